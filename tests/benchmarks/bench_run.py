@@ -147,7 +147,8 @@ def profiled(folder: Path, scratch: Path, config: Path | None, tracking: list[st
     profile = cProfile.Profile()
     action: Callable[[], None] = once
     profile.runcall(action)
-    pstats.Stats(profile).sort_stats("tottime").print_stats(25)
+    # at its end the program discards what is left for its standard output
+    pstats.Stats(profile, stream=sys.stderr).sort_stats("tottime").print_stats(25)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Broken inputs: each ends with one sentence that names file and cause, its exit code, and nothing half-written."""
+"""What is no mistake in a file: no permission, a full disk, an interruption, lenient reading, one file by two names."""
 
 from __future__ import annotations
 
@@ -7,16 +7,11 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
-import broken_observations
-import broken_others
-from broken_bench import CASES, INPUT, OUTPUT, Bench, Change, Outcome, bench_in
-
-#: The modules that registered the cases.
-SOURCES: Final = (broken_observations, broken_others)
+from broken_bench import INPUT, OUTPUT, Bench, Outcome, bench_in, epoch_starts
 
 
 @pytest.fixture(scope="module")
@@ -47,20 +42,6 @@ def test_the_unbroken_run_is_sound(bench: Bench) -> None:
     assert outcome.code == 0, outcome.stderr
     written = sorted(p.name for p in bench.out.iterdir())
     assert written == ["positions.csv", "positions.parquet", "run.json", "train.csv", "train.parquet"]
-
-
-def test_there_are_enough_cases() -> None:
-    assert len({case.id for case in CASES}) == len(CASES) >= 30
-
-
-@pytest.mark.parametrize(("change", "code", "words"), CASES)
-@pytest.mark.every(2)
-def test_one_sentence_and_nothing_half_written(bench: Bench, change: Change, code: int, words: tuple[str, ...]) -> None:
-    options = change(bench)
-    before = everything_below(bench.folder)
-    outcome = bench.run(**options)
-    assert_one_sentence(outcome, code, words)
-    assert everything_below(bench.folder) == before
 
 
 @pytest.mark.parametrize(
@@ -119,8 +100,17 @@ def test_an_interrupted_run_leaves_nothing(bench: Bench, monkeypatch: pytest.Mon
 
 
 def test_broken_lines_are_counted_when_asked(bench: Bench) -> None:
-    broken_observations.observations_with_letters_for_a_number(bench)
+    lines = bench.front.read_text().splitlines(keepends=True)
+    at = epoch_starts("".join(lines))[5] + 1
+    lines[at] = lines[at][:5] + "2l345678.9O1" + lines[at][17:]
+    bench.write("front.obs", "".join(lines))
     outcome = bench.run(lenient=True)
     assert outcome.code == 0, outcome.stderr
     assert "front.obs, line " in outcome.stdout
     assert "front.obs, line " in (bench.out / "run.json").read_text()
+
+
+def test_a_log_given_twice_by_another_name_is_found(bench: Bench) -> None:
+    (bench.folder / "same.obs").symlink_to(bench.front)
+    outcome = bench.run(front=[bench.front, bench.folder / "same.obs"])
+    assert_one_sentence(outcome, INPUT, ("front.obs", "given twice"))

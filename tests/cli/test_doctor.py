@@ -79,7 +79,7 @@ def test_networks_orbits_and_maps_without_heights_are_no_problem(desk: Path, tmp
     found = examine_files([desk / "front.obs", desk / "brdc.nav", net])
     assert found.findings[2].facts[:3] == (
         "5 points, 228 m",
-        "without heights: those of the log's own positions are taken (--heights log)",
+        "without heights: the heights of the log's own positions are used (--heights log)",
         "a network of 2 tracks, of which a run finds the route",
     )
     assert all("km from the place in the header" in problem for problem in found.problems)
@@ -100,7 +100,7 @@ def test_heights_are_taken_as_the_format_defines_them(tmp_path: Path, name: str,
     (tmp_path / name).write_text(text)
     found = examine_files([tmp_path / name])
     assert " ".join(found.findings[0].options) == f"--height-datum {datum}"
-    assert f"takes them as {datum.split()[0]}" in found.problems[0]
+    assert f"takes the heights as {datum.split()[0]}" in found.problems[0]
 
 
 @pytest.mark.requirement("A6")

@@ -333,6 +333,7 @@ def test_geopackage_has_the_tables_of_its_standard(results: Path, tmp_path: Path
     assert datetime.fromisoformat(contents[7]).utcoffset() == timedelta(0)
 
 
+@pytest.mark.requirement("G2")
 def test_geoparquet_and_the_tables_of_a_run_in_pandas_and_xarray(results: Path, tmp_path: Path) -> None:
     """The tables that other tools read: pandas by way of pyarrow, shapely for the geometry, xarray from pandas."""
     export(results, tmp_path / "run.parquet")

@@ -144,6 +144,7 @@ def test_a_sigma_that_is_too_small_is_said(desk: Desk) -> None:
         ("doctor {desk}/front.obs {desk}/brdc.nav {desk}/line.csv", ("files", 1, "kind"), "navigation"),
     ],
 )
+@pytest.mark.requirement("S3")
 def test_json_is_one_line_with_the_verdict(
     desk: Desk, command: str, path: tuple[str | int, ...], value: object
 ) -> None:

@@ -277,16 +277,6 @@ def test_documents_and_log_are_kept(tmp_path: Path) -> None:
         assert store.log(last=2) == [(3, 3, "line 3"), (4, 4, "line 4")]
 
 
-@pytest.mark.skipif("RAILFIX_TEST_DATABASE" not in os.environ, reason="RAILFIX_TEST_DATABASE names no SQL server")
-def test_another_database() -> None:
-    """With RAILFIX_TEST_DATABASE=postgresql+psycopg://user@host/base."""
-    with Store(os.environ["RAILFIX_TEST_DATABASE"]) as store:
-        record, _ = report_received(TrainRecord(train=7), message(3, 50.0), 0.0, limits=LIMITS)
-        store.save(record)
-        store.save(record)
-        assert store.records()[7].message == record.message
-
-
 @pytest.mark.parametrize("facing", [1, -1])
 def test_a_run_with_a_coverage_hole_is_simulated_and_resynchronised(facing: int) -> None:
     """The demonstration run at 1 Hz, out of coverage for 40 s; the other way round the line is mirrored."""

@@ -570,10 +570,16 @@ def test_postgresql_that_hangs_is_an_alarm_and_holds_up_no_order(folder: Path, t
         server.go_on()
         wait(alarm=False, most_s=15.0)
         assert "the database is written again" in " ".join(state()[0]["log"])
-    finally:
-        server.go_on()
         process.terminate()
         process.communicate()
+        with Store(Server.ADDRESS) as store:
+            assert store.records()[1].sequence == 1
+            assert from_documents(store.documents(HEAD)).trains[1].stop == "stopped by hand"
+            texts = [text for _, _, text in store.log()]
+        assert any(text.startswith("order of operator: stop-all") for text in texts)
+    finally:
+        server.go_on()
+        process.kill()
         server.kill()
         shutil.rmtree(place)
 

@@ -33,7 +33,6 @@ from railfix.ground.triangle import (
     advance,
     compare_triangle,
     limits_for_false_stops,
-    monitor_log,
     release,
 )
 from railfix.io import read_navigation, read_observations, write_observations
@@ -178,7 +177,7 @@ def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
         else:
             moved[since > 0] = FAR - PLAN_M
         fixes = draw_fixes(rng, common_m=common, moved_m=moved)
-        log = monitor_log(fixes, limits=LIMITS)
+        log = Monitor(limits=LIMITS, times=TIMES).judge(fixes)
         verdicts = log.triangle.verdict
         assert (verdicts[:20] == TriangleVerdict.HEALTHY).all()
         if fault == "drift inside":

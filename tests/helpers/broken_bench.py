@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import pytest
 from typer.testing import CliRunner
 
 #: Epochs of the logs that are kept.
@@ -134,17 +132,3 @@ def bench_in(folder: Path) -> Bench:
 
 #: Exit codes of the errors.
 INPUT, SETTING, MISMATCH, NOTHING, OUTPUT = 3, 4, 5, 7, 8
-
-Change = Callable[[Bench], dict[str, Any]]
-#: Every registered case: what it breaks, the exit code, words that the sentence must have.
-CASES: Final[list[Any]] = []
-
-
-def broken(code: int, *words: str) -> Callable[[Change], Change]:
-    """Register a case: a function that breaks something and returns the options to run with."""
-
-    def register(change: Change) -> Change:
-        CASES.append(pytest.param(change, code, words, id=change.__name__))
-        return change
-
-    return register

@@ -19,8 +19,8 @@ _LISTED = 40
 
 
 def _number(value: float) -> str:
-    """Return a number to six digits, a rounding error below 1e-5 as zero."""
-    return f"{0.0 if abs(value) < 1e-5 else value:.6g}"
+    """Return a number to six digits and to 1e-5: what lies below is rounding of coordinates."""
+    return f"{round(value, 5) + 0.0:.6g}"
 
 
 def _label(text: str) -> str:

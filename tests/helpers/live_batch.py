@@ -98,16 +98,10 @@ def _collect(parts: dict[str, list[pl.DataFrame]], result: Result) -> None:
         parts["passings"].append(passing_table(result))
 
 
-#: Relative difference of sigmas and levels that rounding explains. Sums over the channels of an epoch, and over those
-#: of a log, differ by 1e-15; the filter amplifies that while several branches are open: on m8t up to 1.2e-7 m along the
-#: line, and 1.7e-7 of a bound (1.3e-6 m of 22.7 m). Messages are rounded to centimetres.
-OF_A_BOUND = 1e-6
-
-
 def differences(whole: Mapping[str, pl.DataFrame], other: Mapping[str, pl.DataFrame], atol: float) -> dict[str, str]:
     """The columns in which tables differ, with what differs; rows of channels that are not observed do not count.
 
-    Numbers differ by more than `atol`, or 1e-9 of them; sigmas and protection levels by more than `OF_A_BOUND` of them.
+    Numbers differ by more than `atol`, or 1e-9 of them.
     """
     found: dict[str, str] = {}
     for name, table in whole.items():
@@ -128,8 +122,7 @@ def differences(whole: Mapping[str, pl.DataFrame], other: Mapping[str, pl.DataFr
             a, b = table[column], theirs[column]
             if a.dtype.is_float():
                 x, y = a.fill_null(np.nan).to_numpy(), b.fill_null(np.nan).to_numpy()
-                rtol = OF_A_BOUND if "sigma" in column or column.startswith("protection") else 1e-9
-                wrong = ~(np.isclose(x, y, rtol=rtol, atol=atol, equal_nan=True))
+                wrong = ~(np.isclose(x, y, rtol=1e-9, atol=atol, equal_nan=True))
                 largest = np.nanmax(np.abs(x[wrong] - y[wrong]), initial=0.0)
                 text = f"{int(wrong.sum())} of {len(x)}, by up to {largest:.3g}"
             else:

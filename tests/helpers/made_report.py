@@ -66,7 +66,8 @@ def _single(time: np.ndarray, placed: np.ndarray) -> dict[str, Any]:
     some = np.where(time % 7 == 1, np.nan, 1.0)
     outcomes = ["passed", "excluded_one", "untestable"]
     return {
-        "latitude_deg": np.full(EPOCHS, 35.0), "longitude_deg": np.full(EPOCHS, 135.7),
+        "n_used": np.where(placed, 8, 0), "latitude_deg": np.full(EPOCHS, 35.0),
+        "longitude_deg": np.full(EPOCHS, 135.7),
         "own_sigma_m": np.full(EPOCHS, 1.5),
         "kilometrage_m": 5000.0 + 5.0 * time, "n_rejected": np.full(EPOCHS, 3), "noise_scale": 1.2 * some,
         "raim_outcome": [outcomes[int(k) % 3] for k in time], "raim_statistic": 4.5 * some,
@@ -130,15 +131,17 @@ _METRICS = (
 def made_report_run(folder: Path, *, filtered: bool = True, observations: bool = True) -> Path:
     """Write a run at 5 m/s from 100 m on and its ground truth ``truth.csv`` beside it; return the folder of the run.
 
-    Epochs 20 to 29 are in a tunnel, where single epochs have no position; a few have failed a check.
+    Epochs 20 to 29 are in a tunnel, 60 to 62 below a bridge: single epochs have no position there; a few others have
+    failed a check.
     """
     time = np.arange(float(EPOCHS))
     place = 100.0 + 5.0 * time
-    dark = (time >= 20) & (time < 30)
+    dark, bridge = (time >= 20) & (time < 30), (time >= 60) & (time < 63)
+    dark |= bridge
     answer = np.where(dark, np.nan, place + np.sin(time))
     answer[50] = place[50] + 14.0
     status = np.where(dark, "too_few_satellites", np.where(time % 30 == 11, "uncertain", "ok")).tolist()
-    environment = np.where(dark, "tunnel", "open")
+    environment = np.where(bridge, "bridge", np.where(dark, "tunnel", "open"))
     truth = reference(
         time, place, environment=environment, sigma_m=np.full(EPOCHS, 0.05), speed_mps=np.full(EPOCHS, 5.0)
     )

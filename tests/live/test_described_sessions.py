@@ -10,7 +10,7 @@ import asyncio
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ from railfix.core.timescale import GPS_EPOCH, timedelta
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus
 from railfix.io.train_message import MessageStatus, TrainMessage
-from railfix.live import console, warm_up
+from railfix.live import command, console, warm_up
 from railfix.live.console import Metrics, PlaceWatch, SensorWatch
 from railfix.live.engine import END_NS, EngineState, LiveEngine, LiveOutput
 from railfix.live.forms import ROW_FORMS, _json_rows, cbor_bytes, forms, gga_sentence, wants, whole_message
@@ -40,10 +40,13 @@ from railfix.live.session import status_text
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink, parse_file_target
 from railfix.live.sources import check_source, hidden, is_file
+from railfix.live.state import belongs_to
+from railfix.live.state_values import StateFormatError, decode, encode
 from railfix.live.stream import FOREVER, Lag, Sensed, SensorLines, fresh_state
 from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import GroundUnits, RadarSpeeds, SensorSamples, StationRanges
 from railfix.motion.slip import MotionState
+from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.received import no_navigation
 from railfix.track import Trajectory
@@ -54,6 +57,13 @@ pytestmark = pytest.mark.requirement("A8")
 START: Final = np.datetime64("2024-03-05T00:00:10.25", "ns")
 MS: Final = 1_000_000
 NAN: Final = float("nan")
+
+
+@dataclass
+class Example:
+    """A data class that is not of the package."""
+
+    value: int
 
 
 class Track(SimpleNamespace):
@@ -235,6 +245,7 @@ def _console(_: Path) -> Iterator[Iterable[str]]:
         ]  # type: ignore[list-item]
         yield metrics.text().splitlines(), metrics.summary()
         yield from _watch(patch)
+        yield from _observed(patch)
         said: list[str] = []
         check = iter([RailfixError("elsewhere")])
         patch.setattr(console, "ENOUGH_TO_STOP", 3)
@@ -251,6 +262,22 @@ def _console(_: Path) -> Iterator[Iterable[str]]:
             places.take(SimpleNamespace(result=SimpleNamespace(antennas={"front": None})))  # type: ignore[arg-type]
             places.take(SimpleNamespace(result=None))  # type: ignore[arg-type]
             yield [f"place watch has said {said}"]
+
+
+def _observed(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
+    """Sentences on balises are logged where the line has any, for outputs with rows."""
+    patch.setattr(command, "balise_notes", lambda name, passings: [f"{name}: {passings}"])
+    for balises, part in product((None, object()), ("both", "rows", "message")):
+        said: list[str] = []
+        log = SimpleNamespace(say=said.append, shows_status=False, show=None)
+        inputs = SimpleNamespace(out=None, sensors={}, state=None)
+        engine = SimpleNamespace(processor=SimpleNamespace(balises=balises))
+        hooks, streams = command._hooks(inputs, LiveSettings(), engine, log, None, full="drop")  # type: ignore[arg-type]
+        own = SimpleNamespace(antennas={}, fusion={"front": SimpleNamespace(passings="B1")})
+        assert hooks.observe is not None
+        for found in (own, None):
+            hooks.observe(LiveOutput(message=None, result=found, part=part))  # type: ignore[arg-type]
+        yield [f"balises {balises is not None}, {part}: {said} {hooks.sensed} {hooks.save} {hooks.show} {streams}"]
 
 
 def _watch(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
@@ -322,10 +349,15 @@ class Processor(SimpleNamespace):
         return screened
 
     def along_track(self, epochs: dict[str, Observations], _: Any) -> Any:
-        antennas = {
-            name: single(300.0 + 18.2 * (name == "front"), seconds=_second(epoch)) for name, epoch in epochs.items()
-        }
-        return result(**{name: (own, None) for name, own in antennas.items()}), State()
+        antennas = {}
+        for name, epoch in epochs.items():
+            seconds = _second(epoch)
+            place = 300.0 + 18.2 * (name == "front") + 40.0 * seconds
+            antennas[name] = single(place, seconds=seconds)
+        received = SimpleNamespace(notes=self.notes_later.pop(0)) if self.notes_later else None
+        state = State(received=received)  # type: ignore[arg-type]
+        return result(**{name: (own, None) for name, own in antennas.items()}), state
+        return result(**{name: (own, None) for name, own in antennas.items()}), state
 
 
 def _count(value: Any) -> int:
@@ -349,6 +381,7 @@ def _engine(*antennas: str, sensors: tuple[str, ...] = (), **settings: Any) -> L
     processor = Processor(
         notes=("a note",), received=SimpleNamespace(notes=(), navigation=no_navigation()), antenna_order=lambda: None,
         trajectories={name: clean_trajectories()[name] for name in antennas}, balises=None, units=None, given=[],
+        notes_later=[],
         config=SimpleNamespace(antenna_pair=SimpleNamespace(tag_tolerance_s=0.01)),
     )  # fmt: skip
     return LiveEngine(processor, LiveSettings(**settings), sensors)  # type: ignore[arg-type]
@@ -400,7 +433,10 @@ def _sessions(_: Path) -> Iterator[Iterable[str]]:
     yield ["queue", *queued[:2], *queued[50:53], *queued[-2:]]
     left = [*_shown(engine, 0, engine.poll(now_ns=END_NS))]
     yield [f"{len(left)} left", left[0], left[-1], str(dict(engine.counts))]
+    slow = _engine("front", "rear", period_s=5.0, pair_wait_s=3.0)
+    yield ["a period of 5 s", *_play(slow, [(0.0, "front", 0.0), (2000.0, "", 0), (3100.0, "", 0)], live=False)]
     yield from _sensed_and_heard()
+    yield from _changes()
     yield from _resumed()
     lag = Lag(behind_s=1.0)
     before = -1
@@ -438,6 +474,22 @@ def _sensed_and_heard() -> Iterator[Iterable[str]]:
     engine.add_sbas(SimpleNamespace(merge=lambda _: None))  # type: ignore[arg-type]
     engine.add_base(epoch_at(300))
     yield _play(engine, [(100.0, "front", 100.0), (200.0, "front", 200.0)], live=False)
+
+
+def _changes() -> Iterator[Iterable[str]]:
+    """Replacements of requested data that begin, change and end."""
+    engine = _engine("front", no_input="skip")
+    engine.processor.notes_later += [("b", "c"), ("b", "c"), ("c", "d"), ()]  # type: ignore[attr-defined]
+    yield _play(engine, [(100.0 * k, "front", 100.0 * k) for k in range(5)], live=False)
+    engine, seen = _engine("front", "rear", no_input="skip"), []
+
+    def add(front: tuple[np.ndarray, ...], rear: tuple[np.ndarray, ...]) -> bool:
+        seen.append(f"order at {front[1][-1]:.1f} and {rear[1][-1]:.1f} m")
+        return len(seen) > 2
+
+    engine._order = SimpleNamespace(add=add, note="the antennas are exchanged")  # type: ignore[assignment]
+    pairs = [(100.0 * k, name, 100.0 * k) for k in range(12) for name in ("front", "rear")]
+    yield [*_play(engine, pairs, live=False), *seen]
 
 
 def _resumed() -> Iterator[Iterable[str]]:
@@ -505,6 +557,15 @@ def _streams(_: Path) -> Iterator[Iterable[str]]:
         except RailfixError as error:
             said = str(error)
         yield [f"{hidden(source)}: {said}; a file {is_file(source)}"]
+    for value in (PlaceWatch(str), Example(1), {"a": (1.5, b"x", slice(1, 2)), 3: {4}}, np.array([None])):
+        try:
+            said = repr(decode(encode(value)))
+        except StateFormatError as error:
+            said = str(error).replace(f"{__name__}.", "")
+        yield [f"{type(value).__name__} in a state: {said}"]
+    priors = [{"satellite_prior": dict(pairs)} for pairs in ((("G", 1e-5), ("E", 2e-5)), (("E", 2e-5), ("G", 1e-5)))]
+    heads = [belongs_to({}, {"settings": parse_config({"risk": risk})}, ("front",)) for risk in priors]
+    yield [f"the order of keys in settings changes nothing: {heads[0] == heads[1]}, {list(heads[0])}"]
     for target in (
         "json@-",
         "json",

@@ -69,8 +69,8 @@ def test_chunks_are_joined_however_the_header_is_written(coding: bytes) -> None:
     [
         (OK + b"Transfer-Encoding: chunked\r\n\r\n-5\r\n" + bytes(300), "answer is no HTTP"),
         (OK + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", "answer is no HTTP"),
-        (OK + b"Content-Type: gnss/sourcetable\r\n\r\nSTR;A", "source table, not a stream; is the mount point right"),
-        (OK + b"\r\nSTR;MOUNT;here\r\n", "source table, not a stream"),
+        (OK + b"Content-Type: gnss/sourcetable\r\n\r\nSTR;A", "are host and mount point right"),
+        (OK + b"\r\nSTR;MOUNT;here\r\n", "source table, not a receiver's stream"),
         (b"SOURCETABLE 200 OK\r\n", "is the mount point right"),
         (OK + b"Content-Type: text/html\r\n\r\n<p>", "a page of HTML"),
         (OK + b"\r\n<!DOCTYPE html><html>" + bytes(40), "a page of HTML"),

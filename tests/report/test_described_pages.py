@@ -46,6 +46,7 @@ from railfix.track.network_read import NetworkFinding, NetworkQuality, check_net
 from report_page import Page
 
 pytestmark = pytest.mark.requirement("D3")
+NAN: Final = float("nan")
 
 
 def line_track(points: int = 9, step_m: float = 5.0) -> Track:
@@ -129,8 +130,14 @@ def _plans() -> Iterator[Chart]:
     yield plots.plan(positions.with_columns(x_m=pl.lit(None, dtype=pl.Float64)))
     gap = pl.concat([positions, positions.with_columns(pl.col("chainage_m") + 500.0)] * 2)
     yield plots.plan(gap)
-    dense = pl.concat([positions] * 2000)
-    yield plots.plan(dense)
+    east = np.arange(7000.0) * 0.01
+    spread = pl.concat([positions.head(1)] * 7000).with_columns(
+        x_m=pl.col("x_m") - east * np.sin(np.radians(135.0)), y_m=pl.col("y_m") + east * np.cos(np.radians(135.0)),
+        conventional_x_m=pl.col("conventional_x_m") - east * np.sin(np.radians(135.0)),
+        conventional_y_m=pl.col("conventional_y_m") + east * np.cos(np.radians(135.0)),
+    )  # fmt: skip
+    later = spread.with_columns((pl.col("time_gpst") + pl.duration(days=1)).cast(pl.Datetime("ns")))
+    yield plots.plan(spread, filtered=later.select("time_gpst", "x_m", "y_m", "z_m"))
 
 
 def _line() -> Iterator[Chart]:
@@ -234,6 +241,20 @@ def _networks() -> Iterator[Any]:
     yield network.network_plan(net, quality, _run())
     nowhere = log_at(np.full(2, np.nan), np.full(2, np.nan))
     yield network.network_plan(net, check_network(net), (nowhere, _run()[1].take(np.array([7, 8]))))
+
+
+def _empty() -> Iterator[Iterable[str]]:
+    """Whether a chart has something to draw, by layer: nothing known, one of the coordinates, all."""
+    one, none, zero = np.array([1.0]), np.array([NAN]), np.array([0.0])
+    edges, count = np.array([0.0, 1.0]), np.array([[1]])
+    layers = [Points(label="", colour="", x=x, y=y) for x in (one, none) for y in (one, none)]
+    layers += [Band(label="", colour="", x=one, low=low, high=one) for low in (one, none)]
+    layers += [Bars(label="", colour="", left=zero, right=one, height=height) for height in (one, zero)]
+    layers += [Cells(label="", colour="", x_edges=edges, y_edges=edges, counts=n) for n in (count, 0 * count)]
+    layers += [RangeBars(label="", colour="", names=("a",), low=one, mid=mid, high=one) for mid in (one, none)]
+    layers += [Marks(label="", colour="", x=one, y=one, words=("a",))]
+    frame = {"name": "", "title": "", "caption": "", "x_label": "", "y_label": ""}
+    yield [f"{layer.kind} empty {Chart(layers=(layer,), **frame).empty}" for layer in layers]
 
 
 def _layers() -> Iterator[Iterable[str]]:
@@ -381,7 +402,9 @@ def _network_pages(folder: Path) -> Iterator[Iterable[str]]:
 
 
 def _of(charts: Iterable[Any]) -> Iterator[Iterable[str]]:
-    return (describe(chart) for chart in charts)
+    for chart in charts:
+        axis = f"; common axis {chart.common_axis!r}" if isinstance(chart, Chart) else ""
+        yield [*describe(chart), f"empty {chart.empty}{axis}"]
 
 
 CASES: Final[dict[str, Callable[[Path], Iterable[Iterable[str]]]]] = {
@@ -392,6 +415,7 @@ CASES: Final[dict[str, Callable[[Path], Iterable[Iterable[str]]]]] = {
     "signals": lambda _: _of(_signals()),
     "screens": lambda _: _of(_screens()),
     "networks": lambda _: _of(_networks()),
+    "empty": lambda _: _empty(),
     "layers": lambda _: _layers(),
     "pictures": _pictures,
     "reports": _reports,

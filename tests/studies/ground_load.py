@@ -154,9 +154,11 @@ async def drive(
         await asyncio.sleep(0.1)
     print(f"{len(trains):6d}  connected after {time.perf_counter() - started:.1f} s", flush=True)
     await asyncio.sleep(10.0)
-    begin, spent = time.perf_counter(), processor()
+    begin, spent, own = time.perf_counter(), processor(), time.process_time()
     await asyncio.sleep(seconds)
     spent = (processor() - spent) / (time.perf_counter() - begin)
+    own = (time.process_time() - own) / (time.perf_counter() - begin)
+    print(f"{len(trains):6d}  trains {own:6.3f} s/s", flush=True)
     await asyncio.gather(*running)
     return times, counted, spent
 

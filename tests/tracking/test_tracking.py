@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.kernels.tracking import index as ix
-from railfix.kernels.tracking.constants import ACROSS_LOST
+from railfix.kernels.tracking.constants import CONTRADICTION_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
@@ -436,7 +436,7 @@ def test_an_improbable_place_hides_no_other() -> None:
     for arc in (ix.ARC, ix.PREVIOUS_ARC):
         state.mean[:, arc] += [600.0, 50.0]
     state.hypothesis["log_probability"], state.hypothesis["origin_m"] = [0.0, -36.0], state.mean[:, ix.ARC]
-    state.monitors = replace(state.monitors, across=ACROSS_LOST)
+    state.monitors = replace(state.monitors, contradiction=CONTRADICTION_LOST)
     result, _ = track(case.epochs.take(slice(30, None)), case.line, state)
     assert result.hypotheses[0] == 3
     np.testing.assert_allclose(result.arc_m, case.arc_m[30:], atol=1.5)

@@ -377,6 +377,21 @@ def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
         assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
 
 
+@pytest.mark.requirement("C6")
+def test_codes_that_are_left_out_do_not_hide_that_the_others_contradict_the_position() -> None:
+    """Five of ten codes are left out, with the weight of a perfect fit; the others have almost none."""
+    left_out = np.arange(12) % 2 == 0
+    left_out[10:] = False
+    rows = named_tuple(layout.Rows, code=slice(0, 10), doppler=slice(11, 12), left_out=left_out)
+    weight = np.where(left_out, 1.25, 0.1)
+    weight[10:] = 0.7, 0.9
+    variance = np.ones(12)
+    code, motion = plain("tracking.update").mean_weights(rows, variance, weight)
+    assert (code, motion) == pytest.approx((0.1, 0.8))
+    variance[1:10:2] = np.inf
+    assert np.isnan(plain("tracking.update").mean_weights(rows, variance, weight)[0])
+
+
 @pytest.mark.requirement("E5")
 def test_a_position_off_in_a_curve_displaces_across() -> None:
     """10 m of travel on a radius of 573 m: the tangents differ by 10 / 573 to the right, for each metre."""

@@ -16,11 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from railfix.ground.layout import Layout, Piece, PointName, along, shares
-from railfix.ground.state import HEAD as HEAD
 from railfix.ground.state import Interlocking, InterlockingLimits, PointState, TrainInterval, stop_trains
-from railfix.ground.state import from_documents as from_documents
-from railfix.ground.state import to_documents as to_documents
-from railfix.ground.state import with_train as with_train
 
 
 class NearbyTrains:

@@ -34,21 +34,36 @@ def check_keys(folder: Path, name: str) -> None:
             raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
 
 
+class Peer(NamedTuple):
+    """Verified certificate of the other end of a connection: common name, serial number and end."""
+
+    name: str
+    serial: int
+    ends: datetime
+
+    @classmethod
+    def of(cls, certificate: x509.Certificate) -> Peer:
+        """Return the values of a certificate, which are slow to read; ValueError where it has no name."""
+        names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+        if not names:
+            raise ValueError("no name")
+        return cls(str(names[0].value), certificate.serial_number, certificate.not_valid_after_utc)
+
+    @property
+    def valid_s(self) -> float:
+        """Time until the certificate ends [s]."""
+        return (self.ends - datetime.now(UTC)).total_seconds()
+
+
 class Revoked(NamedTuple):
     """Certificates that do not count any more: by name, such as ``train-7``, and by serial number."""
 
     names: frozenset[str] = frozenset()
     serials: frozenset[int] = frozenset()
 
-    def has(self, certificate: x509.Certificate) -> bool:
-        """Return whether a certificate is one of them."""
-        return name_of(certificate) in self.names or certificate.serial_number in self.serials
-
-
-def name_of(certificate: x509.Certificate) -> str | None:
-    """Return the common name of a certificate, None where it has none."""
-    names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
-    return str(names[0].value) if names else None
+    def has(self, peer: Peer) -> bool:
+        """Return whether the certificate of a peer is one of them."""
+        return peer.name in self.names or peer.serial in self.serials
 
 
 def read_revoked(folder: Path) -> Revoked:
@@ -69,6 +84,11 @@ def read_revoked(folder: Path) -> Revoked:
         raise InputFileError(path, f"cannot be read ({error})") from None
 
 
+def ending_sentence(name: str, ends: datetime) -> str:
+    """Return that a certificate ends soon, and the remedy."""
+    return f"the certificate {name} ends on {ends.date().isoformat()}; renew it (railfix ground keys --renew)"
+
+
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
     """Return the certificates of an end, and of the authority, that end within `WARNING_DAYS`, a sentence each."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
@@ -77,8 +97,7 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
         # of an authority that was renewed the newest counts
         newest = max(x509.load_pem_x509_certificates((folder / file).read_bytes()), key=lambda c: c.not_valid_after_utc)
         if newest.not_valid_after_utc <= limit:
-            day = newest.not_valid_after_utc.date().isoformat()
-            found.append(f"the certificate {file} ends on {day}; renew it (railfix ground keys --renew)")
+            found.append(ending_sentence(file, newest.not_valid_after_utc))
     return found
 
 

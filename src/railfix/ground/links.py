@@ -21,7 +21,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat, draw_session
-from railfix.ground.keys import WARNING_DAYS, Revoked, list_ending, read_revoked
+from railfix.ground.keys import WARNING_DAYS, Revoked, ending_sentence, list_ending, read_revoked
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen
 
 #: Results that are kept: an hour of ten frames a second.
@@ -272,8 +272,9 @@ class TrainLinks:
                 ) as protocol:
                     self.protocols[name] = protocol
                     self._resend(name)
-                    async with asyncio.timeout(protocol.valid_s):
-                        await protocol.wait_closed()
+                    if protocol.peer is not None:
+                        async with asyncio.timeout(protocol.peer.valid_s):
+                            await protocol.wait_closed()
             except (ConnectionError, TimeoutError, OSError):
                 pass  # retried after a time; the meter counts unanswered frames
             self.protocols.pop(name, None)
@@ -349,8 +350,7 @@ class CentreLinks:
         self._stack = AsyncExitStack()
         self.alarm: str | None = None
         self._revoked = Revoked()
-        #: Certificates of trains that expire soon, by name, and those of the centre, one sentence each.
-        self._ending: dict[str, str] = {}
+        self._ending: list[str] = []  #: Certificates that expire soon, one sentence each.
 
     async def start(self) -> None:
         """Listen.
@@ -377,7 +377,7 @@ class CentreLinks:
 
     def alarms(self) -> list[str]:
         """Return the faults of the certificates, one sentence each."""
-        return [*([] if self.alarm is None else [self.alarm]), *self._ending.values()]
+        return [*([] if self.alarm is None else [self.alarm]), *self._ending]
 
     def threats(self) -> Counter[Threat]:
         """Return the number of rejected frames of all trains."""
@@ -401,9 +401,7 @@ class CentreLinks:
             except InputFileError as error:
                 self.alarm = f"{error}; the certificates revoked before are still rejected"
             for protocol in self._peers.values():
-                if protocol.certificate is None:
-                    continue
-                if protocol.valid_s < 0.0 or self._revoked.has(protocol.certificate):
+                if protocol.peer is not None and (protocol.peer.valid_s < 0.0 or self._revoked.has(protocol.peer)):
                     protocol.reject()
             self._note_ending()
             await asyncio.sleep(RETRY_S)
@@ -411,12 +409,9 @@ class CentreLinks:
     def _note_ending(self) -> None:
         """List the certificates that expire within `WARNING_DAYS`: of the centre, and of connected trains."""
         limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
-        ends = {p.peer: p.certificate.not_valid_after_utc for p in self._peers.values() if p.peer and p.certificate}
-        self._ending = {text: text for text in list_ending(self._keys, "centre")} | {
-            name: f"the certificate of {name} ends on {end.date().isoformat()}; renew it (railfix ground keys --renew)"
-            for name, end in ends.items()
-            if end <= limit
-        }
+        peers = {protocol.peer: None for protocol in self._peers.values() if protocol.peer is not None}
+        soon = [ending_sentence(f"of {peer.name}", peer.ends) for peer in peers if peer.ends <= limit]
+        self._ending = [*list_ending(self._keys, "centre"), *soon]
 
     def _masquerade(self) -> None:
         self.masquerades += 1
@@ -434,9 +429,9 @@ class CentreLinks:
         return self._encode(train, FrameKind.ECHO, echo.encode())
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
-        kind, _, name_of_train = (protocol.peer or "").partition("-")
-        known = protocol.certificate
-        if kind != "train" or not name_of_train.isdigit() or known is None or self._revoked.has(known):
+        peer = protocol.peer
+        kind, _, name_of_train = ("" if peer is None else peer.name).partition("-")
+        if kind != "train" or not name_of_train.isdigit() or peer is None or self._revoked.has(peer):
             protocol.reject()
             return
         train, now_ns = int(name_of_train), time.monotonic_ns()

@@ -12,8 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 from railfix.ground.layout import Layout, Piece, PointName, overlap
-from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
-from railfix.ground.state import stop_trains as stop_trains
+from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
 
 #: Why a section is barred: closed by hand; occupied by vehicles that report nothing, by hand or by its detection;

@@ -371,13 +371,6 @@ class Monitor:
         return orders
 
 
-def monitor_log(
-    fixes: StationFixes, *, limits: TriangleLimits | None = None, times: MonitorLimits | None = None
-) -> MonitoredLog:
-    """Run the monitor over the fixes of a log; SettingsError as `Monitor.judge`."""
-    return Monitor(limits=limits or TriangleLimits(), times=times or MonitorLimits()).judge(fixes)
-
-
 def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> None:
     """Draw the fixes about their points, and the errors of fixes and sides over time."""
     from matplotlib.figure import Figure

@@ -8,8 +8,8 @@ import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
-from typing import Final, Protocol
+from dataclasses import dataclass
+from typing import Final
 
 from railfix.ground.store import DatabaseError
 
@@ -19,25 +19,8 @@ HANGS_S: Final = 1.0
 RETRY_S: Final = 1.0
 
 
-class Writer(Protocol):
-    """Executor of commits: immediate, or in a thread."""
-
-    def submit(self, work: Callable[[], None]) -> Future[None]:
-        """Begin some work; return its outcome."""
-
-
-class DirectWriter:
-    """Writer that carries the work out before it returns."""
-
-    def submit(self, work: Callable[[], None]) -> Future[None]:
-        """Do the work; return its outcome."""
-        outcome: Future[None] = Future()
-        _carry_out(work, outcome)
-        return outcome
-
-
 class ThreadWriter:
-    """Writer with a separate thread, which does not keep the process from ending.
+    """Executor of commits in a separate thread, which does not keep the process from ending.
 
     `done` is called, in that thread, after each work.
     """
@@ -66,13 +49,15 @@ class ThreadWriter:
             self._done()
 
 
-def _carry_out(work: Callable[[], None], outcome: Future[None]) -> None:
+def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
+    """Do some work; return its outcome, which the future takes."""
     try:
         work()
     except Exception as error:  # noqa: BLE001 (the caller of `result` gets it)
         outcome.set_exception(error)
     else:
         outcome.set_result(None)
+    return outcome
 
 
 @dataclass(kw_only=True)
@@ -82,7 +67,7 @@ class Commits:
     `alarm`: why the store rejects the state; nothing is granted meanwhile, but stops are sent.
     """
 
-    writer: Writer = field(default_factory=DirectWriter)
+    writer: ThreadWriter | None = None  #: Without one a commit is carried out at once.
     alarm: str | None = None
     _open: tuple[Future[None], Callable[[], None], float] | None = None
     _failed_s: float = float("-inf")
@@ -93,7 +78,8 @@ class Commits:
 
     def begin(self, work: Callable[[], None], then: Callable[[], None], now_s: float) -> None:
         """Begin a commit; `then` is called by `settle` once it is done."""
-        self._open = self.writer.submit(work), then, now_s
+        outcome = _carry_out(work, Future()) if self.writer is None else self.writer.submit(work)
+        self._open = outcome, then, now_s
 
     def settle(self, now_s: float) -> None:
         """Process the outcome of a completed commit; raise errors that are not failures of the database."""

@@ -316,9 +316,7 @@ class _Answer:
         head = {bytes(name).lower(): bytes(value).lower().strip() for name, value in response.headers}
         kind, coding = head.get(b"content-type", b""), head.get(b"content-encoding", b"identity")
         if kind.startswith(b"gnss/sourcetable"):
-            raise InputFileError(
-                hidden(self._source), "the caster sends its source table, not a stream; is the mount point right?"
-            )
+            raise self._no_stream("its source table")
         if kind.startswith(b"text/html"):
             raise self._no_stream("a page of HTML")
         if coding != b"identity":
@@ -331,9 +329,7 @@ class _Answer:
         if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
             raise self._no_stream("a page of HTML")
         if content.startswith((b"STR;", b"CAS;", b"NET;", b"SOURCETABLE")):
-            raise InputFileError(
-                hidden(self._source), "the caster sends its source table, not a stream; is the mount point right?"
-            )
+            raise self._no_stream("its source table")
 
     def _no_stream(self, what: str) -> InputFileError:
         return InputFileError(

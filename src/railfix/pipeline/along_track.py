@@ -72,7 +72,9 @@ def along_track(
     samples: SensorSamples | None = None,
     references: LineReferences | None = None,
 ) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
-    """Return filtered positions of one antenna after all screens and exclusions, the filter's input, and its state.
+    """Return filtered positions of one antenna, the filter's input, and its state.
+
+    The filter itself weighs codes that screens and exclusions of single epochs have rejected (`gnss_epochs`).
 
     The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
     `samples` are the on-board sensor samples since the previous chunk; `references` has the line's features, ground
@@ -93,12 +95,12 @@ def along_track(
     tracked = mark_doubtful(tracked, doubted & placed, TrackStatus.DOUBTFUL)
     wheel = None
     if config.interference.use == "on" and any(replay.sensors.wheel_m is not None for replay in replays):
-        wheel, alone = _against_wheel(replays, single.arc_m, single.sigma_m, after.wheel, config)
-        after = replace(after, wheel=alone)
+        wheel, wheel_state = _against_wheel(replays, single.arc_m, single.sigma_m, after.wheel, config)
+        after = replace(after, wheel=wheel_state)
         if config.interference.wheel_level == "on":
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
-            pulled, filtered = _against_wheel(replays, tracked.arc_m, sure, after.pulled, config)
-            after, tracked = replace(after, pulled=filtered), _bound_by_wheel(tracked, pulled.bound_m)
+            of_filter, filter_wheel = _against_wheel(replays, tracked.arc_m, sure, after.filter_wheel, config)
+            after, tracked = replace(after, filter_wheel=filter_wheel), _bound_by_wheel(tracked, of_filter.bound_m)
         # a named cause outranks a doubt without a cause; a time-tag error outranks both
         unnamed = (tracked.status == TrackStatus.DOUBTFUL) & (single.suspicion != Suspicion.TIME_TAGS)
         parted = wheel.parted & (is_bounded(tracked.status) | unnamed)
@@ -198,11 +200,11 @@ def _run_filter(
     state: FilterState,
     samples: SensorSamples | None,
     references: LineReferences | None,
-    alone: tuple[Floats, Floats],
+    single: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
     """Return the filter's positions, the sensor motion, the smoother's input, and the state for the next chunk.
 
-    `alone` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
+    `single` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
 
     With sensors the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks: the wheel
     position, which gives the gradient, starts each block at the filter's position.
@@ -231,7 +233,7 @@ def _run_filter(
         if sensors.ranges is not None:
             sensors = replace(sensors, ranges=_gated_ranges(sensors.ranges, part.time, line, state, config))
         if sensing and len(part):
-            part, gate = _gate(part, sensors, alone[0][first:last], alone[1][first:last], line, state, config)
+            part, gate = _gate(part, sensors, single[0][first:last], single[1][first:last], line, state, config)
             state = replace(state, gate=gate)
         replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
         level = state.level
@@ -342,8 +344,8 @@ def gnss_epochs(
     after = state
     if slips is None:
         slips, after = find_slips(obs, state, frequency_hz=ranges.channels.every_frequency_hz, limits=config.slips)
-    healthy = ((ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0) & ~ranges.unsure[:, None]
-    moving = (ranges.reason & ~int(_WEIGHED_BY_FILTER | _CODE_ALONE)) == 0
+    code_used = ((ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0) & ~ranges.unsure[:, None]
+    motion_used = (ranges.reason & ~int(_WEIGHED_BY_FILTER | _CODE_ALONE)) == 0
     phases, dopplers = ("phase" in config.filter_sources, "doppler" in config.filter_sources)
     no_delay, air = np.zeros(ranges.code_m.shape), ranges.troposphere_m
     phase = corrected_phase_m(
@@ -355,9 +357,9 @@ def gnss_epochs(
     epochs = GnssEpochs(
         time=obs.time, satellite=ranges.satellite, signal=ranges.signal, clock=ranges.channels.clock,
         sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
-        code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
-        phase_m=np.where(moving & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],
-        rate_mps=np.where(moving & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
+        code_m=np.where(code_used, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
+        phase_m=np.where(motion_used & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],
+        rate_mps=np.where(motion_used & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
         cn0_dbhz=ranges.cn0_dbhz, off_map=np.zeros(len(obs.time), dtype=np.bool_),
     )  # fmt: skip
     return epochs, after

@@ -68,7 +68,7 @@ class FilterState(NotebookTable):
     gate: ReturnState = field(default_factory=ReturnState)
     #: State of the comparison of wheel distances with single-epoch distances, and with filter distances.
     wheel: WheelState = field(default_factory=WheelState)
-    pulled: WheelState = field(default_factory=WheelState)
+    filter_wheel: WheelState = field(default_factory=WheelState)
     #: Last epoch at which positions or speeds of the two antennas were inconsistent.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     passings: PassingState | None = None  #: State of balises and virtual balises.

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import scipy
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, channel_sums, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
@@ -205,7 +205,7 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
     share = (
         model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal_elevation_sigma_m, 0.0), 0.0)
     )
-    return np.asarray(np.einsum("tk,tk->t", share, share))
+    return channel_sums(share**2)
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, Strings, channel_sums
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.settings import Settings
@@ -194,8 +194,10 @@ class _SpeedFit:
 
 def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedFit:
     weight = np.where(used, 1.0 / sigma**2, 0.0)
-    one, h, hh = weight.sum(axis=1), (weight * slope).sum(axis=1), (weight * slope**2).sum(axis=1)
-    y, hy = (weight * measured).sum(axis=1), (weight * slope * measured).sum(axis=1)
+    one, h, hh, y, hy = (
+        channel_sums(values)
+        for values in (weight, weight * slope, weight * slope**2, weight * measured, weight * slope * measured)
+    )
     # Three satellites in one direction leave the speed open; so does a single one.
     determinant = one * hh - h * h
     determinant = np.where((used.sum(axis=1) >= 2) & (determinant > 1e-9 * one * hh), determinant, np.nan)
@@ -211,7 +213,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
         variance=one / determinant,
         residual=residual,
         normalised=np.nan_to_num(normalised),
-        wsse=(weight * residual**2).sum(axis=1),
+        wsse=channel_sums(weight * residual**2),
     )
 
 

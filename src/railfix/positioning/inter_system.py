@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Masks, patch_rows
+from railfix.core.arrays import Datetimes, Floats, Masks, channel_sums, patch_rows
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.gross_errors import gross_alone
@@ -93,7 +93,8 @@ def tie_clocks(
         base = [clocks.index(reference)]
         sigma[:, base] = 0.0
         used = ranges.weight > 0
-        total = np.maximum(np.add.reduceat(ranges.weight, ranges.starts, axis=1), 1e-12)
+        total = np.stack([channel_sums(ranges.weight[:, group]) for group in ranges.groups], axis=1)
+        total = np.maximum(total, 1e-12)
         two = np.add.reduceat(used, ranges.starts, axis=1, dtype=np.intp) >= 2
         known = np.isfinite(free.wsse) & (ranges.space_redundancy > 0)
         usable = two[:, others] & two[:, base] & known[:, None]

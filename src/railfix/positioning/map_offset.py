@@ -224,7 +224,7 @@ def means_of_windows(
     known = of_noise + sums[:, [5, 6, 6, 7]].reshape(-1, 2, 2) / sums[:, 8, None, None]
     known = known + np.diag([sigma_plan_m**2, sigma_height_m**2])
     inverse = _inverse_2x2(known)
-    statistic = np.einsum("ti,tij,tj->t", mean, inverse, mean)
+    statistic = (mean * np.einsum("tij,tj->ti", inverse, mean)).sum(axis=1)
     return mean, known, statistic, detectable_sigmas / np.sqrt(inverse[:, [0, 1], [0, 1]])
 
 

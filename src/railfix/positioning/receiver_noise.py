@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.arrays import Floats, Integers, Masks, channel_sums
 from railfix.core.settings import Settings
 from railfix.positioning.noise_windows import Windows
 
@@ -136,8 +136,8 @@ def robust_clock(
         for _ in range(_ROUNDS):
             score = np.abs(residual - value[:, None]) * root
             weight = root**2 * np.minimum(1.0, HUBER / np.maximum(score, 1e-12))
-            total = weight.sum(axis=1)
-            value = (weight * residual).sum(axis=1) / total
+            total = channel_sums(weight)
+            value = channel_sums(weight * residual) / total
         clock[rows, g] = value
         share[rows, group] = weight / total[:, None]
     return RobustClock(clock_m=clock, share=share)

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, channel_sums
 from railfix.core.epoch_rows import EVERY
 from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
@@ -191,7 +191,7 @@ def _noise_scale(
 ) -> tuple[Floats, Floats]:
     """Return the variance of the differences over the assumed one, by the epochs before, shape (T,), and the sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
-    sample = np.stack([_sum(size), _sum(known.astype(np.float64))], axis=1)
+    sample = np.stack([channel_sums(size), channel_sums(known.astype(np.float64))], axis=1)
     last_epoch = [(own.last, own.age)]
     before, _, (after,), _ = correlated_sums(time, sample, own.scale[None], (EVERY,), last_epoch, **ages)
     mean = (_FROM_MEAN_SIZE * before[:, 0] + _FIRST_SAMPLES) / (before[:, 1] + _FIRST_SAMPLES)
@@ -210,18 +210,13 @@ def _fit_field(
     for number in np.unique(group[group >= 0]).tolist():
         here = group == number
         own = np.where(here, weight, 0.0)
-        total = np.where(here.any(axis=1), _sum(own), 1.0)
-        centre = np.where(here[..., None], (_sum(own[..., None] * values) / total[:, None])[:, None], centre)
+        total = np.where(here.any(axis=1), channel_sums(own), 1.0)
+        centre = np.where(here[..., None], (channel_sums(own[..., None] * values) / total[:, None])[:, None], centre)
         of_centre = np.where(here, 1.0 / total[:, None], of_centre)
     apart = values - centre
-    normal = _sum((weight[..., None] * apart)[..., None] * apart[..., None, :])
+    normal = channel_sums((weight[..., None] * apart)[..., None] * apart[..., None, :])
     covariance = np.linalg.inv(normal[:, :3, :3] + np.eye(3))
     factors = np.einsum("tij,tj->ti", covariance, normal[:, :3, 3])
     variance = [np.einsum("tki,tij,tkj->tk", at, covariance, at) for at in (basis, centre[..., :3])]
     field, of_centre_m = (np.einsum("tki,ti->tk", at, factors) for at in (basis, centre[..., :3]))
     return field, variance[0], centre[..., 3] - of_centre_m, of_centre + variance[1]
-
-
-def _sum(values: Floats) -> Floats:
-    """Return the sum over the channels in sequence: channels without a value do not change the result by a bit."""
-    return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)

@@ -23,14 +23,14 @@ from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 
-#: Number of epochs that are listed, at most one in this time of a run [s]; number of pieces of the line in which each
-#: run is drawn.
+#: Number of listed epochs; minimum time between two of a run [s]; number of pieces of the line in which each run is
+#: drawn.
 _WORST: Final = 10
 _EVENT_S: Final = 60
 _PIECES: Final = 400
-#: Runs that the charts by run have, those with the largest values; the table has all.
+#: Number of runs in the charts by run, those with the largest values; the table has all runs.
 _BARS: Final = 40
-#: Quantities that the worst epochs are sought by, the best first.
+#: Quantities by which the worst epochs are selected, in order of preference.
 _QUANTITIES: Final = ("error_m", "protection_level_m", "along_sigma_m")
 _FIGURES: Final[Sequence[Column]] = (
     ("epochs", "epochs", count),
@@ -48,16 +48,16 @@ _FIGURES: Final[Sequence[Column]] = (
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignReport:
-    """What a campaign found."""
+    """Results of a campaign."""
 
     sentences: tuple[str, ...]  #: At most five sentences: number of runs, accuracy, the worst, failures.
     tables: tuple[Table, ...]  #: Tables of the runs, of failed runs, of the worst epochs.
     charts: tuple[Chart, ...]
-    notes: tuple[str, ...]  #: On runs that could not be compared with their reference.
+    notes: tuple[str, ...]  #: Notes on runs that could not be compared with their reference.
 
 
 def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
-    """Sum up the runs of a campaign (`run_campaign`), and explain their worst epochs."""
+    """Summarise the runs of a campaign (`run_campaign`), and explain their worst epochs."""
     fields = runs.columns[: runs.columns.index("status")]
     rows, epochs, notes = [], [], []
     for row in runs.iter_rows(named=True):
@@ -129,7 +129,9 @@ def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
 
 
 def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the epoch with the largest error of each piece of the line and antenna; without errors, level or sigma."""
+    """Return the epoch with the largest error (without errors, level or sigma) of each piece of the line and
+    antenna.
+    """
     quantity = next(name for name in _QUANTITIES if name in table.columns and table[name].is_not_null().any())
     placed = table.filter(pl.col("chainage_m").is_not_null(), pl.col(quantity).is_not_null())
     length = float(np.ptp(placed["chainage_m"].to_numpy())) if len(placed) else 0.0

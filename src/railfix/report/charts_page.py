@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from railfix.track.network_read import NetworkQuality
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-#: Unknown value of an unsigned 16-bit number.
+#: Unsigned 16-bit number of an unknown value.
 _UNKNOWN: Final = 65535
 _OF_CHART: Final = (
     "title", "x_label", "y_label", "x_scale", "y_scale", "y_linear", "x_range", "y_range", "equal",
@@ -52,7 +52,9 @@ def script_json(value: Any) -> str:
 
 
 def pack_array(values: NDArray[Any], kind: str = "f") -> str:
-    """An array as base 64, little endian, after the letter of its kind: 32-bit float, unsigned of 16 or 32 bits."""
+    """Return an array as base 64, little endian, after the letter of its type: 32-bit float, unsigned of 16 or 32
+    bits.
+    """
     dtype = {"f": "<f4", "h": "<u2", "i": "<u4"}[kind]
     return kind + base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode("ascii")
 
@@ -103,7 +105,7 @@ def _cells(layer: Cells) -> dict[str, Any]:
 
 
 def sky_values(sky: SkyEpochs) -> dict[str, Any]:
-    """Return satellites in view as plain values; angles and C/N0 in hundredths."""
+    """Return satellites in view as plain values, with angles and C/N0 in hundredths."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
         "epoch": pack_array(sky.epoch_s),
@@ -176,7 +178,7 @@ _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'uns
 
 @dataclass(frozen=True)
 class Text:
-    """A text of a kind: "sentence", "absent" (why the page does not have something) or "command"."""
+    """Text of a kind: "sentence", "absent" (the reason for a missing part) or "command"."""
 
     kind: str
     text: str
@@ -189,7 +191,7 @@ ReportedCommand: Final = partial(Text, "command")
 
 @dataclass(frozen=True)
 class Notes:
-    """A list of sentences under a heading."""
+    """List of sentences under a heading."""
 
     kind: ClassVar[str] = "notes"
     title: str
@@ -198,7 +200,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Folded:
-    """A part that the reader opens."""
+    """Folded part of the page."""
 
     kind: ClassVar[str] = "folded"
     title: str
@@ -210,7 +212,7 @@ Block = Table | Text | Notes | Folded
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A chart or sky plot in the page."""
+    """Chart or sky plot in the page."""
 
     number: int
     chart: Chart | SkyEpochs
@@ -222,7 +224,7 @@ class Figure:
 
     @property
     def is_sky(self) -> bool:
-        """Whether it is a sky plot."""
+        """Whether the figure is a sky plot."""
         return isinstance(self.chart, SkyEpochs)
 
 
@@ -315,7 +317,7 @@ def figure(
     )  # fmt: skip
 
 
-#: Tracks that are listed at most.
+#: Largest number of listed tracks.
 _LISTED: Final = 5_000
 
 

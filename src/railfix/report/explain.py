@@ -1,5 +1,5 @@
-"""One epoch of a run explained: its position, each satellite and its outcome, what set sigma and level, and the effect
-of each satellite.
+"""Explanation of one epoch of a run: its position, the outcome of each satellite, the causes of sigma and level, and
+the effect of each satellite.
 
 Everything is read from the tables of the run. The position without a satellite is computed from the residuals by
 weighted least squares along, across and above the line, with the map's error as a prior and one free clock per
@@ -32,12 +32,12 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
     "off_map": "beyond an end of the map, or too far from the position without the map",
-    "map_end": "at an end of the map: the ranges put it a little beyond",
+    "map_end": "at an end of the map: the ranges place it slightly beyond",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
     "no_observation": "no position: the antenna has no observation",
-    "inconsistent": "the ranges contradict each other, and no exclusion mends it",
+    "inconsistent": "the ranges are inconsistent, and no exclusion resolves it",
     "antennas_disagree": "the positions of the two antennas are not as far apart as the antennas are",
     "uncertain": "its standard deviation is over the limit",
     "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or the train is on "
@@ -49,7 +49,7 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
 FILTER_STATUS: Final[Mapping[str, str]] = {
     "tracking": "one position, from measurements of this epoch",
     "several_branches": "several positions are possible; the most probable one is given",
-    "coasting": "predicted: no measurement of this epoch is believed",
+    "coasting": "predicted: no measurement of this epoch was accepted",
     "lost": "measurements contradict the track: positions are searched for again",
     "expired": "no position: dead reckoning for too long",
     "not_started": "no position yet: no epoch so far had redundant codes",
@@ -74,20 +74,20 @@ _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "stat
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """One epoch of one antenna."""
+    """Explanation of one epoch of one antenna."""
 
     run: Path
     antenna: str
     time: np.datetime64  #: GPS time of the epoch.
     asked: str  #: The requested time.
-    #: Rows of ``positions`` and ``train``; `track` is empty where the filter was off.
+    #: Rows of ``positions`` and ``train``; `track` is empty if the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
-    #: Every observation, those used first, with its elevation, residual and outcome, the weight and innovation that the
-    #: filter gave it, and for those used how far the single position would move along the line without it, and its
-    #: standard deviation then [m]; null where it would have none.
+    #: Every observation, used ones first, with elevation, residual, outcome, and its weight and innovation in the
+    #: filter. For used observations also the shift of the single-epoch position along the line without it, and the
+    #: standard deviation without it [m]; null if there would be no position.
     satellites: pl.DataFrame
-    sentences: tuple[str, ...]  #: Lines on position, sigma, level and status.
+    sentences: tuple[str, ...]  #: Sentences on position, sigma, level and status.
     neighbours: pl.DataFrame  #: Rows of ``positions`` and ``train`` of the epochs around it: `_NEIGHBOURS`.
 
 
@@ -165,7 +165,7 @@ def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
 def _without_each(
     satellites: pl.DataFrame, single: Mapping[str, Any], axes: Floats, map_sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Return how far the position moves along the line without each used satellite, and its sigma then."""
+    """Return the shift of the position along the line without each used satellite, and its sigma without it."""
     used = (satellites["reason_text"] == "used").to_numpy() & satellites["residual_m"].is_not_null().to_numpy()
     elevation, azimuth = (np.radians(satellites[name].to_numpy()) for name in ("elevation_deg", "azimuth_deg"))
     local = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
@@ -186,7 +186,7 @@ def _without_each(
 def _solve(
     design: Floats, sigma_m: Floats, residual_m: Floats, clocks: Strings, map_sigma_m: tuple[float, float]
 ) -> tuple[float, float] | None:
-    """Return step along the line and its sigma; None where the ranges do not determine it."""
+    """Return the step along the line and its sigma; None if the ranges do not determine it."""
     groups = np.unique(clocks)
     if len(residual_m) < len(groups) + 1:
         return None
@@ -283,5 +283,5 @@ def write_explanation(explanation: Explanation, path: Path) -> Path:
 
 
 def time_text(time: np.datetime64) -> str:
-    """Return a time to milliseconds, as people write it."""
+    """Return a time as text, to milliseconds."""
     return str(time)[:23].replace("T", " ")

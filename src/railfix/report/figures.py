@@ -33,7 +33,7 @@ from railfix.report.plots.screens import list_screens, missing_columns, screen_o
 from railfix.report.plots.signals import CN0_COLUMNS, SKY_COLUMNS, SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.report.runs import ReportedRun
 
-#: Number of listed epochs with an error above the level.
+#: Largest number of listed epochs with an error above the level.
 WORST: Final = 20
 NO_LEVELS: Final = "The run has no protection levels (protection is off)."
 _KINDS: Final = {
@@ -131,7 +131,7 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
                 ]
 
 
-#: Number of epochs with the largest errors that the sky plot includes.
+#: Number of epochs with the largest errors in the sky plot.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
     "No reference was given (--reference), so there are no errors, figures of merit and Stanford diagrams; intervals "
@@ -145,7 +145,7 @@ NO_TIMES: Final = "run.json has no processing times, so there is no chart of the
 
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
-    """Plan of the line and errors over chainage of one antenna, or protection levels without a reference."""
+    """Return the plan of the line and errors over chainage of one antenna, or protection levels without a reference."""
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     if errors is not None:
         beside = error_over_chainage(errors, filtered=run.filter_rows(antenna))
@@ -157,7 +157,7 @@ def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) 
 
 
 def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart:
-    """Plan, coloured by error, by protection level without a reference, or by status without either."""
+    """Return the plan, coloured by error, by protection level without a reference, or by status without either."""
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     level = floats(positions, "protection_level_m")
     return plan(
@@ -175,7 +175,9 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
 def antenna_groups(
     run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
 ) -> Iterator[Group]:
-    """Yield the charts of one antenna; `sky`: most epochs of the sky plot, `background`: lines below the plan [deg]."""
+    """Yield the charts of one antenna; `sky` is the largest number of epochs of the sky plot, `background` has lines
+    below the plan [deg].
+    """
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     start = find_start(positions)
     yield Group(title="The line", charts=_keep(_plan(run, antenna, background)), start=start)

@@ -19,7 +19,7 @@ from railfix.run.verdict import POSITIONS, judge_run
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFigure:
-    """A figure of single epochs with its name, the filter's figure, and the conventional one or a remark."""
+    """Key figure: name, single-epoch value, filter value, and conventional value or a remark."""
 
     name: str
     value: str
@@ -38,7 +38,7 @@ class Headline:
 
 
 def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> Headline:
-    """Return the verdict and key figures of one antenna, against the reference where there is one."""
+    """Return the verdict and key figures of one antenna, against the reference if there is one."""
     if evaluation is not None:
         passed = get_figures(evaluation, run, antenna, "constrained_ok")
         if passed.get("errors"):
@@ -47,7 +47,9 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
 
 
 def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> Headline:
-    """Return the headline with the figures of the evaluation: `passed` of single epochs that passed every check."""
+    """Return the headline with the figures of the evaluation; `passed` has the single epochs that passed every
+    check.
+    """
     other = get_figures(evaluation, run, antenna, "conventional")
     filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
     whose = "Single epochs have" if filtered else "The train has"
@@ -107,7 +109,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
-    """Return how many usable errors exceed their level, or without levels how the errors compare with the sigma."""
+    """Return the number of usable errors above their level, or without levels the ratio of errors to sigma."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         len(evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna))

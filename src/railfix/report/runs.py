@@ -31,7 +31,7 @@ from railfix.track import Track
 
 _OBSERVATIONS: Final = "observations.parquet"
 _NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
-#: Columns that the report uses besides those of every table: of the positions, of the filter, of the errors.
+#: Columns of the report in addition to those of every table: of the positions, of the filter, of the errors.
 _POSITIONS: Final = cs.contains("protection_level", "protection_status", "protection_cause", "_fault") | cs.by_name(
     "kilometrage_m", "n_rejected", "raim_statistic", "raim_threshold", "raim_level_m", "protection_kind",
     *(column.name for screen in SCREENS for column in screen.columns if column.table == "positions"),
@@ -47,20 +47,20 @@ _ERRORS: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedRun:
-    """One run with the content of its part of the report."""
+    """Run with the content of its part of the report."""
 
     name: str  #: Name of the folder, with as many parent folders as distinguish the runs.
     folder: RunFolder
     config: Config  #: Settings that were used.
-    observations: pl.LazyFrame | None  #: None where the run wrote none.
+    observations: pl.LazyFrame | None  #: Observations; None if the run wrote none.
     #: Columns of `railfix.evaluate.EPOCH_COLUMNS` that the report uses, and levels: of the single-epoch positions, and
     #: of the filter along the track; None without a reference or without a filter.
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
     train: pl.DataFrame | None  #: Times, positions and sigmas by the filter along the track, None without it.
-    reference: str  #: Path of the reference; empty without one.
-    conventional: Path | None  #: Run of the conventional positions, where it is another one.
-    track: Track | None  #: None where its files cannot be read.
+    reference: str  #: Path of the reference; empty without a reference.
+    conventional: Path | None  #: Run of the conventional positions, if it is a different run.
+    track: Track | None  #: Track; None if its files cannot be read.
     curve: Cn0Curve | None
     notes: tuple[str, ...]
 
@@ -79,15 +79,15 @@ class ReportedRun:
         return self.folder.positions.filter(antenna=antenna)
 
     def get_errors(self, antenna: str) -> pl.DataFrame | None:
-        """Return the rows of one antenna, None without a reference."""
+        """Return the errors of one antenna; None without a reference."""
         return None if self.errors is None else self.errors.filter(antenna=antenna)
 
     def filter_rows(self, antenna: str) -> pl.DataFrame | None:
-        """Return the rows of the filter along the track, None without."""
+        """Return the filter's rows; None without the filter."""
         return None if self.filtered is None else self.filtered.filter(antenna=antenna)
 
     def get_train(self, antenna: str) -> pl.DataFrame | None:
-        """Return positions by the filter along the track, None without."""
+        """Return the filtered positions; None without the filter."""
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
@@ -110,9 +110,9 @@ def read_runs(
     """Read runs, and evaluate them where there is a reference; None replaces the evaluation without references.
 
     `references`: none, one for all runs, or one for each in order. `conventional`: none, or for each run in order
-    another run on the same log, whose conventional positions are shown: one with the screens of elevation and C/N0
-    alone gives the unscreened ones of P1. The table of epochs of the evaluation is empty: the runs have the columns
-    that the report uses.
+    another run on the same log, whose conventional positions are shown; a run with the elevation and C/N0 screens only
+    gives the unscreened positions of P1. The evaluation's table of epochs is empty, because the runs have the columns
+    of the report.
 
     InputFileError, MismatchError: a file is not as expected, or a reference is not that of the run.
     SettingsError: the number of references or of conventional runs does not fit, or a run is given twice.
@@ -199,7 +199,7 @@ def _observations(path: Path) -> pl.LazyFrame | None:
 
 
 def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[str, ...]]:
-    """Return the C/N0 curve that the run used, or a note on why it is not drawn."""
+    """Return the C/N0 curve of the run, or a note that it is not drawn."""
     if config.cn0_curve is None:
         return None, ()
     path = next(iter(folder.input_paths("cn0_curve")), Path(config.cn0_curve))
@@ -210,7 +210,7 @@ def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[st
 
 
 def _track(folder: RunFolder) -> tuple[Track | None, tuple[str, ...]]:
-    """Track that the run used, or a note on why the line is drawn from the positions."""
+    """Return the track of the run, or a note that the line is drawn from the positions."""
     try:
         return read_run_track(folder), ()
     except RailfixError as error:

@@ -1,4 +1,4 @@
-"""Campaigns: many logs positioned adjacent, resumable, each with its own results folder.
+"""Campaigns: many logs positioned in one resumable command, each with its own results folder.
 
 The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables
 together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/positions.parquet")``.
@@ -48,14 +48,14 @@ class Campaign(Settings):
     track: tuple[str, ...]  #: Patterns of the track's files, joined to a route in this order.
     rear: str = ""
     sp3: str = ""
-    #: Patterns of one file per run; may be empty.
+    #: Patterns of one file for each run; may be empty.
     vehicle: str = ""
     tachometer: str = ""
     inertial: str = ""
     radar: str = ""
     reference: str = ""  #: Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
     config: Path | None = None
-    options: RunOptions = RunOptions()  #: Of every run.
+    options: RunOptions = RunOptions()  #: Options of every run.
 
 
 #: Patterns of several files per run, and of one.
@@ -90,7 +90,9 @@ class CampaignProgress(Protocol):
     """Callback for the progress of a campaign."""
 
     def __call__(self, *, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-        """Runs done, of these kept from an earlier call, failed, in total, and the estimated time left [s]."""
+        """Report the numbers of runs done, kept from an earlier call, failed and in total, and the estimated time left
+        [s].
+        """
 
 
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
@@ -156,9 +158,9 @@ def run_campaign(
     fails is a row with its error: the fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`,
     `ok_rate`, `wall_s`, `reference`, `folder` (below `out`).
 
-    `reading` replaces that of the campaign's options, where it differs from the default.
-    The executor is of `concurrent.futures`: processes on this machine, or any other with its interface whose workers
-    see the same files; by the errors `lost` it reports that a worker process is gone.
+    `reading` replaces the campaign's reading options where it differs from the default. The executor is of
+    `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the same files;
+    by the errors `lost` it reports that a worker process is gone.
     """
     runs = read_campaign(path, out)
     if reading not in (None, LogReading()):
@@ -211,7 +213,7 @@ def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
 
 
 def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Position one run, unless its results are there; return its row, and whether they were."""
+    """Position one run, unless its results exist; return its row, and whether they existed."""
     try:
         check_folder(run.out, overwrite="replace")
         if not (kept := run.done):

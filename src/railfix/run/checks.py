@@ -22,15 +22,15 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Number of conventional positions, all this far away, after which a run is stopped early.
+#: Number of conventional positions, and their distance from the line, after which a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
-#: Navigation records farther from the log than this are of another day.
+#: Largest time between the log and its navigation records; records further away are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: Records reach about this far beyond their reference time (Galileo, IODnav of 4 h and its margin).
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
-#: First and last time of something.
+#: First and last time.
 Span = tuple[np.datetime64, np.datetime64]
 
 

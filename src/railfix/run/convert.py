@@ -1,7 +1,7 @@
 """Receiver logs as RINEX files, positions of a run as messages of ROS 2, tables of EGNSS MATE in and out.
 
-Definitions of messages in an MCAP file are those of sensor_msgs, and of https://github.com/EGNSS-MATE/emate_ros (MIT),
-commit 9067868 of 16 April 2024, written for ROS 1; the third contains the row of the table.
+Message definitions in an MCAP file are from sensor_msgs, and from https://github.com/EGNSS-MATE/emate_ros (MIT), commit
+9067868 of 16 April 2024, written for ROS 1; the third contains the row of the table.
 """
 
 from __future__ import annotations
@@ -193,8 +193,8 @@ def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
 def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Track) -> dict[str, pl.DataFrame]:
     """Return R_TRACK and R_ETCS_TPR of the first antenna of a run, from rows of its tables.
 
-    The last relevant balise group is the one read last, by the passings, empty before the first; track edges are the
-    track's sections.
+    The last relevant balise group is the group read last according to the passings, empty before the first; track edges
+    are the track's sections.
     """
     rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
     chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()
@@ -265,5 +265,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return the columns of a table of the schema in their order; those without a value in railfix are empty."""
+    """Return the columns of a table of the schema in their order; columns without a value in railfix are empty."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

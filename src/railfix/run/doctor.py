@@ -32,7 +32,7 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.vehicle import read_vehicle
 
 _SECOND: Final = np.timedelta64(1, "s")
-_MOST_NOTES: Final = 5  #: Notes on one file that are shown.
+_MOST_NOTES: Final = 5  #: Largest number of notes shown for one file.
 Kind = Literal[
     "observations", "navigation", "orbits", "sbas", "track", "vehicle", "settings", "positions", "unknown"
 ]  # fmt: skip
@@ -109,7 +109,7 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
 
 
 def _find_kinds(path: Path) -> tuple[Kind, ...]:
-    """Return the kinds that a file can be of, the likely one first."""
+    """Return the possible kinds of a file, the likely kind first."""
     kind = find_kind(path)
     if kind in ("table", "gpx"):
         without: tuple[Kind, ...] = ("track",) if kind == "table" else ("positions", "track")
@@ -216,13 +216,13 @@ def _track(path: Path) -> FileFinding:
         segments = read_segments(path, MapReading(height_datum="ellipsoidal"))  # its checks need no geoid
         options = ("--height-datum", datum, *(("--geoid", "egm96") if kml else ()))
         problems = (
-            f"{path}: does not say above what its heights are; the command takes them as {datum}"
+            f"{path}: does not state its height datum; the command takes the heights as {datum}"
             f"{', as KML defines them' if kml else ''}; --height-datum and --geoid change that",
         )
     facts = []
     if any(segment.height_datum == NO_HEIGHTS for segment in segments):
         options = (*options, "--heights", "log")
-        facts.append("without heights: those of the log's own positions are taken (--heights log)")
+        facts.append("without heights: the heights of the log's own positions are used (--heights log)")
         segments = [replace(segment, height_m=np.zeros(len(segment.height_m))) for segment in segments]
     else:
         heights = np.concatenate([segment.height_m for segment in segments])

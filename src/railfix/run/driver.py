@@ -48,7 +48,7 @@ class Progress(Protocol):
     """Callback for the progress of a run."""
 
     def __call__(self, *, epochs: int, fraction: float) -> None:
-        """Epochs done so far, and the fraction of the logs that has been read, 0 to 1."""
+        """Report the epochs done so far, and the fraction of the logs that has been read, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +218,7 @@ def _position(
     beside: Executor,
     progress: Progress | None,
 ) -> Tally:
-    """Position chunk by chunk: counts and rows.
+    """Position chunk by chunk, and return counts.
 
     Five chunks are in work at a time: reading, screens, single epochs, filter, and writing by `beside`.
     """
@@ -274,7 +274,7 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return likely causes by antenna, of those without a position that fits the line; blank where none was found."""
+    """Return likely causes by antenna for antennas without a position on the line; blank if none was found."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
@@ -299,7 +299,7 @@ def _notes_of_sensors(
 
 #: Question of a note where positions are off the map and no cause was found.
 _TRACK: Final = "is this the right track?"
-#: Satellites left out by the filter that notes name.
+#: Largest number of left-out satellites that notes name.
 _NAMED: Final = 3
 
 
@@ -312,7 +312,7 @@ def collect_notes(
     *,
     note_statistic: float,
 ) -> tuple[str, ...]:
-    """Return the notes of a run, each once; of the map from `MapOffsetLimits.note_threshold` of its test on.
+    """Return the notes of a run, each once; on the map if its test statistic exceeds `MapOffsetLimits.note_threshold`.
 
     `causes`: why no position of an antenna is on the line, where that is so.
     """
@@ -368,7 +368,7 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     if sign == "left_map":
         return "the 3-D positions have left the map (column interference_causes)"
     if sign == "contradicted":
-        return "all positions of the minute before failed a check, so that none of the filter is sure,"
+        return "all positions of the previous minute failed a check, so that no filtered position is certain,"
     if sign != "time_tags":
         return f"interference: {sign}"
     low, high = tag_error_s
@@ -380,12 +380,12 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     return f"the time tags are {size} {which}, so that no position has a level ({guess}?)"
 
 
-#: Errors of time tags that differ by more are not constant [s].
+#: Largest spread of a constant time-tag error [s].
 _STEADY_S: Final = 0.5
 
 
 def _describe_detectable(detectable_m: Floats) -> str:
-    """Return which offsets of the map the run does not exclude, one clause."""
+    """Return a clause on the map offsets that the run cannot detect."""
     if np.isnan(detectable_m).any():
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
@@ -427,7 +427,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
 
 
 def _footer(files: Iterable[Mapping[str, Any]], notes: Iterable[str]) -> dict[str, str]:
-    """RunProvenance in short, for the footer of the Parquet files."""
+    """Return a short provenance of the run for the footer of the Parquet files."""
     return {
         "railfix": __version__,
         "command": " ".join(sys.argv),

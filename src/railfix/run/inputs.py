@@ -34,7 +34,7 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
-#: Texts of options that several commands have.
+#: Texts of options shared by several commands.
 NAVIGATION: Final = (
     "Navigation file, RINEX or a receiver's log; repeat it for several. Without it a receiver's log is used with its "
     "own "
@@ -54,7 +54,7 @@ BALISE_LIST: Final = (
     "the beginning of that track) and sigma_m."
 )
 VIRTUAL_BALISES: Final = (
-    "Points whose passing is reported with its interval: a list like that of --balise-list. Needs levels."
+    "Points whose passing is reported with its interval: a list in the format of --balise-list. Needs levels."
 )
 
 
@@ -105,7 +105,7 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run, each described by its option; those without one are named by the settings."""
+    """Input files of a run, each described by its option; files without an option are named by the settings."""
 
     own_navigation = ("front", "rear")
     front: tuple[Path, ...] = input_option(
@@ -116,8 +116,8 @@ class RunInputs(InputFiles):
     nav: tuple[Path, ...] = input_option(NAVIGATION, ())
     track: tuple[Path, ...] = input_option(TRACK, (), metavar="TRACK")
     mate: Path | None = input_option(
-        "Folder with tables of EGNSS MATE, in place of --front, --track and the sensors; an option beside it goes "
-        "before its table.",
+        "Folder with tables of EGNSS MATE, instead of --front, --track and the sensors; an option given as well "
+        "replaces its table.",
         None,
         metavar="FOLDER",
     )
@@ -133,7 +133,7 @@ class RunInputs(InputFiles):
     heights: Path | None = input_option(
         "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or "
         "kilometrage_m, "
-        "positions of a run, or the word log for those of the log itself.",
+        "positions of a run, or the word log for the log's own heights.",
         None,
     )
     vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
@@ -150,7 +150,7 @@ class RunInputs(InputFiles):
     )
     ranging_units: Path | None = input_option("Surveyed ground units: CSV with unit, x_m, y_m, z_m (ECEF).", None)
     balises: Path | None = input_option(
-        "Balises that the train has read: CSV or Parquet with time_gpst, balise and, where it is known, sigma_m.", None
+        "Balises read by the train: CSV or Parquet with time_gpst, balise and, where it is known, sigma_m.", None
     )
     balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
     virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
@@ -264,7 +264,7 @@ def _check_file(name: str, path: Path) -> None:
         raise InputFileError(path, f"cannot be read ({error.strerror}); check what {name} names") from error
 
 
-#: Last whole year of times to the nanosecond in 64 bits.
+#: Last full year of 64-bit times in nanoseconds.
 LAST_YEAR: Final = 2261
 
 
@@ -338,7 +338,7 @@ class LogReading(Settings):
     )
 
     reader: Reader = option(
-        "What reads RINEX observation files: railfix, or georinex, an independent reader to compare with, which is "
+        "Reader of RINEX observation files: railfix, or georinex, an independent reader to compare with, which is "
         "slower, reads whole files at once, and knows neither events nor broken lines.",
         "railfix",
     )
@@ -355,7 +355,7 @@ class LogReading(Settings):
 
     @property
     def instant(self) -> np.datetime64 | None:
-        """The date as the readers take it."""
+        """The date as an argument of the readers."""
         return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
 
 
@@ -379,7 +379,7 @@ class ColumnNames(Settings):
 
     @property
     def names(self) -> dict[str, str]:
-        """Name in the file by that in railfix; SettingsError where a text is not NAME=COLUMN."""
+        """Column names in the file by railfix name; SettingsError if a text is not NAME=COLUMN."""
         return column_names(self.column)
 
 
@@ -389,7 +389,7 @@ class RunOptions(Settings):
     start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
     base_place: str | None = option(
-        "Position of the base station, in the frame of the satellites; from its header without it.",
+        "Position of the base station in the frame of the satellites; by default from its header.",
         None,
         metavar="LAT,LON,HEIGHT",
     )
@@ -412,7 +412,7 @@ class RunOptions(Settings):
 
     @property
     def of_filter(self) -> list[str]:
-        """Options given that need the filter along the track."""
+        """Given options that need the filter along the track."""
         return ["smooth"] if self.smooth == "on" else []
 
     @field_validator("start", "end")

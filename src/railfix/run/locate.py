@@ -1,4 +1,4 @@
-"""Logs without a track map: 3-D positions, a surveyed map of several runs, features as measured (P2 2.3)."""
+"""Logs without a track map: 3-D positions, a map surveyed from several runs, measured features (P2 2.3)."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def locate_files(
 
 
 def reasons_text(located: Located) -> str:
-    """Return how many epochs have no position for each reason; "" where every epoch has one."""
+    """Return the number of epochs without a position for each reason; "" if every epoch has a position."""
     found = Counter(located.no_position.tolist())
     return ", ".join(f"{count} {NoPosition(reason).text}" for reason, count in sorted(found.items()) if reason)
 
@@ -118,23 +118,23 @@ def solution_text(located: Located) -> str:
     return "\n".join(lines) + "\n"
 
 
-#: Epochs of a log that are positioned together.
+#: Number of epochs positioned together.
 _CHUNK_EPOCHS: Final = 3000
-#: Epochs that are tried, and how near the line a position is on it, in plan [m].
+#: Number of epochs tested, and distance in plan within which a position is on the line [m].
 _EPOCHS: Final = 5
 _ON_LINE_M: Final = 150.0
-#: Positions this far above or below the line have another cause than range errors [m].
+#: Height difference from the line that range errors do not explain [m].
 _HEIGHT_M: Final = 30.0
 #: Seconds between GPS time and UTC since 2017; BeiDou time is 14 s behind GPS time.
 _LEAP_S: Final = 18
 _BEIDOU_S: Final = 14
-#: Hours between time zones that are tried.
+#: Time-zone shifts that are tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
 
 
 def likely_cause(observations: Observations, received: Received, config: Config, line: Trajectory) -> str:
-    """Return why the positions of a log may lie off the line, in a clause; "" if no cause was found.
+    """Return a clause on the likely reason for positions off the line; "" if no cause was found.
 
     Conventional positions of some epochs are compared with the line: in height, and with the time tags shifted by leap
     seconds and by whole hours.
@@ -158,7 +158,7 @@ def likely_cause(observations: Observations, received: Received, config: Config,
 
 
 def _shifts_s() -> Iterator[int]:
-    """Yield shifts of time tags that mistakes make, the smallest first [s]."""
+    """Yield time-tag shifts due to common mistakes, the smallest first [s]."""
     for seconds in (_LEAP_S, _BEIDOU_S):
         yield from (seconds, -seconds)
     for hours in range(1, _HOURS + 1):
@@ -177,13 +177,13 @@ def _offset_m(
     arc, _ = line.nearest(place[None])
     height = float(geodetic_from_ecef(place)[2])
     of_line = float(geodetic_from_ecef(line.at_arc(arc)[0])[2])
-    # moved to the height of the line, where it may be of any height
+    # moved to the height of the line, whose heights may be arbitrary
     level = place * (1.0 + (of_line - height) / float(np.linalg.norm(place)))
     return float(line.nearest(level[None])[1][0]), height - of_line, of_line
 
 
 def _cause_in_height(above_m: float, of_line_m: float) -> str:
-    """Say that the line is too high or too low, and which unit explains it."""
+    """Return a clause on the height of the line, and the unit that explains it."""
     height = of_line_m + above_m
     feet = abs(of_line_m * _FEET - height) < abs(above_m) / 4.0
     hint = "are the heights of the map in feet?" if feet else "is the height datum of the map the right one?"
@@ -279,19 +279,19 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
 
 #: Columns of ``train.parquet`` with measured properties of the line, and the unit of the second and third.
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
-#: A change counts when it is this multiple of its standard deviation, from this many values on either side.
+#: Significance of a change in standard deviations, and number of values on either side.
 _SIGMAS: Final = 5.0
 _LEAST_VALUES: Final = 3
 #: Iterations that centre the window on a change.
 _CENTRED: Final = 5
-#: A slip affects the gradient for some time before it is detected: values this near to one are left out.
+#: Time around a slip in which values are left out, because a slip affects the gradient before it is detected.
 _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
 
 
 def read_measured(folder: Path) -> pl.DataFrame:
     """Read the measured properties of the line from a run, by chainage; of two antennas the rows of the first.
 
-    InputFileError: the folder has no results of a filter, or these none by wheel and inertial unit.
+    InputFileError: the folder has no filter results, or these have no values by wheel and inertial unit.
     """
     path = folder / "train.parquet"
     with reading_table(path, "has no measured line ({}); give a folder of railfix run"):
@@ -311,15 +311,17 @@ def read_measured(folder: Path) -> pl.DataFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredFeature:
-    """A feature that runs show together."""
+    """Feature detected from all runs together."""
 
-    feature: Feature  #: Its `arc_m` is a chainage.
-    places_m: Floats  #: Its chainage by each of the runs that detect it alone, shape (R,).
+    feature: Feature  #: Feature, whose `arc_m` is a chainage.
+    places_m: Floats  #: Its chainage from each run that detects it alone, shape (R,).
     map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
 
 
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
-    """Return the features that all runs (`read_measured`) together show, in order; `of_map`: features of the map."""
+    """Return the features detected from all runs (`read_measured`) together, in order; `of_map` are features of the
+    map.
+    """
     alone = [_features(run) for run in runs]
     found = []
     for feature in _features(pl.concat(runs).sort(_COLUMNS[0])):
@@ -330,14 +332,14 @@ def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) 
 
 
 def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
-    """Position of the nearest one of the same kind and direction; NaN where none is near."""
+    """Return the position of the nearest feature of the same kind and direction; NaN if none is near."""
     alike = [f.arc_m for f in others if f.quantity == feature.quantity and f.change * feature.change > 0.0]
     near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * BASE_M]
     return min(near, key=lambda at: abs(at - feature.arc_m), default=float("nan"))
 
 
 def _features(rows: pl.DataFrame) -> list[Feature]:
-    """Return the features of rows by chainage; stretches without values part them."""
+    """Return the features of rows by chainage; stretches without values separate them."""
     at = rows[_COLUMNS[0]].to_numpy()
     grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), STEP_M)
     first = np.searchsorted(at, grid - 0.5 * BASE_M)

@@ -8,7 +8,7 @@ from typing import Any, Final
 from railfix.core.errors import InputFileError
 from railfix.io.mate import mate_table
 
-#: Inputs of a run by the table that gives them; of the two tables of the track the first that is there.
+#: Inputs of a run by table; of the two track tables the first existing one is used.
 _INPUTS: Final = {
     "S_GNSS_SAT": "front", "S_DM_TRACKPOINT": "track", "S_DM_TRACK_SEGMENT_POSITION": "track", "S_IMU": "inertial",
     "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "balise_list",
@@ -16,7 +16,7 @@ _INPUTS: Final = {
 
 
 def find_inputs(folder: Path) -> dict[str, Any]:
-    """Return the inputs of a run that the tables in a folder give, by the names of `railfix.run.inputs.RunInputs`.
+    """Return the inputs of a run from the tables in a folder, with the names of `railfix.run.inputs.RunInputs`.
 
     InputFileError: the folder has no S_GNSS_SAT, or no table of the track.
     """

@@ -142,7 +142,7 @@ def _try_lock(file: IO[str]) -> bool:
 
 #: Rows of a group of a file, which is combined in memory.
 _GROUP: Final = 30_000
-#: How often a caller that waits looks whether the writer has failed [s].
+#: Interval at which a waiting caller checks the writer for a failure [s].
 _LOOK_S: Final = 0.1
 
 
@@ -213,12 +213,12 @@ _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "png": ("a picture in PNG", (".png",), ""),
     "map": ("a file for maps", (".kml", ".gpx", ".geojson", ".gpkg", ".parquet", ".mcap"), ""),
 }
-#: How times are written to CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
+#: Format of times in CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
-#: Rows that `OutputFolder.change` reads at a time.
+#: Number of rows that `OutputFolder.change` reads at a time.
 _ROWS: Final = 50_000
 
-#: Times that a folder is tried to be made while other runs make and remove those above it.
+#: Number of attempts to make a folder while other runs make and remove its parent folders.
 _ATTEMPTS: Final = 10
 
 
@@ -253,7 +253,7 @@ class OutputFolder:
                 raise
 
     def _make(self) -> None:
-        """Make the folder and those above it, which other runs may make, or remove again, at the same time."""
+        """Make the folder and its parents, which other runs may make or remove at the same time."""
         for left in reversed(range(_ATTEMPTS)):
             try:
                 for folder in reversed([p for p in (self.path, *self.path.parents) if not p.exists()]):
@@ -418,7 +418,7 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn errors of the system about a file into one sentence."""
+    """Convert system errors on a file to an OutputError of one sentence."""
     from polars.exceptions import PolarsError
 
     try:
@@ -430,7 +430,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def finite_values(value: Any) -> Any:
-    """Return the same plain values with NaN and infinities as words."""
+    """Return plain values with NaN and infinities as words."""
     if isinstance(value, Mapping):
         return {key: finite_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

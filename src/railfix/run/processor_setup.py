@@ -28,9 +28,9 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings with the priors of faults, and the stretches without a level, of the error model that they name.
+    """Return settings with the fault priors, and the stretches without a level, of their error model.
 
-    Those that the settings give themselves stay, and all do where the model does not bound its priors.
+    Explicitly given settings stay unchanged, and all settings do if the model does not bound its priors.
     """
     given = config.risk.model_fields_set & {"local_prior", "side_prior", "priors"}
     if config.error_model is None or given:
@@ -55,9 +55,9 @@ def make_processor(
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
     `track` is the line itself, for positions by its features; `units` are the surveyed stations of two-way ranges,
-    `balises` the positions of those that the train reads. `base_ecef_m`: position of a base station; "stream": the
-    position in the headers of its observations. InputFileError: a file named by the settings is not as expected.
-    SettingsError: SBAS and precise ephemerides together, or no SBAS message of the requested GEO.
+    `balises` the positions of the balises. `base_ecef_m`: position of a base station; "stream": the position in the
+    headers of its observations. InputFileError: a file named by the settings is not as expected. SettingsError: SBAS
+    and precise ephemerides together, or no SBAS message of the requested GEO.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
@@ -81,12 +81,12 @@ def make_processor(
     )
 
 
-#: Time tags of the base station up to this after those of the train count as the same instant.
+#: Largest delay of the base station's time tags after the train's that counts as the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
 def parse_position(text: str, option: str) -> Floats:
-    """Return a position given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
+    """Parse a position LAT,LON,HEIGHT of the command line to ECEF, shape (3,) [m]."""
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
     except ValueError:
@@ -105,10 +105,10 @@ class BaseLog:
         if self._waiting is None:
             raise InputFileError(log.paths[0], "has no epoch in the requested time")
         header = self._waiting.header
-        self.span = self._waiting.time[0], self._waiting.time[-1]  #: Times of the epochs read so far.
+        self.span = self._waiting.time[0], self._waiting.time[-1]  #: Times of the epochs read so far [ns].
         self.ecef_m = header.approximate_ecef_m if place is None else parse_position(place, "--base-place")
         if not np.linalg.norm(np.nan_to_num(self.ecef_m)) > 1e6:
-            raise InputFileError(log.paths[0], "its header has no position; give that of the station (--base-place)")
+            raise InputFileError(log.paths[0], "its header has no position; give the station's position (--base-place)")
 
     def until(self, time: np.datetime64) -> Observations | None:
         """Return the epochs up to a time that have not been returned before."""

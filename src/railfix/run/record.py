@@ -34,17 +34,16 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Figures of an antenna without rows.
-#: Limits that levels of the filter are counted at [m].
+#: Figures of an antenna without rows. Limits at which the filter's levels are counted [m].
 WITHIN_M: Final = (20, 50)
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
-    """Return percentiles of each antenna from the rows written [m]; None replaces what the run does not have.
+    """Return percentiles of each antenna from the rows written [m]; None for missing figures.
 
-    Statistics of sigma along the line; of finite protection levels, with epochs by status; of the filter, with epochs
-    by status, and its levels with the numbers of those within `WITHIN_M`.
+    The figures are statistics of sigma along the line; of finite protection levels, with epochs by status; and of the
+    filter, with epochs by status, and its levels with the numbers within `WITHIN_M`.
     """
     return {
         name: {
@@ -109,11 +108,11 @@ class RunProvenance:
     """Inputs of a run."""
 
     files: Sequence[Mapping[str, Any]]  #: Inputs with size and hash.
-    packages: Mapping[str, str]  #: `package_versions`.
+    packages: Mapping[str, str]  #: Result of `package_versions`.
     asked: Mapping[str, Any]  #: Settings as given.
-    config: Config  #: Settings that were in force.
+    config: Config  #: Settings in force.
     options: RunOptions  #: Options that are not settings of the positions.
-    line: Mapping[str, Any]  #: Facts of the track map, the vehicle and the trajectories.
+    line: Mapping[str, Any]  #: Properties of the track map, the vehicle and the trajectories.
     navigation: Navigation
 
 
@@ -194,9 +193,9 @@ class RunRecord:
 
     @cached_property
     def config(self) -> Config:
-        """Settings that were used, with the files they name where these are now.
+        """Settings that were used, with the current paths of their files.
 
-        Settings that earlier versions recorded and that never changed a result are left out. InputFileError: the record
+        Recorded settings of earlier versions that never affected a result are left out. InputFileError: the record
         lacks them, or they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
@@ -210,7 +209,7 @@ class RunRecord:
 
     @cached_property
     def inputs(self) -> RunInputs:
-        """Input files, where they are now."""
+        """Input files with their current paths."""
         kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
         several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
         values = {
@@ -253,7 +252,7 @@ class RunRecord:
         )
         if not complete:
             raise InputFileError(
-                self.path / "run.json", "has inputs that are no list of input, path and sha256; repeat the run"
+                self.path / "run.json", "inputs must be a list of input, path and sha256; repeat the run"
             )
         return list(entries)
 
@@ -284,7 +283,7 @@ _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
 def level_basis(record: Facts) -> str:
-    """Return the term for the levels of a run: their priors are measured, or assumed."""
+    """Return the term for the levels of a run, by measured or assumed priors."""
     risk = (record.get("settings_used") or {}).get("risk") or {}
     return "protection" if risk.get("priors") == "measured" else "indicative protection"
 
@@ -292,7 +291,7 @@ def level_basis(record: Facts) -> str:
 def budget_tables(antennas: Mapping[str, Facts], basis: str) -> list[Table]:
     """Return the filter by status, where it is on, single epochs by status, and pseudoranges by reason.
 
-    `antennas` are those of ``run.json``; fields that a record of an earlier version lacks are shown as a dash.
+    `antennas` are from ``run.json``; fields missing in a record of an earlier version are shown as a dash.
     """
     filtered = {name: facts["filter"] for name, facts in antennas.items() if facts.get("filter")}
     caption = "Single epochs (positions.csv)" if filtered else "Epochs by status"
@@ -349,7 +348,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield epochs with too few satellites: the reason that left too few, and those that it alone did."""
+    """Yield epochs with too few satellites by the reason that left too few, with the number due to it alone."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):
@@ -385,7 +384,7 @@ def _ratio(part: float, whole: float) -> float | None:
 
 
 def _metres(what: str, found: Sequence[Facts | None], fields: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a row for each field of the antennas' figures, None where missing."""
+    """Yield a row for each field of the antennas' figures, with None where missing."""
     for label, field in fields.items():
         yield [f"{what}, {label}", *(number(None if each is None else each[field], 2, " m") for each in found)]
 

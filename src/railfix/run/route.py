@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import polars as pl
@@ -33,25 +33,22 @@ from railfix.track.network import UNMAPPED_PRIOR, Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
 from railfix.track.network_route import find_route, left_out_note
 
-if TYPE_CHECKING:
-    from railfix.run.processor_setup import BaseLog
-
-#: Interval of the positions that are matched [s].
+#: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
 #: Tracks of the route within this distance are candidates for a position on it [m]; difference between lengths in plan
 #: and along the line.
 _REACH_M: Final = 50.0
 _LENGTHS_DIFFER: Final = 1e-3
-#: Least probability of another track than the route's at which it is written and named.
+#: Minimum probability of another track for it to be written and named.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
-#: Alternatives named in the notes; all are in ``run.json``.
+#: Number of alternatives named in the notes; all are in ``run.json``.
 _NAMED: Final = 8
-#: Epochs of an alternative nearer than this belong together [s].
+#: Largest gap within one alternative [s].
 _TOGETHER_S: Final = 60.0
-#: Probability of a track that the map lacks, above which the log indicates one: twice the prior.
+#: Probability of an unmapped track above which the log indicates one: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
-#: Name of a track that the map does not have.
+#: Name of an unmapped track.
 NONE: Final = "none"
 
 #: Additional columns of positions on a network.
@@ -60,19 +57,19 @@ ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
     "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the alternatives",
     "unmapped_probability": "probability of a track that the map lacks, given the whole log",
-    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from that "
-    "track; positive right of it",
-    "unconstrained_up_m": "height of that position above the track, less the antenna's where the vehicle is known",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, to the right "
+    "of that track",
+    "unconstrained_up_m": "height of that position above the track, less the antenna height if the vehicle is known",
 }
 #: Columns of the table of tracks near each position.
 TRACK_COLUMNS: Final[dict[str, str]] = {
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
     "track": "track of the network; `none`: a track that the map does not have",
-    "on_route": "whether it is of the route on which the positions are computed",
-    "probability": "of this track given the whole log; the rows of an epoch and antenna add up to 1",
+    "on_route": "whether the track belongs to the route on which the positions are computed",
+    "probability": "probability of this track given the whole log; the rows of an epoch and antenna sum to 1",
     "chainage_m": "distance in plan along the track from its first point, of the nearest point to the position",
-    "kilometrage_m": "the line's own marking there, where the map has one",
+    "kilometrage_m": "kilometrage as marked on the line at that point, if the map has it",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
     "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive right of it",
 }
@@ -101,7 +98,7 @@ class Alternative:
 
     @property
     def sentence(self) -> str:
-        """For the notes of a run."""
+        """Sentence for the notes of a run."""
         span = f"{str(self.first)[:19]} to {str(self.last)[11:19]}"
         return f"route: from {span} the train may be on {self.track} instead of {self.instead_of} " + (
             f"(probability up to {self.probability:.2f})"
@@ -116,7 +113,7 @@ class RouteOfLog:
     tracks: tuple[int, ...]  #: Tracks of the route, in order.
     #: Tracks of the most probable sequence that no route joins to those: the train turned back over them.
     left_out: tuple[int, ...]
-    log: PlanLog  #: Positions that were matched, in the frame of the network.
+    log: PlanLog  #: Matched positions in the frame of the network.
     matched: Matched
     time: np.datetime64  #: Coordinates at the frame's epoch.
     reading: TrackReading
@@ -127,12 +124,12 @@ class RouteOfLog:
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
 
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
-        """Return whether another track than the route's has a probability above a risk.
+        """Return whether a track outside the route has a probability above a risk.
 
-        A track that the map lacks counts beyond `_UNMAPPED_LIMIT`: up to there it is in the levels (`with_unmapped`).
-        Computed from the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside
-        another has its own probability. At the positions matched before and after each time: the track between two that
-        are known may be another.
+        An unmapped track counts above `_UNMAPPED_LIMIT`; below it the levels include it (`with_unmapped`). It is
+        computed from the tracks of the route within `_REACH_M` of each chainage, because parallel parts of the route
+        have their own probabilities, and at the matched positions before and after each time, because the track may
+        differ between two known ones.
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
@@ -143,7 +140,9 @@ class RouteOfLog:
         return np.asarray(np.fmin(*known) < 1.0 - risk)
 
     def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
-        """Probability of the tracks of the route near chainages, at matched positions; of all without a chainage."""
+        """Return the probability of the route's tracks near chainages, at matched positions; of all its tracks without
+        a chainage.
+        """
         lengths = self.network.length_m[list(self.tracks)]
         end = np.cumsum(lengths)
         reach = _REACH_M + _LENGTHS_DIFFER * end[-1]
@@ -155,13 +154,13 @@ class RouteOfLog:
 
     @cached_property
     def unmapped(self) -> Floats:
-        """Probability of a track that the map does not have, shape (n,)."""
+        """Probability of an unmapped track, shape (n,)."""
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
 
     def with_unmapped(self, config: Config) -> Config:
-        """Return the settings with the probability of a track that the map lacks as the prior of a wrong map.
+        """Return the settings with the probability of an unmapped track as the prior of a wrong map.
 
-        It is the largest of the log, at most `_UNMAPPED_LIMIT`: where it is more there is no level.
+        It is the largest probability of the log, at most `_UNMAPPED_LIMIT`; above that there is no level.
         """
         share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
         limits, risk, araim = config.tracking, config.risk, config.araim
@@ -299,22 +298,33 @@ class RouteOfLog:
         )
 
 
+class BaseObservations(Protocol):
+    """Observations of a base station in order of time (`railfix.run.processor_setup.BaseLog`)."""
+
+    ecef_m: Floats  #: Position of the station; shape (3,).
+
+    def until(self, time: np.datetime64) -> Observations | None:
+        """Return the epochs up to a time that have not been returned before."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LogPositions:
-    """Conventional positions of a log once a second, from which a line that is not known yet is found."""
+    """Conventional positions of a log once per second, from which an unknown line is found."""
 
-    path: str  #: Names the log in messages.
+    path: str  #: Name of the log in messages.
     parts: Callable[[], Iterable[Observations]]  #: The pieces of the log in order of time.
     navigation: Navigation
     config: Config
     time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
     reading: TrackReading
     antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
-    open_base: Callable[[], BaseLog | None] = lambda: None  #: Open the log of a base station; None without one.
+    open_base: Callable[[], BaseObservations | None] = lambda: (
+        None
+    )  #: Open the log of a base station; None without one.
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions of quality 5, single, or 4 with a base station; NoPositionError where the log has none."""
+        """Positions of quality 5 (single), or 4 with a base station; NoPositionError if the log has none."""
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         base, state, located = self.open_base(), BaseState(), []
         station = None if base is None else BaseStation(self.config, base.ecef_m)

@@ -1,6 +1,7 @@
 """Checks of the sensors on board against the positions of single epochs: signs, units, axes, time tags, diameter.
 
-These do not depend on the sensors, as the speeds of the filter do: a sensor mounted backwards moves the filter too.
+Single epochs do not depend on the sensors, but the filter's speeds do: a sensor mounted backwards affects the filter
+too.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from railfix.tracking import Line
 
 #: Positions are averaged over cells of this length [s].
 _CELL_S: Final = 4.0
-#: A train that moves, for signs of speeds [m/s].
+#: Minimum speed for a check of signs [m/s].
 _MOVING_MPS: Final = 1.0
-#: Number of cells required for a statement, and the least root mean square of compared quantities: changes of a force
+#: Number of cells required for a statement, and minimum root mean square of the compared quantities: changes of a force
 #: [m/s2] and of a speed [m/s], a rate [rad/s].
 _LEAST_CELLS: Final = 15
 _LEAST_FORCE_MPS2: Final = 0.08
@@ -36,7 +37,7 @@ _LEAST_RATE_RADPS: Final = 0.003
 #: A slope of measured over expected values below this is a reversed sign, above that a rate in degrees.
 _REVERSED: Final = -0.3
 _IN_DEGREES: Final = 10.0
-#: Lags that are tried, and the least that is reported [s]; the residual without a lag must be larger by this factor.
+#: Tested lags, and smallest reported lag [s]; the residual without a lag must be larger by this factor.
 _LONGEST_LAG_S: Final = 20.0
 _LEAST_LAG_S: Final = 2.0
 _LESS_ALIKE: Final = 2.0
@@ -49,8 +50,8 @@ class PositionMotion:
     """Motion of an antenna by its positions, M cells of time; NaN where a neighbour is missing."""
 
     time: Datetimes  #: Shape (M,).
-    #: Toward rising chainage; the gradient is that of the line, as climb over horizontal length, and the heading, too,
-    #: with its rate positive to the right; shape (M,).
+    #: Chainage, speed and acceleration toward rising chainage; gradient of the line as climb over horizontal length,
+    #: and its heading, whose rate is positive to the right; shape (M,).
     speed_mps: Floats
     acceleration_mps2: Floats
     gradient: Floats
@@ -81,7 +82,7 @@ def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMoti
 def sign_notes(
     samples: SensorSamples, places: pl.DataFrame, trajectory: Trajectory, tachometer: TachometerLimits
 ) -> Iterator[str]:
-    """Yield a sentence on each sensor with a wrong sign, unit, axis, or time tags seconds off.
+    """Yield a sentence on each sensor with a wrong sign, unit or axis, or with time tags off by seconds.
 
     `places`: positions with ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
     """
@@ -133,7 +134,7 @@ def _of_speeds(
 
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
-    """Return the lag of the sensor's time tags behind the satellites' [s]; 0 where none of seconds is certain."""
+    """Return the lag of the sensor's time tags behind the satellites' [s]; 0 if no lag of seconds is certain."""
     x, found = _centre(expected), {}
     for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
         y = measured(time + timedelta(np.array([lag])))
@@ -201,17 +202,17 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
     return float((x * y).sum() / (x * x).sum())
 
 
-#: Speeds of the wheel are compared this far apart [ns].
+#: Interval of the compared wheel speeds [ns].
 _STEP_NS: Final = 500_000_000
-#: Speeds by satellites are known this near to an instant [s].
+#: Largest time from an instant to a satellite speed [s].
 _NEAR_S: Final = 1.5
-#: Scale and lag that are reported.
+#: Smallest reported scale error and lag.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
-#: A larger difference is no worn wheel.
+#: Largest scale error of a worn wheel.
 _OTHER_TEETH: Final = 0.1
-#: Ranges are compared with satellite positions within this time [s], from a moving train, to a unit within this
-#: distance [m] and seen along the track with at least this cosine; this many are required on each side.
+#: Comparison of ranges with satellite positions: largest time difference [s], minimum speed, largest distance of the
+#: unit [m], minimum cosine of its direction along the track, and number required on each side.
 _BETWEEN_S: Final = 3.0
 _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0
@@ -225,7 +226,7 @@ _RANGE_M: Final = 3.0
 class SensorChecks:
     """Positions and speeds of one antenna by satellites, for the comparison with the sensors on board."""
 
-    #: By Dopplers (`doppler_speeds`), and of single epochs that passed every check; per chunk.
+    #: Doppler speeds (`doppler_speeds`), and single-epoch positions that passed every check; per chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
     places: list[pl.DataFrame] = field(default_factory=list)
 
@@ -243,7 +244,7 @@ class SensorChecks:
             return ()
         places = pl.concat(self.places)
         reversed_ones = tuple(sign_notes(samples, places, trajectory, limits.tachometer))
-        if reversed_ones:  # the filter's speeds, which the rest is compared with, depend on these sensors
+        if reversed_ones:  # the filter's speeds, the reference of the other checks, depend on these sensors
             return reversed_ones
         notes = sensor_notes(samples, pl.concat(self.speeds), limits.tachometer)
         if units is not None and len(samples.ranging):
@@ -263,7 +264,7 @@ class SensorChecks:
 def range_notes(
     ranging: StationRanges, units: GroundUnits, places: pl.DataFrame, trajectory: Trajectory, limits: SensorLimits
 ) -> Iterator[str]:
-    """Yield sentences on ranges that are displaced along the track, or too long, compared with satellite positions.
+    """Yield sentences on ranges that are displaced along the track, or biased, compared with satellite positions.
 
     `places` has ``time_gpst`` and ``chainage_m`` of an antenna, `limits` the position of the vehicle's ranging unit.
     """
@@ -318,16 +319,16 @@ def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
 
 
 def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
-    """Return a sentence on each sensor whose speeds are in another unit, late, or off in scale.
+    """Return a sentence on each sensor whose speeds have a wrong unit, a delay, or a scale error.
 
-    `speeds` are those by satellites of one antenna (`doppler_speeds`). `tachometer` is the wheel as entered.
+    `speeds` are the satellite speeds of one antenna (`doppler_speeds`), `tachometer` the wheel as entered.
     """
     right_time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
     right = speeds["speed_mps"].to_numpy()
     notes: list[str] = []
     if len(samples.radar):
         found = _check(samples.radar.time, samples.radar.speed_mps, right_time, right)
-        notes += _sentences("radar", found, "its speeds are {:+.1f} % off those by Dopplers")
+        notes += _sentences("radar", found, "its speeds differ from Doppler speeds by {:+.1f} %")
     if len(samples.tachometer):
         first, last = (int(t.astype(np.int64)) for t in samples.tachometer.time[[0, -1]])
         grid = np.arange(first, last, _STEP_NS).astype("datetime64[ns]")
@@ -344,7 +345,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
 
 
 def _check(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
-    """Return speeds against those by satellites; None with too few in common."""
+    """Compare speeds with satellite speeds; None with too few in common."""
     if len(right_time) < 2 or not len(time):
         return None
     after = np.clip(np.searchsorted(right_time, time), 1, len(right_time) - 1)

@@ -1,4 +1,4 @@
-"""Tables of the sensors on board as samples, and their parts by time."""
+"""Tables of the on-board sensors as samples, and their parts by time."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def read_sensors(
 
 
 def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Samples:
-    """Return samples from all columns of the table of a sensor but the time; NaN where a number is absent."""
+    """Return samples from all columns of a sensor table except the time; NaN where a number is absent."""
     values = dict(columns)
     if sensor == "tachometer":
         values = {name: np.nan_to_num(column).astype(np.int64) for name, column in columns.items()}
@@ -60,10 +60,10 @@ def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any
 
 
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
-    """Read the ground units that ranges, a table or a stream, are measured to; None without ranges.
+    """Read the ground units of ranges, given as a table or a stream; None without ranges.
 
-    InputFileError: no such table. MismatchError: a range is to a unit that it does not have. SettingsError: one of the
-    two is given without the other.
+    InputFileError: no such table. MismatchError: the table lacks the unit of a range. SettingsError: one of the two is
+    given without the other.
     """
     if ranging is None and units is not None:
         raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
@@ -133,7 +133,8 @@ def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
 def load_balises(
     readings: Path | str | None, places: Path | None, virtual: Path | None, track: Track, config: Config
 ) -> ListedBalises | None:
-    """Read the positions of the balises that the train reads, a table or a stream, and of virtual ones; None without.
+    """Read the positions of the balises, whose readings are a table or a stream, and of virtual balises; None without
+    any.
 
     InputFileError: see `read_listed_balises`. SettingsError: readings without a list, or a list without; virtual
     balises without levels of the filter.
@@ -154,7 +155,7 @@ def load_balises(
 
 
 def check_filter(config: Config, options: Iterable[str]) -> None:
-    """Raise SettingsError where an option is given that only the filter along the track uses, and that is off."""
+    """Raise SettingsError if an option of the filter along the track is given while the filter is off."""
     for name in options:
         if config.filter == "off":
             raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")

@@ -1,4 +1,4 @@
-"""Inputs of a run: the line with its trajectories, navigation, and logs in chunks of the same span of time."""
+"""Inputs of a run: the line with its trajectories, navigation, and logs in chunks of equal time spans."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 #: Shortest track of a run [m].
 _SHORTEST_M: Final = 1.0
-#: Track of a run that differs from its files, in the folder of results.
+#: File name, in the results folder, of a run's track that differs from its files.
 TRACK_FILE: Final = "track.csv"
 
 
@@ -51,12 +51,12 @@ class OpenedLine:
     track: Track
     vehicle: Vehicle | None
     trajectories: dict[str, Trajectory]
-    #: How the track was moved to the frame of the satellites; None where no time was given.
+    #: Transformation of the track to the frame of the satellites; None if no time was given.
     frame: FrameShift | None = None
     #: The route through a network of tracks that was found from the log; None where the files are one route.
     route: RouteOfLog | None = None
-    #: Whether the track is unchanged from its files: no route of a network, no heights of a second source, and not
-    #: moved to another frame.
+    #: Whether the track is unchanged from its files: not a route of a network, without heights from another source, and
+    #: not transformed to another frame.
     from_file: bool = True
     preparing: tuple[str, ...] = ()  #: Notes on the cache of prepared lines.
 
@@ -67,14 +67,13 @@ class OpenedLine:
         notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ()), *self.preparing]
         if turns := [turn for turn in self.turns_m.values() if np.isfinite(turn)]:
             notes.append(
-                f"the line is closed: after {turns[0]:.1f} m it comes back to itself, chainages that differ by this "
-                "are one place"
+                f"the line is closed with a length of {turns[0]:.1f} m: chainages that differ by this are one position"
             )
         return tuple(dict.fromkeys([*(self.route.notes if self.route else ()), *notes]))
 
     @property
     def turns_m(self) -> dict[str, float]:
-        """Once round a closed line by the chainage of each antenna [m]; infinite for others."""
+        """Length of a closed line by the chainage of each antenna [m]; infinite for others."""
         turns = {}
         for name, path in self.trajectories.items():
             before, after = path.chainage_at(np.array(path.joins_m))
@@ -120,9 +119,9 @@ def open_line(
 ) -> OpenedLine:
     """Read the track and the vehicle, and compute the path of each antenna.
 
-    With a time `at` the track is transformed to the frame of the satellites then (`railfix.track.frames`); without it
-    the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network: `log`
-    gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
+    With a time `at` the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
+    without it the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a
+    network: `log` gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -219,15 +218,15 @@ def _paths(
 
 @dataclass(kw_only=True)
 class Log:
-    """The files of one antenna's log, read piece by piece."""
+    """Files of one antenna's log, read piece by piece."""
 
     paths: tuple[Path, ...]
     chunk_epochs: int
     reading: LogReading = field(default_factory=LogReading)
-    #: First epoch, and the time before which the last one lies.
+    #: First epoch, and end of the log.
     start: datetime | None = None
     end: datetime | None = None
-    share: float = 0.0  #: Part of the files that has been read, 0 to 1.
+    share: float = 0.0  #: Fraction of the files that has been read, 0 to 1.
     problems: list[str] = field(default_factory=list)  #: Sentences on broken and skipped parts.
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
 
@@ -259,7 +258,7 @@ class Log:
 
 
 Item = TypeVar("Item")
-#: Tags of two receivers that differ by no more than this belong to one instant [ns].
+#: Largest time-tag difference of two receivers at one instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
 
 
@@ -296,7 +295,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
             horizon = min(waiting[name].time[-1] for name in live) + np.timedelta64(slack, "ns")
             cut = {name: int(np.searchsorted(part.time, horizon, side="right")) for name, part in waiting.items()}
         yield {name: part[: cut[name]] for name, part in waiting.items()}
-        # A short rest would cut every chunk that follows in two: it is joined with the next part.
+        # A short remainder would split every following chunk: it is joined with the next part.
         short = [n for n in live if 0 < len(waiting[n]) - cut[n] < len(waiting[n]) // 2]
         waiting = {name: part[cut[name] :] for name, part in waiting.items()}
         for name in short:
@@ -313,7 +312,7 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
 
 
 def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
-    """Return results whose statuses and levels know where another track is more probable than `Config.track_risk`."""
+    """Return results whose statuses and levels account for another track more probable than `Config.track_risk`."""
     antennas, fusion = dict(result.antennas), dict(result.fusion)
     for name, single in antennas.items():
         beside = route.is_uncertain(single.time, single.chainage_m, risk=config.track_risk)

@@ -1,4 +1,4 @@
-"""Codes and carrier phases of an antenna at rest, less those of a base station where given."""
+"""Codes and carrier phases of an antenna at rest, less a base station's if given."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.track_choice import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: Satellites in fewer than this fraction of the epochs are left out, so that the mean is over the same ones.
+#: Minimum fraction of the epochs with a satellite, so that all means are over the same satellites.
 _SHARE: Final = 0.9
 #: Residual standard deviation of satellite and atmospheric errors with a base station [m]; it is at most 10 km away.
 _BESIDE_BASE_M: Final = 0.05
 #: Largest difference of the median positions of the thirds of the log [m].
 _AT_REST_M: Final = 8.0
-#: Change of a double difference from epoch to epoch that is a slip [wavelengths].
+#: Change of a double difference between epochs that indicates a slip [wavelengths].
 _SLIP: Final = 0.25
 #: Fraction of the epochs over which a double difference must be unbroken.
 _UNBROKEN: Final = 0.5
-#: Bit of the loss-of-lock indicator: a slip since the previous epoch; and that half a cycle is unknown.
+#: Bits of the loss-of-lock indicator: a slip since the previous epoch, and an unknown half cycle.
 _LOST, _HALF_CYCLE = 1, 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillCodes:
-    """Codes of one antenna at rest, minus those computed for an origin: T epochs, K satellites."""
+    """Codes of one antenna at rest, less the codes computed for an origin: T epochs, K satellites."""
 
     time: Datetimes  #: Shape (T,).
-    residual_m: Floats  #: Receiver clock of each constellation removed, shape (T, K).
+    residual_m: Floats  #: Codes without the receiver clock of each constellation, shape (T, K).
     system: Strings  #: Shape (K,).
     #: `common_m`: standard deviation of satellite and atmosphere errors; shape (K,).
     azimuth_deg: Floats
     elevation_deg: Floats
     common_m: Floats
-    receivers: int  #: 2 where a base station's codes are subtracted.
+    receivers: int  #: Variance factor, 2 where a base station's codes are subtracted.
     origin_ecef_m: Floats  #: Shape (3,).
-    phases: StandstillPhases | None = None  #: None without a base station.
+    phases: StandstillPhases | None = None  #: Carrier phases; None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
         """Return the mean position over some epochs."""
@@ -160,15 +160,16 @@ def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[I
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillPhases:
-    """Carrier phases of an antenna at rest less those of a base station, T epochs, M satellites."""
+    """Carrier phases of an antenna at rest less a base station's, T epochs, M satellites."""
 
-    difference_m: Floats  #: Less those computed for the origin; NaN where one of the receivers has none; shape (T, M).
+    #: Phases less the phases computed for the origin; NaN where one of the receivers has none; shape (T, M).
+    difference_m: Floats
     lost: Masks  #: Whether one of them reports a slip since the previous epoch, shape (T, M).
     toward: Floats  #: Unit vectors to the satellites, east, north, up; shape (T, M, 3).
     elevation_deg: Floats  #: Shape (T, M).
     wavelength_m: Floats  #: Shape (M,).
     group: Strings  #: Satellites on one clock and signal, shape (M,).
-    distance_m: float  #: From the base station.
+    distance_m: float  #: Vector from the base station.
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
         """Return the mean double differences over some epochs, of each satellite over its longest unbroken part."""
@@ -225,7 +226,7 @@ def _phases(train: _Side, base: _Side) -> StandstillPhases:
         channel = seen.corrected.channels.columns[columns]
         wavelength = SPEED_OF_LIGHT / seen.corrected.channels.frequency_hz[columns]
         rows = np.ix_(epochs, columns)
-        # orbit, clock and troposphere as of the codes; the ionosphere, of opposite sign, is the same at both ends
+        # orbit, clock and troposphere as for the codes; the ionosphere, of opposite sign, is equal at both ends
         corrections = seen.ranges.code_m[rows] - obs.code_m[np.ix_(epochs, channel)]
         lock = obs.loss_of_lock[np.ix_(epochs, channel)]
         phase = obs.phase_cycles[np.ix_(epochs, channel)] * wavelength + corrections

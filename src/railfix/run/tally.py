@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
-#: Causes that leave the question whether the map is right.
+#: Causes for which the map may still be wrong.
 _MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
@@ -76,8 +76,8 @@ class MapOffsetFound:
 class AntennaTally:
     """Counts of one antenna."""
 
-    min_satellites: int = 3  #: Satellites that an epoch needs.
-    judged: dict[str, bool] = field(default_factory=dict)  #: By verdict of a screen, whether it has checked anything.
+    min_satellites: int = 3  #: Minimum number of satellites per epoch.
+    judged: dict[str, bool] = field(default_factory=dict)  #: Whether each screen verdict has checked anything.
     #: Epochs; those with at least one pseudorange; those with coordinates.
     epochs: int = 0
     observed: int = 0
@@ -87,43 +87,44 @@ class AntennaTally:
     used: int = 0
 
     status: Counter[str] = field(default_factory=Counter)
-    status_positioned: Counter[str] = field(default_factory=Counter)  #: Values of the epochs with coordinates.
-    #: Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a reason
-    #: without which alone there would be enough. `not_observed`: too few were observed; `used`: enough were used, but
-    #: their clocks left no range for the position.
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Values at the epochs with coordinates.
+    #: Epochs with too few satellites: by the first reason that left too few, and by a single reason without which there
+    #: would be enough. `not_observed` means that too few were observed; `used` that enough were used, but their clocks
+    #: left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
     short_only: Counter[str] = field(default_factory=Counter)
-    #: Rejected observations by the first reason that applied, and those that one reason alone rejected.
+    #: Rejected observations by their first reason, and observations rejected by one reason alone.
     first_reason: Counter[str] = field(default_factory=Counter)
     only_reason: Counter[str] = field(default_factory=Counter)
     satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
-    #: Observations by satellite for which no navigation record was there or valid.
+    #: Observations by satellite without a valid navigation record.
     unrecorded: Counter[str] = field(default_factory=Counter)
 
     first: np.datetime64 | None = None
     last: np.datetime64 | None = None
     conventional: int = 0  #: Epochs with a valid conventional position.
-    #: Least distance of a conventional position from the trajectory; NaN when there was none.
+    #: Smallest distance of a conventional position from the trajectory; NaN without one.
     conventional_nearest_m: float = float("nan")
     #: Epochs by status of the protection level; empty where levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
     #: Epochs without a level because more faults than can be left out are likelier than the risk allows.
     without_budget: int = 0
-    #: Where the 3-D positions contradicted the map most; None before there were enough.
+    #: Largest contradiction of 3-D positions and map; None before there were enough.
     map_offset: MapOffsetFound | None = None
-    #: Epochs at which the filter, and the single epochs, left a satellite's codes out as wrong for long, and the first
-    #: of them.
+    #: Number of epochs at which the filter, and single epochs, left out a satellite's codes as persistently wrong, and
+    #: the first of these epochs.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: Epochs with each sign of interference, and the first of them.
+    #: Number of epochs with each sign of interference, and the first of these epochs.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: Least and largest error of the time tags where that is the cause, + where they are late; NaN without any [s].
+    #: Smallest and largest time-tag error where that is the cause, positive for late tags; NaN without any [s].
     tag_error_s: tuple[float, float] = (float("nan"), float("nan"))
-    #: Least and largest offset across (first column) and up that a window finds; NaN without any window; shape (2, 2).
+    #: Smallest and largest offset, across (first column) and up, that a window detects; NaN without any window; shape
+    #: (2, 2).
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
-        """Count one more chunk."""
+        """Add the counts of a chunk."""
         if not len(result.time):
             return
         self.first = result.time[0] if self.first is None else self.first
@@ -154,7 +155,7 @@ class AntennaTally:
             self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
 
     def add_conventional(self, result: AntennaResult) -> None:
-        """Count the valid conventional positions: ranges that contradict each other give arbitrary positions."""
+        """Count the valid conventional positions; inconsistent ranges give arbitrary positions."""
         offset = result.conventional_offset_m[result.conventional_status == PointStatus.VALID]
         self.conventional += len(offset)
         if len(offset):
@@ -168,7 +169,7 @@ class AntennaTally:
             self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
-        """Keep the window that contradicts the map most, where nothing else explains it (`suspicion`)."""
+        """Keep the window with the largest contradiction of the map, unless `suspicion` explains it."""
         offset, interference = result.map_offset, result.interference
         if not np.isfinite(offset.statistic).any():
             return
@@ -204,7 +205,7 @@ class AntennaTally:
                 counter[str(result.satellite[channel])] += int(of_channel[channel])
 
     def _add_short(self, result: AntennaResult) -> None:
-        """Which reason took the satellites of the epochs that have too few."""
+        """Count the reasons for too few satellites at epochs."""
         short = np.flatnonzero(result.status == Status.TOO_FEW_SATELLITES)
         if not len(short):
             return
@@ -231,7 +232,7 @@ class AntennaTally:
 
     @property
     def never_recorded(self) -> dict[str, int]:
-        """Satellites seen for which no record was usable, with their observations."""
+        """Observed satellites without a usable record, with their observations."""
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
@@ -265,15 +266,15 @@ class AntennaTally:
 class Tally:
     """Counts of all antennas of a run."""
 
-    min_satellites: int = 3  #: Satellites that an epoch needs.
+    min_satellites: int = 3  #: Minimum number of satellites per epoch.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    notes: dict[str, None] = field(default_factory=dict)  #: Used as keys, in the order of arrival.
+    notes: dict[str, None] = field(default_factory=dict)  #: Notes as keys, in the order of arrival.
     #: First epoch of each chunk, its epochs of all antennas, and the time since the previous chunk [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
     order: AntennaOrder | None = None  #: Test of the order of two antennas.
 
     def add(self, result: Result) -> None:
-        """Count one more chunk."""
+        """Add the counts of a chunk."""
         for name, antenna in result.antennas.items():
             tally = self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites))
             tally.add(antenna)
@@ -292,7 +293,7 @@ class Tally:
         return tuple(self.notes) if order is None else (*self.notes, order)
 
     def took(self, times: Iterable[Datetimes], spent_s: float) -> None:
-        """Record the processing time of the positions of one more chunk: its time tags by antenna, and the time [s]."""
+        """Record the positioning time of a chunk [s], with its time tags by antenna."""
         some = [part for part in times if len(part)]
         if some:
             self.chunks.append((min(part[0] for part in some), sum(map(len, some)), spent_s))
@@ -320,15 +321,15 @@ def _count_left_out(
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRows:
-    """Processing of each chunk of results."""
+    """Output of each chunk of results."""
 
     folder: OutputFolder
     line: OpenedLine
     observations: bool  #: Whether rows of observations are requested.
-    checks: SensorChecks | None  #: Collects those of the first antenna, where there are sensors.
-    replays: Mapping[str, Replays]  #: Keeps the filter's input, by antenna; empty where nothing is smoothed.
-    passings: bool = False  #: Whether rows of balises and virtual ones are requested.
-    #: Balises so far that were missed, or read where they are not.
+    checks: SensorChecks | None  #: Collects the rows of the first antenna if there are sensors.
+    replays: Mapping[str, Replays]  #: Keeps the filter's input by antenna; empty without smoothing.
+    passings: bool = False  #: Whether rows of balises and virtual balises are requested.
+    #: Balises so far that were missed, or read at a wrong position.
     balise_notes: list[str] = field(default_factory=list)
 
     def write(self, result: Result) -> None:
@@ -358,18 +359,18 @@ class ResultRows:
                 self.folder.append_csv(f"{name}.csv", round_floats(table))
 
 
-#: Notes on balises that a run gives.
+#: Largest number of notes on balises in a run.
 _MOST_NOTES: Final = 20
 
 
 def shorten_notes(notes: list[str]) -> list[str]:
-    """Return the first notes, and the number of the others."""
+    """Return the first notes and a sentence with the number of further ones."""
     more = len(notes) - _MOST_NOTES
     return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
 
 
 class Replays:
-    """Input of the filter, chunk by chunk, in a file that is deleted with the process."""
+    """Filter input, chunk by chunk, in a file that is deleted with the process."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run
@@ -384,7 +385,7 @@ class Replays:
         pickle.dump(chunk, self._file, protocol=pickle.HIGHEST_PROTOCOL)
 
     def backward(self) -> Iterator[Replay]:
-        """Yield the stored input, the last first."""
+        """Yield the stored input, last chunk first."""
         for start in reversed(self._starts):
             self._file.seek(start)
             yield from reversed(pickle.load(self._file))

@@ -18,7 +18,7 @@ from railfix.run.record import level_basis
 POSITIONS: Final = "epochs with a position"
 PASSED: Final = "epochs that passed every check"
 SIGMA: Final = "sigma along the line, median"
-#: Statuses of the filter whose positions are promised.
+#: Filter statuses of positions that count as passed.
 _PROMISED: Final = ("tracking", "coasting")
 
 
@@ -26,10 +26,10 @@ _PROMISED: Final = ("tracking", "coasting")
 class PositionFigures:
     """Figures of one kind of positions of an antenna; None where none exist."""
 
-    epochs: int  #: All epochs for the filter along the track, those with observations for single epochs.
-    positions: int  #: Epochs with a position.
+    epochs: int  #: Number of epochs: all for the filter along the track, epochs with observations for single epochs.
+    positions: int  #: Number of epochs with a position.
     passed: int  #: Epochs of status `ok`, or `tracking` and `coasting` for the filter.
-    statuses: Mapping[str, int]  #: Epochs by status, those that occur, the most frequent first.
+    statuses: Mapping[str, int]  #: Number of epochs of each occurring status, the most frequent first.
     chainage_first_m: float | None  #: Least and largest chainage [m].
     chainage_last_m: float | None
     sigma_p50_m: float | None  #: Median, 95th percentile and largest standard deviation along the line [m].
@@ -41,7 +41,7 @@ class PositionFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaVerdict:
-    """Verdict on one antenna: the filter along the track, where it is on, and single epochs."""
+    """Verdict on one antenna: filter along the track, if on, and single epochs."""
 
     antenna: str
     level_name: str  #: "protection level", or "indicative protection level" where the priors of faults are assumed.
@@ -60,7 +60,7 @@ class AntennaVerdict:
         return self.leading.positions > off_map
 
     def figures(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the name of each figure, its leading value, and that of single epochs where the filter leads."""
+        """Yield the name of each figure, its leading value, and the single-epoch value if the filter leads."""
         texts: dict[str, Callable[[PositionFigures], str]] = {
             POSITIONS: lambda of: f"{count(of.positions)} of {count(of.epochs)}",
             PASSED: lambda of: f"{count(of.passed)} of {count(of.epochs)}",
@@ -94,7 +94,7 @@ class Verdict:
 
 
 def judge_run(record: Mapping[str, Any]) -> Verdict:
-    """Return the verdict on a run from its record; figures that a record of an earlier version lacks are None."""
+    """Return the verdict on a run from its record; figures missing in a record of an earlier version are None."""
     level_name = f"{level_basis(record)} level"
     antennas = []
     for name, facts in (record.get("antennas") or {}).items():

@@ -1,4 +1,4 @@
-"""Logs of a train at rest to the probability of each track of a network.
+"""Probability of each track of a network from logs of a train at rest.
 
 A train that was on a known track when it was switched off, and has not moved since, is still there: a
 cold-movement detector or the odometer shows how far it has moved, and misses a move with a probability.
@@ -35,17 +35,18 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 
-#: A train that has moved less is on the same track [m]: creep of wheels, slack of couplings.
+#: Distance up to which a moved train is on the same track [m]: creep of wheels, slack of couplings.
 _SAME_PLACE_M: Final = 1.0
 #: Error of the distance moved: fraction, and constant part [m].
 _ODOMETER_SHARE: Final = 0.05
 _ODOMETER_M: Final = 10.0
-_NOTED_MISFIT: Final = 2.5  #: Distances from the most likely track in standard deviations that are noted.
-#: Least probability of a track that the map does not have.
+#: Distance from the most likely track, in standard deviations, from which on a note is given.
+_NOTED_MISFIT: Final = 2.5
+#: Minimum probability of an unmapped track.
 _LEAST_UNMAPPED: Final = 1e-9
 
 
-#: Weights of mapped tracks by name; and probability of a track missing from the map.
+#: Weights of mapped tracks by name, and probability of an unmapped track.
 TrackPrior = tuple[dict[str, float], float]
 
 
@@ -60,8 +61,8 @@ def prior_of_last_place(
 ) -> TrackPrior:
     """Return the prior of tracks from the last position (`write_last_place`) and the distance moved since [m].
 
-    `missed_move` is the probability that the train was moved unnoticed, anywhere; `unmapped` the prior of a track that
-    the map lacks, for a train that was moved. InputFileError: the file is not a last position on this network.
+    `missed_move` is the probability that the train was moved unnoticed, anywhere; `unmapped` the prior of an unmapped
+    track, for a train that was moved. InputFileError: the file is not a last position on this network.
     """
     record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")
@@ -88,7 +89,9 @@ def prior_of_last_place(
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
-    """Return tracks that a train from anywhere on a track can have reached after a distance, turns included."""
+    """Return the tracks that a train from anywhere on a track can have reached after a distance, including
+    reversals.
+    """
     near = nx.multi_source_dijkstra_path_length(
         network.graph.to_undirected(as_view=True), {4 * track + k for k in range(4)}, cutoff=within_m
     )
@@ -96,7 +99,7 @@ def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
 
 
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
-    """Return the weights of the tracks that the interlocking states, of ``NAME=WEIGHT,...``.
+    """Parse the interlocking's track weights ``NAME=WEIGHT,...``.
 
     SettingsError: it is not such a text, or names a track that the map lacks.
     """
@@ -116,7 +119,7 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     return weights
 
 
-#: Tracks within this distance of the train are hypotheses [m]; their points within the other distance are used.
+#: Distance from the train within which tracks are hypotheses, and within which their points are used [m].
 _NEAR_M: Final = 60.0
 _POINTS_M: Final = 400.0
 _MOST_TRACKS: Final = 64
@@ -150,7 +153,7 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackDecision:
-    """Posterior at each look, with the time at rest, shape (L,) [s], and the decision.
+    """Posterior at each evaluation, with the time at rest, shape (L,) [s], and the decision.
 
     `track` is a name, ``"none"``, or ``"undecided"``, with NaN for `decided_s`; `end` is the last epoch.
     """
@@ -174,11 +177,11 @@ def decide_track(
     every_s: float = 10.0,
     prior: Mapping[str, float] | None = None,
 ) -> TrackDecision:
-    """Look at the posterior from time to time and decide when the risk of another track is below a bound.
+    """Evaluate the posterior repeatedly and decide when the risk of another track is below a bound.
 
     `tracks`, `antennas` (all about the same origin), `arms_m`, `errors` and `prior` are as for `track_posterior`.
-    `risk` bounds the probability that the track is another one; the first look is after `least_s`, the next ones are
-    `every_s` apart [s].
+    `risk` bounds the probability of a wrong track; the first evaluation is after `least_s`, the next ones are `every_s`
+    apart [s].
     """
     start = max(codes.time[0] for codes in antennas)
     length = float((min(codes.time[-1] for codes in antennas) - start) / np.timedelta64(1, "s"))
@@ -234,7 +237,7 @@ class WhichTrackOptions(Settings):
     risk: float = option("Bound of the probability of a wrong track.", 1e-3, metavar="P", gt=0, lt=0.5)
     least_s: float = option("Time at rest before the first decision.", 60.0, name="--least", metavar="S", ge=0)
     prior: str | None = option(
-        "Weights of the tracks that the interlocking holds possible: T1=0.9,T2=0.1.", None, metavar="NAME=P,..."
+        "Weights of the tracks that the interlocking considers possible: T1=0.9,T2=0.1.", None, metavar="NAME=P,..."
     )
     moved: float | None = option(
         "Distance moved since --last, by cold-movement detection (0: none) or odometer.", None, metavar="M", ge=0
@@ -255,7 +258,7 @@ class WhichTrackOptions(Settings):
 
 
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
-    """Read logs and map, and decide which track the train stands on."""
+    """Decide the track of a standing train from logs and map."""
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
         raise SettingsError("a base station needs both --base and --base-place")
@@ -322,7 +325,7 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Return the weights of all tracks: the product of those of the interlocking and of the last position."""
+    """Return the weights of all tracks: interlocking weights times weights of the last position."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(

@@ -78,6 +78,7 @@ def decimate_epochs(
     taken = (before[1:] > before[:-1]).nonzero()[0]
     value, variance = _columns(sensors, len(epochs))
     # Row 0 is the remainder of the previous chunk, row t + 1 epoch t; a selected row ends an interval.
+    # With the epochs 1 and 3 of five selected, rows 0 to 2 and 3 to 4 are intervals, and row 5 remains.
     goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
     if since.unbroken is not None:
         goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
@@ -157,39 +158,39 @@ def track_with_levels(
 
     If the filter with sub-filters processes every epoch, its positions are returned and the main filter does not run.
     """
-    taken, some, sensed, since = decimate_epochs(epochs, sensors, state.since, limits.level_period_s)
-    place, after = None, state.track
+    taken, some, decimated_sensors, since = decimate_epochs(epochs, sensors, state.since, limits.level_period_s)
+    with_bank, after = None, state.track
     if some is not None:
-        place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
+        with_bank, after = track(some, line, state.track, limits=limits, sensors=decimated_sensors, levels=True)
     every = state.every and len(taken) == len(epochs)
-    if every and place is not None and after is not None:
-        tracked, track_state = place, copy_with(after, bank=None)
+    if every and with_bank is not None and after is not None:
+        tracked, track_state = with_bank, copy_with(after, bank=None)
     else:
         tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
     state = copy_with(state, track=after, since=since, every=every)
-    tracked, state = carried_levels(tracked, taken, place, line, state, limits)
+    tracked, state = carried_levels(tracked, taken, with_bank, line, state, limits)
     return tracked, track_state, state
 
 
 def carried_levels(
     tracked: Tracked,
     taken: Indices,
-    place: Tracked | None,
+    with_bank: Tracked | None,
     line: Line,
     state: LevelState,
     limits: TrackingLimits,
 ) -> tuple[Tracked, LevelState]:
     """Return positions with the levels of the sub-filtered epochs propagated to all epochs.
 
-    `tracked` has the main filter's positions, `taken` the mask of the epochs of the filter with sub-filters, `place`
-    its positions at these epochs (None without any), and `state` its last epoch before the chunk.
+    `tracked` has the main filter's positions, `taken` the indices of the epochs of the filter with sub-filters,
+    `with_bank` its positions at these epochs (None without any), and `state` its last epoch before the chunk.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
-    if place is not None:
-        columns = np.array([getattr(place, name) for name in _KEPT], dtype=np.float64).T
-        columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
-        times, values = np.concatenate([times, place.time]), np.concatenate([values, columns])
+    if with_bank is not None:
+        columns = np.array([getattr(with_bank, name) for name in _KEPT], dtype=np.float64).T
+        columns[:, _KEPT.index("level_m")] = np.where(is_bounded(with_bank.status), with_bank.level_m, np.inf)
+        times, values = np.concatenate([times, with_bank.time]), np.concatenate([values, columns])
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
     tau = seconds(tracked.time - times[number])  # NaN before the first
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau

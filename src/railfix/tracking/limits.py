@@ -59,7 +59,7 @@ class TrackingLimits(Settings):
     #: Displacement by orbit and ionospheric errors over hours: about 1 m per satellite with a dilution of one;
     #: averaging over epochs does not reduce it.
     slow_code_m: float = Field(default=1.0, ge=1e-6)
-    #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler.
+    #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler; C/N0 at most 50 dB-Hz, 45 if not given.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
     #: The same two parameters for the change of a carrier phase over an epoch.

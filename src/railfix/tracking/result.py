@@ -40,7 +40,7 @@ class Tracked(NotebookTable):
     acceleration_mps2: Floats
     probability: Floats  #: Probability of the reported hypothesis; shape (T,).
     hypotheses: Integers  #: Number of hypotheses; shape (T,).
-    #: Mean weights of codes, and of Dopplers and phases; shape (T,).
+    #: Mean weights of the codes that are not left out, and of Dopplers and phases; shape (T,).
     code_weight: Floats
     motion_weight: Floats
     #: Shape (T,).

@@ -28,6 +28,7 @@ _WORSE: Final = 25.0
 #: Prior standard deviation of the speed: no train is faster than twice this [m/s].
 _ANY_SPEED_MPS: Final = 50.0
 _ANY_DRIFT_MPS: Final = 1e3
+_FIRST_STEP_M: Final = 1.0  #: Displacement of the map over the epoch before the first [m].
 #: Sensor priors: a wheel diameter wrong by 2 %, an accelerometer's offset and mounting, a radar's angle.
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
@@ -106,6 +107,8 @@ def begin(
     variance[:, ix.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, ix.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, ix.MAP_UP] = line.sigma_height_m**2
+    # no prediction precedes the first epoch: the map's displacement over it is as good as unknown
+    variance[:, [ix.STEP_RIGHT, ix.STEP_UP, ix.MAP_LENGTH_ERROR]] = _FIRST_STEP_M**2
     variance[:, ix.SLOW_CODE] = limits.slow_code_m**2
     variance[:, ix.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
     variance[:, ix.WHEEL] = WHEEL_PRIOR**2
@@ -214,7 +217,7 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
     if weak:
         hold = max(hold, constants.LEVEL_START_S)
     state.monitors = replace(
-        state.monitors, level_hold_s=hold, weak_motion_s=0.0, weak_code_s=0.0, across=0.0, code_shift=0.0,
+        state.monitors, level_hold_s=hold, weak_motion_s=0.0, weak_code_s=0.0, contradiction=0.0, code_shift=0.0,
         code_shift_variance=0.0, least_speed_mps=ANY_SPEED[0], most_speed_mps=ANY_SPEED[1], coded_s=-np.inf,
     )  # fmt: skip
 
@@ -255,7 +258,7 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
     """Return hypotheses at positions away from a lost track; `weak` means that its weights were low for long."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
-    elsewhere = 1.0 if weak or state.monitors.across >= constants.ACROSS_TAKEN else _ELSEWHERE
+    elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
     # A hypothesis less probable than a new one at its position has drifted from the position implied by codes.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]

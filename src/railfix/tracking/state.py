@@ -26,13 +26,13 @@ class Monitors:
     #: Log ratios of the Doppler and phase variances to those of the limits.
     log_doppler_scale: float = 0.0
     log_phase_scale: float = 0.0
-    #: Mean of the normalised position shifts that codes imply over the last epochs, and its variance.
+    #: Mean of the position shifts that codes imply over the last epochs, in standard deviations, and its variance.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0
     #: Log ratio of the variance of map lengths to its limit, at least 0.
     map_log_variance: float = 0.0
-    #: Cumulative sum of the velocity contradictions (`railfix.kernels.tracking.monitors`).
-    across: float = 0.0
+    #: Cumulative sum of the contradictions of the velocity, along and across (`railfix.kernels.tracking.monitors`).
+    contradiction: float = 0.0
     #: One less the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
     step_s: float = 0.0  #: Time for which all codes have implied another position [s].

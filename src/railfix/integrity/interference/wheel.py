@@ -54,7 +54,6 @@ class WheelState:
     part: int = 0
     second: int = -1
     held: HeldState = field(default_factory=HeldState)
-    #: Time of the last sample.
     difference_m: float = float("nan")
     bound_m: float = float("nan")
     beyond: bool = False

@@ -22,7 +22,7 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.arrays import Floats, Indices, Integers, Masks, channel_sums
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
@@ -168,7 +168,7 @@ def set_sums(prior: Floats, most: int) -> Floats:
     """
     power, powers = prior, []
     for _ in range(most):
-        powers.append(power.sum(axis=1))
+        powers.append(channel_sums(power))
         power = power * prior
     sums = [np.ones(len(prior))]
     for size in range(1, most + 1):

@@ -4,8 +4,8 @@
 `railfix.kernels.tracking.recursion.advance` returns at an epoch that requires a position search; the search is done
 between the epoch's prediction and its update.
 
-Single letters are indices: t epoch, h hypothesis, b source and its sub-filter, j measurement, k channel (term of a
-quantity next to q, axis next to c), q quantity, i unknown, g clock, v vertex, c component x, y, z; a and b rows and
-columns of a matrix. The letters x, P, F, Q, H, S, K, y, r, u, T, z are variables of the equations in
-docs/filter-equations.md.
+Single letters are indices: t epoch, h hypothesis, b source and its sub-filter, j measurement, k channel or term of a
+quantity, q quantity, i unknown, g clock, v vertex, c component x, y, z. Loops over the elements of a matrix use the
+next free ones of a, b, c, i, j. The letters x, P, F, Q, H, T, z, y, S and g = P h are those of
+docs/filter-equations.md, which has a table of the others.
 """

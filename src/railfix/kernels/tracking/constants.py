@@ -45,7 +45,7 @@ RADAR_WALK: Final = 2e-4
 #: Fraction of the map's height error that changes over `MAP_CORRELATION_M`. For the error across it is 1, because
 #: height errors of a survey or a terrain model extend over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
-LEAST_STEP_M2: Final = 1e-6  #: Minimum variance of a position step [m2], which keeps matrices regular.
+LEAST_STEP_M2: Final = 1e-6  #: Minimum variance of a step of position and of speed [m2, m2/s2].
 
 # Equations.
 #: Ranges to ground units are not used below this speed [m/s], because their error does not change at rest (P2 3.3).
@@ -62,8 +62,8 @@ UNKNOWN_CLOCK: Final = 100.0  #: Standard deviation of the phase clock and its d
 FIRST_OFFSET_M2: Final = 1e-4  #: Variance of the offset of the first constellation from the code clock [m2].
 
 # Reweighting.
-PASSES: Final = 4  #: Rounds of reweighting per epoch.
-LEVEL_PASSES: Final = 3  #: Rounds of reweighting of the sub-filters.
+PASSES: Final = 4  #: Fits of an epoch, with new weights between them.
+LEVEL_PASSES: Final = 3  #: Sets of weights in sub-filters: the first ones, and those after each of two fits.
 #: Mean weight of codes, or of phases and Dopplers, below which the reweighting is restarted from other weights.
 WEAK_FIT: Final = 0.7
 #: Variances of position and speed added for that restart [m2, m2/s2].
@@ -196,9 +196,9 @@ DIRECTION_SHARE: Final = 0.03
 LARGEST_SQUARE: Final = 12.0
 ALLOWED_SQUARE: Final = 4.0
 #: Sums at which the protection level is withheld, and at which the track is lost.
-ACROSS_DOUBT: Final = 12.0
-ACROSS_LOST: Final = 30.0
-ACROSS_TAKEN: Final = 60.0  #: Sum that is set after a takeover: larger than a velocity across the line can give.
+CONTRADICTION_DOUBT: Final = 12.0
+CONTRADICTION_LOST: Final = 30.0
+CONTRADICTION_TAKEN: Final = 60.0  #: Sum that is set after a takeover: larger than a velocity across the line can give.
 #: Limits beyond which codes contradict motion, because of a step of all codes, a slow pull or a wrong map: normalised
 #: mean of the position shifts that codes imply, and log variance of the map's lengths (6 times the assumed error).
 DRIFT_SIGMAS: Final = 5.0

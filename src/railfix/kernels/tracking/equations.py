@@ -1,20 +1,8 @@
-r"""Measurement equations of one epoch, linearised at one Gaussian: the rows of H.
+"""Measurement equations of one epoch, linearised at one Gaussian: the rows of H and A in docs/filter-equations.md.
 
-With u the unit vector from receiver to satellite, e the tangent, c and h the axes to the right and up::
-
-    code    rho = range(s + n) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
-    Doppler rate = A + slope (v + w) - u.(c q_c + h q_h) / dt + f + noise
-    phase   change = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
-    wheel   W (1 + k) = s - s' + q_a, radar alike;  force F = (v - v') / dt + g sin(gradient) + beta;  place = s
-    balise  place = s - age v + age^2 a / 2;  range = |unit - antenna(s - age v, m_c, m_h)|
-
-s' and v' are the arc length and speed of the previous epoch, x_i the satellite's correlated error in units of its
-sigma, o_g the offset of its constellation's code clock, w the time-correlated error of Dopplers, n the slow error of
-the codes, m the map's error, q the error of the map's displacement over the epoch (along, right, up: q_a, q_c, q_h), A
-the satellite's part of the range rate, slope what the speed adds to it, W the distance by the wheel, k its scale-factor
-error, beta the offset of the accelerometer. The phase change uses the direction g of the chord for both ends. With a
-direction for each end, the phases would measure the absolute position from the bend of the line more precisely than the
-line is known.
+The page has an equation for each kind of row, in the letters of its table of unknowns. The change of a carrier phase
+uses the direction of the chord at both ends. With the tangent of each end the phases would measure the absolute
+position from the bend of the line more precisely than the line is known.
 """
 
 from __future__ import annotations
@@ -182,30 +170,30 @@ def _write_phases(given: Given, t: int, rows: Rows, geometry: Geometry, motion: 
 @inner
 def _write_dopplers(given: Given, t: int, rows: Rows, geometry: Geometry, motion: Floats, equations: Equations) -> None:
     """Write the Doppler range rates; `motion` is the result of `_write_motion_quantities`."""
-    dt, design, tangent, gradient = given.epoch[t].interval_s, equations.design, geometry.axes[0], np.empty(3)
+    dt, design, tangent, per_velocity = given.epoch[t].interval_s, equations.design, geometry.axes[0], np.empty(3)
     for j in range(rows.doppler.start, rows.doppler.stop):
         k = rows.channel[j]
-        rate = write_range_rate(given.channel[t, k], geometry.point, geometry.sight[k], gradient)
-        slope = gradient[0] * tangent[0] + gradient[1] * tangent[1] + gradient[2] * tangent[2]
+        rate = write_range_rate(given.channel[t, k], geometry.point, geometry.sight[k], per_velocity)
+        per_speed = per_velocity[0] * tangent[0] + per_velocity[1] * tangent[1] + per_velocity[2] * tangent[2]
         design[j, ix.M_RIGHT], design[j, ix.M_UP] = -geometry.along[k, 1] / dt, -geometry.along[k, 2] / dt
-        design[j, ix.M_SPEED], design[j, ix.M_DRIFT] = slope, 1.0
+        design[j, ix.M_SPEED], design[j, ix.M_DRIFT] = per_speed, 1.0
         _write_motion_value(given.channel[t, k].measured[ix.DOPPLER] - rate, j, motion, equations)
 
 
 @inner
-def write_range_rate(channel: Record, point: Floats, u: Floats, gradient: Floats) -> float:
+def write_range_rate(channel: Record, point: Floats, u: Floats, per_velocity: Floats) -> float:
     """Return the satellite's part of the range rate [m/s], and write its gradient with respect to the receiver
     velocity.
 
     ``rate = (A + g . v) / (1 + A / c)`` with A from the satellite's velocity, u the unit vector to the satellite, and
-    the Earth's rotation in both; `point`, `u` and `gradient` have the shape (3,).
+    the Earth's rotation in both; `point`, `u` and `per_velocity` have the shape (3,).
     """
     sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
     moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]
     moving += TURN * (velocity[0] * point[1] - velocity[1] * point[0])
     stretch = 1.0 + moving / SPEED_OF_LIGHT
-    gradient[0], gradient[1] = (-u[0] - TURN * sat[1]) / stretch, (-u[1] + TURN * sat[0]) / stretch
-    gradient[2] = -u[2] / stretch
+    per_velocity[0], per_velocity[1] = (-u[0] - TURN * sat[1]) / stretch, (-u[1] + TURN * sat[0]) / stretch
+    per_velocity[2] = -u[2] / stretch
     return float(moving / stretch)
 
 
@@ -223,8 +211,8 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: floa
             unknown[3], coefficient[3] = ix.WHEEL if column == ix.WHEEL_COLUMN else ix.RADAR, -measured
             value[j] = measured * (1.0 + x[unknown[3]]) - (x[ix.ARC] - x[ix.PREVIOUS_ARC] + x[ix.MAP_LENGTH_ERROR])
         elif column == ix.FORCE_COLUMN:
-            slope = gradient_at(vertex, line, 0.5 * (x[ix.ARC] + x[ix.PREVIOUS_ARC]))
-            gravity = GRAVITY_MPS2 * slope / math.sqrt(1.0 + slope**2)
+            gradient = gradient_at(vertex, line, 0.5 * (x[ix.ARC] + x[ix.PREVIOUS_ARC]))
+            gravity = GRAVITY_MPS2 * gradient / math.sqrt(1.0 + gradient**2)
             unknown[:3], coefficient[:3] = (ix.SPEED, ix.PREVIOUS_SPEED, ix.FORCE_OFFSET), (1.0 / dt, -1.0 / dt, 1.0)
             value[j] = measured - (x[ix.SPEED] - x[ix.PREVIOUS_SPEED]) / dt - gravity - x[ix.FORCE_OFFSET]
         elif column < ix.RANGE_COLUMN:

@@ -36,8 +36,8 @@ def reweigh(
     (d^2 + map_branch_m^2)``, because branches within the map error have the same range difference at every epoch.
 
     Errors of the motion (Dopplers, phases, sensors) are correlated over seconds. The evidence of a second therefore
-    counts once at any epoch rate, and by at most `MOST_MOTION` per epoch. Its log odds are bounded by ``d^2 / (2 s^2)``
-    with s^2 = 2 (map_branch_m / 3)^2, and by one per `MOTION_M` of travel.
+    counts once at any epoch rate, and by at most `MOST_MOTION` per second. Its log odds are bounded by
+    ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, and by one per `MOTION_M` of travel.
 
     All satellites on one side of a street share code errors for minutes. The log odds of codes are bounded by ``n d^2 /
     (2 CODE_COMMON_M^2)``, the information of n independent epochs with such an error; n is 1, plus one per
@@ -54,7 +54,7 @@ def reweigh(
     travel = monitors.branch_m
     independent = 1.0 + monitors.branch_s / constants.CODE_COMMON_S + travel / constants.CODE_COMMON_TRAVEL_M
     best = int(np.argmax(hypothesis["log_probability"][:count]))
-    first, first_code = hypothesis[best].log_probability, hypothesis[best].log_code
+    best_log, best_log_code = hypothesis[best].log_probability, hypothesis[best].log_code
     of_second = min(dt, 1.0)
     most, floor = constants.MOST_MOTION * of_second, math.log(constants.BRANCH_FLOOR)
     after, after_code = np.empty(count), np.empty(count)
@@ -64,10 +64,10 @@ def reweigh(
         part = square / (square + parameters.map_branch_m**2)
         reach = min(constants.MOST_ODDS * square / parameters.map_branch_m**2, travel / constants.MOTION_M)
         gained = min(max(of_second * (evidence[h] - evidence[best]), -most), most)
-        motion = clip_odds(one.log_probability - one.log_code - (first - first_code), part * gained, reach)
+        motion = clip_odds(one.log_probability - one.log_code - (best_log - best_log_code), part * gained, reach)
         reach = independent * square / (2.0 * constants.CODE_COMMON_M**2)
         gained = code_evidence[h] - code_evidence[best]
-        code = clip_odds(one.log_code - first_code, part * gained, reach)
+        code = clip_odds(one.log_code - best_log_code, part * gained, reach)
         if square < constants.BRANCH_FLOOR_M**2:
             code = min(max(code, floor), -floor)
         recent = math.exp(-dt / constants.RECENT_S) * one.log_recent
@@ -100,8 +100,8 @@ def prune(parameters: Record, state: State) -> Indices:
     """
     count = state.monitors[0].hypotheses
     order = np.argsort(-state.hypothesis["log_probability"][:count], kind="mergesort")
-    leads = find_leading(state.hypothesis, count)
-    kept, log_probability = _merge_twins(state, np.concatenate((np.array([leads]), order[order != leads])))
+    leading = find_leading(state.hypothesis, count)
+    kept, log_probability = _merge_twins(state, np.concatenate((np.array([leading]), order[order != leading])))
     size = min(len(kept), parameters.most_hypotheses)
     kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
     if abs(state.x[kept[0], ix.ARC] - state.hypothesis[kept[0]].origin_m) >= constants.DECIDED_TRAVEL_M:

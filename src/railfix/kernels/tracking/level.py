@@ -26,13 +26,13 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Given, Record, State
 from railfix.kernels.tracking.line import write_point
-from railfix.kernels.tracking.subfilters import find_others
+from railfix.kernels.tracking.subfilters import find_other
 
 
 class Alternatives(NamedTuple):
     """Alternative positions of the train with their probabilities; shapes (A,)."""
 
-    along_m: Floats  #: Distance along the line; 0 for a branch that does not count along the line.
+    along_m: Floats  #: Distance along the line; 0 beyond `start_separation_m`, where it has no term of its own.
     straight_m: Floats  #: Straight distance.
     forward_m: Floats  #: Component of the straight distance along the line at the alternative.
     sigma_m: Floats
@@ -40,7 +40,7 @@ class Alternatives(NamedTuple):
 
 
 @inner
-def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
+def find_other_positions(given: Given, state: State) -> tuple[Alternatives, float]:
     """Return all hypotheses except the first, and the probability of those further along the line than a level may
     reach.
     """
@@ -75,7 +75,7 @@ def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple
 @inner
 def _find_subfilters(given: Given, state: State) -> Alternatives:
     """Return the running sub-filters, and the filter itself for a tilted ionosphere."""
-    first, size, most = len(state.hypothesis), 0, find_others(state) + ix.ALL_IN_VIEW
+    first, size, most = len(state.hypothesis), 0, find_other(state, ix.ALL_IN_VIEW)
     away, sigma, probability = np.empty(most + 1), np.empty(most + 1), np.empty(most + 1)
     for b in range(most):
         if state.source[b].running:
@@ -92,24 +92,25 @@ def _find_subfilters(given: Given, state: State) -> Alternatives:
 
 
 @inner
-def _cross(branches: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
+def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
     """Return the positions on other branches if a source is faulty, and the risk used by those that need no term.
 
     A fault shifts the positions on all branches equally along the line. Positions that require less than the level so
     far need no term.
     """
-    most, size, spent = len(branches.sigma_m) * len(subfilters.sigma_m), 0, 0.0
+    most, size, spent = len(positions.sigma_m) * len(subfilters.sigma_m), 0, 0.0
     along, straight, sigma, probability = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
-    for h in range(len(branches.sigma_m)):
+    for h in range(len(positions.sigma_m)):
         for b in range(len(subfilters.sigma_m)):
-            shift, prior = subfilters.along_m[b], branches.probability[h] * subfilters.probability[b]
-            own = max(branches.sigma_m[h], subfilters.sigma_m[b])
-            distance = math.sqrt(branches.straight_m[h] ** 2 + shift**2 + 2.0 * branches.forward_m[h] * shift)
+            separation, prior = subfilters.along_m[b], positions.probability[h] * subfilters.probability[b]
+            own = max(positions.sigma_m[h], subfilters.sigma_m[b])
+            forward = positions.forward_m[h]
+            distance = math.sqrt(positions.straight_m[h] ** 2 + separation**2 + 2.0 * forward * separation)
             tail = prior * math.erfc((level - distance) / (math.sqrt(2.0) * own))
             if tail < constants.PAIR_SHARE * risk:
                 spent += tail
                 continue
-            along[size] = branches.along_m[h] + shift if branches.along_m[h] > 0.0 else 0.0
+            along[size] = positions.along_m[h] + separation if positions.along_m[h] > 0.0 else 0.0
             straight[size], sigma[size], probability[size] = distance, own, prior
             size += 1
     return Alternatives(along[:size], straight[:size], straight[:size], sigma[:size], probability[:size]), spent
@@ -129,26 +130,26 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
     source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
     most = satellites * (satellites - 1) // 2
     away, sigma, probability = np.empty(most), np.empty(most), np.empty(most)
-    information, shift = np.zeros(satellites), np.zeros(satellites)
+    information, weighted_separation = np.zeros(satellites), np.zeros(satellites)
     for k in range(satellites):
         if source[k].running:
             information[k] = 1.0 / state.P[first + k, ix.ARC, ix.ARC]
-            shift[k] = information[k] * (state.x[first + k, ix.ARC] - state.x[0, ix.ARC])
-    whole, whole_shift, in_view = 1.0 / state.P[0, ix.ARC, ix.ARC], 0.0, find_others(state) + ix.ALL_IN_VIEW
+            weighted_separation[k] = information[k] * (state.x[first + k, ix.ARC] - state.x[0, ix.ARC])
+    whole, whole_separation, in_view = 1.0 / state.P[0, ix.ARC, ix.ARC], 0.0, find_other(state, ix.ALL_IN_VIEW)
     if source[in_view].running:
         whole = 1.0 / state.P[first + in_view, ix.ARC, ix.ARC]
-        whole_shift = whole * (state.x[first + in_view, ix.ARC] - state.x[0, ix.ARC])
-    for one in range(satellites):
-        if not (source[one].running and source[one].prior > 0.0):
+        whole_separation = whole * (state.x[first + in_view, ix.ARC] - state.x[0, ix.ARC])
+    for i in range(satellites):
+        if not (source[i].running and source[i].prior > 0.0):
             continue
-        for other in range(one):
-            if not source[other].running:
+        for j in range(i):
+            if not source[j].running:
                 continue
-            remaining, prior = information[one] - whole + information[other], source[one].prior * source[other].prior
+            remaining, prior = information[i] - whole + information[j], source[i].prior * source[j].prior
             if remaining <= constants.PAIR_LEFT * whole:
                 spent += prior
                 continue
-            distance = abs(shift[one] - whole_shift + shift[other]) / remaining
+            distance = abs(weighted_separation[i] - whole_separation + weighted_separation[j]) / remaining
             tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # less on the far side
             if tail < constants.PAIR_SHARE * risk:
                 spent += tail
@@ -172,7 +173,7 @@ def find_unchecked(state: State) -> float:
 
 
 @inner
-def write_level(given: Given, state: State, branches: Alternatives, far: float, result: Record) -> None:
+def write_level(given: Given, state: State, positions: Alternatives, unbounded: float, result: Record) -> None:
     """Write the level of the first hypothesis and its parts.
 
     The level is infinite without sub-filters, and where unbounded satellite pairs are more probable than the risk. It
@@ -182,7 +183,8 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
     level may reach, is more probable than the risk. The straight distance includes all branches and a laterally
     displaced map.
     """
-    parameters, source, first, others = given.parameters[0], state.source, len(state.hypothesis), find_others(state)
+    parameters, source, first = given.parameters[0], state.source, len(state.hypothesis)
+    others = find_other(state, ix.ALL_DOPPLERS)
     sigma = math.sqrt(state.P[0, ix.ARC, ix.ARC])
     noise, apart = parameters.level_k * sigma, math.nan
     start, contradicted = noise, False
@@ -201,15 +203,15 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
         return
     pairs, spent = _find_pairs(state, parameters.level_risk, start)
     subfilters = _find_subfilters(given, state)
-    crossed, spent_on_branches = _cross(branches, subfilters, parameters.level_risk, start)
+    crossed, spent_on_branches = _cross(positions, subfilters, parameters.level_risk, start)
     risk = parameters.level_risk - spent - spent_on_branches
     if risk <= 0.0:
         return
-    alternatives = join(join(join(subfilters, branches), pairs), crossed)
+    alternatives = join(join(join(subfilters, positions), pairs), crossed)
     result.ground_level_m = solve_level(sigma, alternatives.straight_m, alternatives, risk, start)
-    if len(branches.sigma_m) == 0:
+    if len(positions.sigma_m) == 0:
         result.level_m = result.ground_level_m
-    elif far <= risk:
+    elif unbounded <= risk:
         result.level_m = solve_level(sigma, alternatives.along_m, alternatives, risk, start)
     if source[others + ix.WRONG_MAP].running:
         row = first + others + ix.WRONG_MAP
@@ -267,7 +269,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
 def bound_speed(parameters: Record, state: State, sigma: float) -> float:
     """Return the bound of the speed error, which propagates the level over the epochs until the next update."""
     bound, first = parameters.level_k_speed * sigma, len(state.hypothesis)
-    for b in range(find_others(state) + ix.ALL_IN_VIEW):
+    for b in range(find_other(state, ix.ALL_IN_VIEW)):
         if state.source[b].running:
             away = abs(state.x[first + b, ix.SPEED] - state.x[0, ix.SPEED])
             bound = max(bound, away + state.source[b].k_speed * math.sqrt(state.P[first + b, ix.SPEED, ix.SPEED]))

@@ -15,7 +15,7 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Given, Record, State
 from railfix.kernels.tracking.line import write_point
-from railfix.kernels.tracking.subfilters import find_others
+from railfix.kernels.tracking.subfilters import find_other
 
 
 @inner
@@ -45,18 +45,20 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
 
 
 @inner
-def update_monitors(state: State, square: float, shift: float, beyond_m: float, dt: float, code_s: float) -> None:
+def update_monitors(
+    state: State, contradiction: float, shift: float, beyond_m: float, dt: float, code_s: float
+) -> None:
     """Update the monitors by the contradictions of an epoch.
 
-    For the reported hypothesis, `square` is the result of `compute_contradiction`, `shift` the shift implied by codes,
-    `beyond_m` the distance beyond an open end of the line; `code_s` is the time interval of the codes.
+    For the reported hypothesis, `contradiction` is the result of `compute_contradiction`, `shift` the shift implied by
+    codes, `beyond_m` the distance beyond an open end of the line; `code_s` is the time interval of the codes.
     """
     monitors = state.monitors[0]
-    if not math.isnan(square):
-        gained = (min(square, constants.LARGEST_SQUARE) - constants.ALLOWED_SQUARE) * min(dt, 1.0)
-        monitors.across = max(monitors.across + gained, 0.0)
+    if not math.isnan(contradiction):
+        gained = (min(contradiction, constants.LARGEST_SQUARE) - constants.ALLOWED_SQUARE) * min(dt, 1.0)
+        monitors.contradiction = max(monitors.contradiction + gained, 0.0)
     if beyond_m > 0.0 and monitors.weak_motion_s >= constants.BESIDE_AFTER_S:
-        monitors.across = constants.ACROSS_LOST
+        monitors.contradiction = constants.CONTRADICTION_LOST
     if code_s > 0.0 and abs(shift) > constants.STEP_SIGMAS:
         monitors.step_s += code_s
     elif code_s > 0.0:
@@ -82,7 +84,7 @@ def _is_doubtful(monitors: Record) -> bool:
         monitors.weak_code_s > constants.LEVEL_DOUBT_CODE_S
         or monitors.weak_motion_s > constants.LEVEL_DOUBT_S
         or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
-        or monitors.across > constants.ACROSS_DOUBT
+        or monitors.contradiction > constants.CONTRADICTION_DOUBT
     )
 
 
@@ -93,7 +95,7 @@ def _is_contradicted_by_subfilter(state: State) -> bool:
     """
     if (state.source["running"] & (state.source["contradicted_s"] > constants.LEVEL_DOUBT_S)).any():
         return True
-    wrong = find_others(state) + ix.WRONG_MAP
+    wrong = find_other(state, ix.WRONG_MAP)
     if wrong < 0 or not state.source[wrong].running:
         return False
     row = len(state.hypothesis) + wrong

@@ -18,12 +18,12 @@ from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
 from railfix.kernels.tracking.layout import Given, Results, Rows, State, Trace
-from railfix.kernels.tracking.level import bound_speed, find_branches, write_level
+from railfix.kernels.tracking.level import bound_speed, find_other_positions, write_level
 from railfix.kernels.tracking.line import excess_beyond_end, wrap_arc, write_point
 from railfix.kernels.tracking.measurements import choose_measurements, start_clocks
 from railfix.kernels.tracking.model import add_bend, narrow_speed_range, predict, restart
 from railfix.kernels.tracking.monitors import compute_contradiction, update_monitors
-from railfix.kernels.tracking.subfilters import advance_subfilters, find_others
+from railfix.kernels.tracking.subfilters import advance_subfilters, find_other
 from railfix.kernels.tracking.update import (
     Correction,
     compute_evidence,
@@ -44,8 +44,9 @@ def _find_search_reasons(given: Given, t: int, state: State) -> int:
     """
     epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
     lost = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
-    lost = lost or monitors.across >= constants.ACROSS_LOST
-    doubtful = monitors.weak_motion_s >= constants.BESIDE_AFTER_S or monitors.across >= constants.ACROSS_DOUBT
+    lost = lost or monitors.contradiction >= constants.CONTRADICTION_LOST
+    doubtful = monitors.weak_motion_s >= constants.BESIDE_AFTER_S
+    doubtful = doubtful or monitors.contradiction >= constants.CONTRADICTION_DOUBT
     doubtful = doubtful or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
     doubtful = doubtful and monitors.measured_s > epoch.time_s - 1.5 * epoch.interval_s
     gap = epoch.coded and epoch.time_s - monitors.measured_s > constants.GAP_S
@@ -84,7 +85,7 @@ def _predict_all(given: Given, t: int, state: State) -> None:
         predict(given, t, state.x[h], state.P[h], monitors.map_log_variance, 0.0, scratch)
     for b in range(len(state.source)):
         if state.source[b].running:
-            wrong_m = given.parameters[0].level_map_m if b == find_others(state) + ix.WRONG_MAP else 0.0
+            wrong_m = given.parameters[0].level_map_m if b == find_other(state, ix.WRONG_MAP) else 0.0
             predict(given, t, state.x[first + b], state.P[first + b], monitors.map_log_variance, wrong_m, scratch)
 
 
@@ -114,8 +115,8 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
     for one in corrections:
         expected = one.covariance, one.without_clock
         write_first_weights(rows, one.equations, expected, rows.variance, one.fit.weight)
-    leading = corrections[find_leading(state.hypothesis, count)]
-    shift = compute_code_shift(rows, leading.equations, leading.covariance, leading.fit.weight)
+    reported = corrections[find_leading(state.hypothesis, count)]
+    shift = compute_code_shift(rows, reported.equations, reported.covariance, reported.fit.weight)
     doubtful = False
     for one in corrections:
         reweight(rows, one.equations, one.covariance, rows.variance, one.fit)
@@ -173,18 +174,18 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
         monitors.coded_s = given.epoch[t].time_s
     for j in range(rows.code.start, rows.code.stop):
         state.offset_known[given.channel[t, rows.channel[j]].clock] = True
-    leads = find_leading(state.hypothesis, len(corrections))
-    best = corrections[leads]
-    implied = 0.0 if leads else shift
+    leading = find_leading(state.hypothesis, len(corrections))
+    best = corrections[leading]
+    implied = 0.0 if leading != 0 else shift
     excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
-        advance_subfilters(given, t, state, rows, best, leads)
+        advance_subfilters(given, t, state, rows, best, leading)
     if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have affected the position so far
         state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
-    square = compute_contradiction(given, t, state, leads)
+    contradiction = compute_contradiction(given, t, state, leading)
     beyond_m = excess_beyond_end(given.line[0], best.x[ix.ARC], math.sqrt(best.P[ix.ARC, ix.ARC]))
-    update_monitors(state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
-    return leads
+    update_monitors(state, contradiction, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
+    return leading
 
 
 @inner
@@ -227,10 +228,10 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
 
 
 @inner
-def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> None:
+def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> None:
     """Update direction, time and distance on the branches, and prune the hypotheses."""
     monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
-    speed = state.x[leads, ix.SPEED]
+    speed = state.x[leading, ix.SPEED]
     if abs(speed) > constants.DIRECTION_MPS:
         monitors.direction = math.copysign(1.0, speed)
     monitors.branch_s += dt
@@ -243,13 +244,13 @@ def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> Non
         if len(trace.kept):
             trace.kept[: len(kept)] = kept
     if monitors.branch_s > constants.TAKEOVER_AFTER_S and state.hypothesis[0].log_least < constants.TAKEOVER:
-        monitors.across = constants.ACROSS_TAKEN
+        monitors.contradiction = constants.CONTRADICTION_TAKEN
         monitors.level_hold_s = max(monitors.level_hold_s, constants.LEVEL_HOLD_S)
 
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write position, speed, level and status; `status` is the status without doubt and other branches."""
+    """Write position, speed, level and status; `status` is the status without doubt and other others."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
@@ -257,22 +258,22 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     if not sigma <= constants.EXPIRED_SIGMA_M:
         result.status = ix.EXPIRED
         return
-    branches, far = find_branches(given, state)
+    others, unbounded = find_other_positions(given, state)
     spread = sigma * sigma
-    for a in range(len(branches.sigma_m)):
-        own = branches.straight_m[a] ** 2 + branches.sigma_m[a] ** 2
-        spread += branches.probability[a] * (own - sigma * sigma)
+    for a in range(len(others.sigma_m)):
+        own = others.straight_m[a] ** 2 + others.sigma_m[a] ** 2
+        spread += others.probability[a] * (own - sigma * sigma)
     result.arc_m, result.sigma_m = x[ix.ARC], math.sqrt(spread)
     result.speed_mps, result.speed_sigma_mps = x[ix.SPEED], math.sqrt(P[ix.SPEED, ix.SPEED])
     result.acceleration_mps2 = x[ix.ACCELERATION]
     result.wheel_scale, result.force_offset_mps2, result.radar_scale = x[ix.WHEEL], x[ix.FORCE_OFFSET], x[ix.RADAR]
     result.map_scale = math.exp(0.5 * monitors.map_log_variance)
-    if far > parameters.level_risk:
+    if unbounded > parameters.level_risk:
         monitors.ambiguity_hold_s = constants.LEVEL_HOLD_S
     else:
         monitors.ambiguity_hold_s = max(monitors.ambiguity_hold_s - given.epoch[t].interval_s, 0.0)
     if len(state.source):
-        write_level(given, state, branches, far, result)
+        write_level(given, state, others, unbounded, result)
         if monitors.level_hold_s > 0.0:
             result.ground_level_m = math.inf
         if monitors.level_hold_s > 0.0 or monitors.ambiguity_hold_s > 0.0:
@@ -289,7 +290,7 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
 @inner
 def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: Trace, lost: bool) -> None:
     """Process an epoch whose state has been predicted."""
-    monitors, dt, leads = state.monitors[0], given.epoch[t].interval_s, 0
+    monitors, dt, leading = state.monitors[0], given.epoch[t].interval_s, 0
     rows = choose_measurements(given, t, state)
     believed = len(rows.variance) > 0  # without measurements only the prediction remains
     if believed:
@@ -300,21 +301,21 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
         sigma = math.sqrt(first.P[ix.SPEED, ix.SPEED])
         believed = narrow_speed_range(given.parameters[0], monitors, rows, first.x[ix.SPEED], sigma, dt)
         if believed:
-            leads = _commit_update(given, t, state, rows, corrections, shift)
+            leading = _commit_update(given, t, state, rows, corrections, shift)
             if len(trace.prior):
                 _write_trace(rows, corrections, trace)
         else:
             monitors.weak_motion_s += dt
-        _write_measurements(t, rows, corrections[leads], believed, results)
+        _write_measurements(t, rows, corrections[leading], believed, results)
     else:
         narrow_speed_range(given.parameters[0], monitors, rows, 0.0, math.inf, dt)
     if not believed:  # the prediction continues
-        leads = find_leading(state.hypothesis, monitors.hypotheses)
+        leading = find_leading(state.hypothesis, monitors.hypotheses)
         monitors.level_hold_s = max(monitors.level_hold_s - dt, 0.0)
-    monitors.distance_since_code_m += abs(state.x[leads, ix.SPEED]) * dt
+    monitors.distance_since_code_m += abs(state.x[leading, ix.SPEED]) * dt
     if believed and rows.code.stop > 0:
         monitors.distance_since_code_m = 0.0
-    _finish(given, t, leads, state, trace)
+    _finish(given, t, leading, state, trace)
     status = ix.TRACKING if believed else ix.COASTING
     _write_place(given, t, ix.LOST if lost else status, state, results)
 

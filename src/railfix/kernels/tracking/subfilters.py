@@ -34,15 +34,19 @@ from railfix.kernels.tracking.update import (
 
 
 @inner
-def find_others(state: State) -> int:
-    """Return the index of the first source after the sensors; negative if levels are off."""
-    return len(state.source) - ix.OTHERS
+def find_other(state: State, which: int) -> int:
+    """Return the index of one of the sources after the sensors (`index.ALL_DOPPLERS` and those after it).
+
+    Negative if levels are off.
+    """
+    return len(state.source) - ix.OTHERS + which
 
 
 @inner
 def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
     """Return which sources are among an epoch's measurements, shape (B,); constellations only if there are several."""
-    needed, satellites, others = np.zeros(len(state.source), dtype=np.bool_), len(state.code_bias), find_others(state)
+    needed, satellites = np.zeros(len(state.source), dtype=np.bool_), len(state.code_bias)
+    others = find_other(state, ix.ALL_DOPPLERS)
     constellations = 0
     for j in range(rows.code.start, rows.code.stop):
         clock = satellites + given.channel[t, rows.channel[j]].clock
@@ -62,8 +66,8 @@ def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
 
 
 @inner
-def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leads: int) -> None:
-    """Correct all sub-filters, already predicted to the epoch; `leads` is the correction of the leading hypothesis
+def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leading: int) -> None:
+    """Correct all sub-filters, already predicted to the epoch; `leading` is the correction of the leading hypothesis
     `best`.
 
     Each sub-filter has its own equations, because those of the filter do not apply where the line bends between the two
@@ -72,8 +76,8 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     satellites in view restarts too, as the reference of the pairs, until it equals the filter.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
-    all_in_view = find_others(state) + ix.ALL_IN_VIEW
-    before = leads == 0 and source["running"].any()
+    all_in_view = find_other(state, ix.ALL_IN_VIEW)
+    before = leading == 0 and source["running"].any()
     needed = _find_needed(given, t, rows, state)
     needed[all_in_view] = not before
     absorbed = np.zeros(len(source), dtype=np.bool_)
@@ -85,7 +89,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     for b in range(len(source)):
         one = source[b]
         satellite = b < satellites
-        if leads or (satellite and not given.within_memory[t, b]):
+        if leading != 0 or (satellite and not given.within_memory[t, b]):
             one.running = False
         if one.running and one.contradicted_s >= constants.LOST_MOTION_S:
             one.running, absorbed[b] = False, True
@@ -96,7 +100,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
             one.running, one.contradicted_s = True, 0.0
         if one.running:
             at = x[ix.ARC], x[ix.PREVIOUS_ARC]
-            if b == all_in_view - ix.ALL_IN_VIEW + ix.WRONG_MAP:
+            if b == find_other(state, ix.WRONG_MAP):
                 rotate_map_error(given, x, P)
             add_bend(given, at, P)
             if (satellite or b == all_in_view) and not needed[b] and _has_joined(x, P, best):
@@ -145,7 +149,7 @@ def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -
         x[ix.ARC] = x[ix.PREVIOUS_ARC] = best.x_prior[ix.ARC]
         for c in range(len(x)):
             P[c, c] = given.start_variance[c]
-    if b == find_others(state) + ix.WRONG_MAP:
+    if b == find_other(state, ix.WRONG_MAP):
         P[ix.MAP_RIGHT, ix.MAP_RIGHT] += given.parameters[0].level_map_m ** 2
         P[ix.MAP_UP, ix.MAP_UP] += given.parameters[0].level_map_m ** 2
 
@@ -177,7 +181,7 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
     The Gaussian itself is not changed: a measurement of infinite variance is not used. `equations` belong to the
     leading hypothesis; the sign of their arc-length coefficients distinguishes satellites ahead from satellites behind.
     """
-    satellites, others, variance = len(state.code_bias), find_others(state), rows.variance.copy()
+    satellites, others, variance = len(state.code_bias), find_other(state, ix.ALL_DOPPLERS), rows.variance.copy()
     if b < satellites + ix.CLOCK_COUNT:
         for j in range(rows.code.start, rows.doppler.stop):
             channel = given.channel[t, rows.channel[j]]

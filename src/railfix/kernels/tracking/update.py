@@ -353,10 +353,13 @@ def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
 
 @inner
 def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, float]:
-    """Return the mean weights of codes, and of phases and Dopplers, of finite variance; NaN without any."""
+    """Return the mean weights of codes that are not left out, and of phases and Dopplers; NaN without any.
+
+    Only measurements of finite variance count.
+    """
     code, motion, codes, motions = 0.0, 0.0, 0, 0
     for j in range(rows.doppler.stop):
-        if variance[j] < math.inf:
+        if variance[j] < math.inf and not rows.left_out[j]:
             if j < rows.code.stop:
                 code, codes = code + weight[j], codes + 1
             else:

@@ -38,12 +38,11 @@ from railfix.report.plots.chart import (
     Marks,
     Points,
     RangeBars,
-    counts_sentence,
     find_start,
     floats,
     nice_step,
     since,
-    spread,
+    thin_points,
     words,
 )
 
@@ -101,14 +100,14 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
         series.append(("on the map, failed a check", "error_m", BLACK, "cross", failed))
     if filtered is not None:
         series.append(("filtered along the track", "error_m", FILTERED, "dot", filtered))
-    shown = total = 0
-    for label, column, colour, shape, table in series:
-        x, y, epoch = axis(table), good_errors(table, column), since(table, find_start(errors))
-        rows = spread(x, y)
-        shown, total = shown + len(rows), total + int(np.isfinite(x + y).sum())
-        layers.append(
-            Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows], epoch_s=epoch[rows])  # type: ignore[arg-type]
+    drawn, thinned = thin_points(
+        Points(
+            label=label, colour=colour, shape=shape, x=axis(table), y=good_errors(table, column),  # type: ignore[arg-type]
+            epoch_s=since(table, find_start(errors)),
         )
+        for label, column, colour, shape, table in series
+    )  # fmt: skip
+    layers += drawn
     every = np.concatenate([good_errors(table, column) for _, column, _, _, table in series])
     scale = error_scale(every)
     if scale["y_scale"] == "symlog":
@@ -123,7 +122,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
     return Chart(
         name=f"error-{quantity}",
         title=f"Error along the line over {quantity}",
-        caption=" ".join(caption) + counts_sentence(shown, total),
+        caption=" ".join(caption) + thinned,
         x_label="chainage of the reference [m]" if start is None else "GPS time",
         y_label=_ERROR_LABEL,
         layers=tuple(layers),
@@ -193,7 +192,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
     return Chart(
         name="error-ranges",
         title="Range of the errors",
-        caption=f"From the lowest to the highest signed error; the mark is the mean. {_SIGN}",
+        caption=f"From the lowest to the highest signed error, with failed checks; the mark is the mean. {_SIGN}",
         x_label=_ERROR_LABEL,
         y_label="",
         layers=tuple(layers),
@@ -202,19 +201,18 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
 
 def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
     """Return the errors of several runs over the chainage of their references, in one chart (P1 figure 8)."""
-    layers, shown, total, every = [], 0, 0, [np.empty(0)]
-    for number, (run, errors) in enumerate(runs.items()):
-        x, y = floats(errors, "chainage_m"), good_errors(errors, "error_m")
-        rows = spread(x, y)
-        shown, total = shown + len(rows), total + int(np.isfinite(x + y).sum())
-        every.append(y)
-        colour = CYCLE[number % len(CYCLE)]
-        epoch = since(errors, find_start(errors))
-        layers.append(Points(label=run, colour=colour, shape="dot", x=x[rows], y=y[rows], epoch_s=epoch[rows]))
+    layers, thinned = thin_points(
+        Points(
+            label=run, colour=CYCLE[number % len(CYCLE)], x=floats(errors, "chainage_m"),
+            y=good_errors(errors, "error_m"), epoch_s=since(errors, find_start(errors)),
+        )
+        for number, (run, errors) in enumerate(runs.items())
+    )  # fmt: skip
+    every = [np.empty(0), *(good_errors(errors, "error_m") for errors in runs.values())]
     return Chart(
         name="errors-of-runs",
         title="Errors of all runs over chainage",
-        caption=f"Single epochs. {_SIGN}{counts_sentence(shown, total)}",
+        caption=f"Single epochs. {_SIGN}{thinned}",
         x_label="chainage of the reference [m]",
         y_label=_ERROR_LABEL,
         layers=tuple(layers),
@@ -311,20 +309,17 @@ def levels_over_chainage(positions: pl.DataFrame, alarm_limit_m: float) -> Chart
 
 def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 | None) -> Chart:
     """Return levels over the time since `start`, or over the chainage without one."""
-    layers: list[Layer] = []
-    shown = total = 0
     # levels are of interest near the alarm limit: a few far beyond it do not set the axis
     top = 2.0 * alarm_limit_m
     epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch
+    series = []
     for (label, column), colour in zip(_PARTS, (*CYCLE[2:6], BLUE), strict=True):
         level = floats(positions, column)
         level = np.where(np.isfinite(level + x), level, np.nan)
-        rows = spread(x, level)
-        if not len(rows) or not (level[rows] > 0.0).any():
-            continue
-        shown, total = shown + len(rows), total + int(np.isfinite(level).sum())
-        layers.append(Points(label=label, colour=colour, x=x[rows], y=level[rows], size=2.5, epoch_s=epoch[rows]))
+        if (level > 0.0).any():
+            series.append(Points(label=label, colour=colour, x=x, y=level, size=2.5, epoch_s=epoch))
+    layers, thinned = thin_points(series)
     if layers:
         line = np.array([np.nanmin(x), np.nanmax(x)])
         limit = np.full(2, alarm_limit_m)
@@ -340,7 +335,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     return Chart(
         name="levels-chainage" if start is None else "levels",
         title="Protection level over chainage" if start is None else "Protection level",
-        caption=" ".join(caption).strip() + counts_sentence(shown, total),
+        caption=" ".join(caption).strip() + thinned,
         x_label="chainage of the position [m]" if start is None else "GPS time",
         y_label="protection level [m]",
         layers=tuple(layers),

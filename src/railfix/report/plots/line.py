@@ -28,14 +28,13 @@ from railfix.report.plots.chart import (
     Layer,
     Marks,
     Points,
-    counts_sentence,
     find_start,
     floats,
     nice_step,
     one_per_cell,
     points,
     since,
-    spread,
+    thin_points,
     words,
 )
 from railfix.track import Track
@@ -263,21 +262,17 @@ _FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("on
 
 def interval_over_chainage(table: pl.DataFrame) -> Chart:
     """Distance from each position to the previous one, over chainage (P1 figure 12), of the table of `interval`."""
-    layers: list[Layer] = []
-    shown = total = 0
-    longest = []
-    for label, prefix, colour, shape in _FIXES:
-        x, y = interval(table, prefix)
-        rows = spread(x, y)
-        shown, total = shown + len(rows), total + len(x)
-        layers.append(Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows]))  # type: ignore[arg-type]
-        if len(y):
-            longest.append(f"{label} {y.max():.2f} m")
+    intervals = {label: interval(table, prefix) for label, prefix, _, _ in _FIXES}
+    layers, thinned = thin_points(
+        Points(label=label, colour=colour, shape=shape, x=intervals[label][0], y=intervals[label][1])  # type: ignore[arg-type]
+        for label, _, colour, shape in _FIXES
+    )
+    longest = [f"{label} {distance.max():.2f} m" for label, (_, distance) in intervals.items() if len(distance)]
     return Chart(
         name="interval-chainage",
         title="Positioning interval",
         caption=f"Distance along the line from each position to the previous one. {_by(table)} "
-        f"Longest: {', '.join(longest)}.{counts_sentence(shown, total)}",
+        f"Longest: {', '.join(longest)}.{thinned}",
         x_label="chainage [m]",
         y_label="distance from the previous position [m]",
         layers=tuple(layers),
@@ -320,17 +315,15 @@ def satellites_over_time(positions: pl.DataFrame) -> Chart:
     """Return satellites used and rejected at each epoch of one antenna."""
     start = find_start(positions)
     x = since(positions, start)
-    layers: list[Layer] = []
-    shown = total = 0
-    for label, column, colour in (("rejected", "n_rejected", CONVENTIONAL), ("used", "n_used", CONSTRAINED)):
-        y = floats(positions, column)
-        rows = spread(x, y)
-        shown, total = shown + len(rows), total + len(x)
-        layers.append(Points(label=label, colour=colour, x=x[rows], y=y[rows], epoch_s=x[rows]))
+    columns = (("rejected", "n_rejected", CONVENTIONAL), ("used", "n_used", CONSTRAINED))
+    layers, thinned = thin_points(
+        Points(label=label, colour=colour, x=x, y=floats(positions, column), epoch_s=x)
+        for label, column, colour in columns
+    )
     return Chart(
         name="satellites",
         title="Satellites",
-        caption=f"Satellites with a pseudorange.{counts_sentence(shown, total)}",
+        caption=f"Satellites with a pseudorange.{thinned}",
         x_label="GPS time",
         y_label="satellites",
         layers=tuple(layers),

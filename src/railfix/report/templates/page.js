@@ -158,14 +158,14 @@
     if (chart.y_range) y.range = [...ordinate(chart, chart.y_range)];
     if (chart.equal) Object.assign(y, { scaleanchor: "x", scaleratio: 1 });
     if (names) Object.assign(y, { tickmode: "array", tickvals: names.names.map((_, i) => i), ticktext: names.names, autorange: "reversed", automargin: true });
-    return { height, width: printing ? width : undefined, autosize: !printing, margin: { ...MARGIN, b: this.below }, paper_bgcolor: t.paper,
+    return { height, width: width || undefined, margin: { ...MARGIN, b: this.below }, paper_bgcolor: t.paper,
       plot_bgcolor: t.paper, font: { family: FONT, size: 12, color: t.ink }, xaxis: x, yaxis: y, hovermode: "closest", dragmode: "zoom",
       barmode: "overlay", legend: { orientation: "h", x: 0, yref: "container", y: 0, yanchor: "bottom", itemsizing: "constant", tracegroupgap: 0 }, shapes: this.chosenShapes(),
       uirevision: "kept", annotations: chart.equal ? [{ text: "N\u2191", xref: "paper", yref: "paper", x: 0.99, y: 0.98, showarrow: false }] : [] };
   };
   Plot.prototype.draw = function () {
     const traces = this.traces(), drawn = Boolean(this.figure.dataset.drawn);
-    Plotly.react(this.div, traces, this.layout(), { responsive: true, displaylogo: false, doubleClick: "reset+autosize",
+    Plotly.react(this.div, traces, this.layout(), { displaylogo: false, doubleClick: "reset+autosize",
       modeBarButtonsToRemove: ["lasso2d", "select2d", "toImage"] });
     this.figure.dataset.drawn = traces.reduce((sum, trace) => sum + (trace.z ? 1 : trace.x.length), 0);
     if (!drawn) this.listen();
@@ -189,8 +189,8 @@
       if (layer.epoch && skies[this.figure.dataset.sky]) choose(this.figure.dataset.sky, (this.chart.epoch0 || 0) + layer.epoch[point.pointNumber], this.figure);
     });
     new ResizeObserver(() => { // another width has other rows of the legend
-      const before = this.below, layout = this.layout();
-      if (!printing && this.div.clientWidth && this.below !== before) Plotly.relayout(this.div, { height: layout.height, "margin.b": this.below });
+      const wide = this.div.clientWidth, layout = this.layout();
+      if (!printing && wide && this.div.layout.width !== wide) Plotly.relayout(this.div, { width: wide, height: layout.height, "margin.b": this.below });
     }).observe(this.div);
     this.div.addEventListener("keydown", event => {
       const sky = skies[this.figure.dataset.sky], step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
@@ -331,7 +331,7 @@
   };
   Sky.prototype.close = function () {
     this.figure.classList.remove("docked");
-    document.body.classList.remove("with-panel");
+    makeRoom();
     this.chosen = null;
     mark(this.figure.id);
   };
@@ -384,17 +384,20 @@
     }
     return out;
   }
-  // Charts are narrower beside the panel: the one that was clicked on, `figure`, stays in the window.
+  // The panel and the mark come first, over the page; then the charts make room, and the one that was clicked on, `figure`,
+  // stays in the window.
   function choose(id, seconds, figure) {
     const sky = skies[id];
     sky.chosen = seconds;
     sky.slider.value = sky.nearest(seconds);
     for (const other of Object.values(skies)) if (other !== sky) { other.figure.classList.remove("docked"); other.chosen = null; }
     sky.figure.classList.add("docked");
-    document.body.classList.add("with-panel");
     sky.draw();
+    requestAnimationFrame(() => { mark(id); setTimeout(() => makeRoom(figure), 100); });
+  }
+  function makeRoom(figure) {
+    document.body.classList.toggle("with-panel", Object.values(skies).some(sky => sky.figure.classList.contains("docked")));
     if (figure) figure.scrollIntoView({ block: "nearest", behavior: "instant" });
-    requestAnimationFrame(() => mark(id));
   }
   function mark(id) {
     for (const plot of plots)
@@ -427,7 +430,10 @@
     waiting = true;
     setTimeout(function () { waiting = false; near(); }, 60);
   }, { passive: true });
-  window.addEventListener("load", () => timing("load"));
+  window.addEventListener("load", function () { // the numbers behind the first click are read while nobody waits
+    timing("load");
+    setTimeout(() => Object.values(skies).forEach(sky => sky.load()), 500);
+  });
   window.addEventListener("resize", near);
   function again() { for (const plot of everything()) if (printing || plot.figure.dataset.drawn) plot.draw(); }
   darkness.addEventListener("change", again);
