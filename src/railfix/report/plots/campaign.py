@@ -74,7 +74,7 @@ def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Float
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
-    """Return the time an epoch over the run, the mean of each chunk; of ``chunks`` of ``run.json``."""
+    """Return the processing time per epoch over the run, as means of the ``chunks`` of ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)
