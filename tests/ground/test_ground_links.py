@@ -6,6 +6,7 @@ import asyncio
 import gc
 import random
 import shutil
+import socket
 import time
 from collections import Counter
 from collections.abc import Coroutine
@@ -16,14 +17,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cryptography.x509 import load_pem_x509_certificate
+from aioquic.asyncio.server import QuicServer
+from cryptography.x509 import Certificate, load_pem_x509_certificate
 
 from attacked_link import AttackedLink, AttackSettings
 from railfix.core.errors import OutputError
 from railfix.ground import keys as keys_module
 from railfix.ground.demo import Relay, RelaySettings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
-from railfix.ground.keys import list_ending, renew_keys, write_keys
+from railfix.ground.keys import Peer, list_ending, renew_keys, write_keys
 from railfix.ground.links import (
     BEARERS,
     CentreLinks,
@@ -35,7 +37,7 @@ from railfix.ground.links import (
     create_bearers,
     round_trips,
 )
-from railfix.ground.quic import LinkProtocol, configuration, connection
+from railfix.ground.quic import RECEIVE_BYTES, LinkProtocol, configuration, connection
 
 pytestmark = pytest.mark.requirement("F3")
 
@@ -314,6 +316,49 @@ def test_two_lossy_bearers_carry_each_message_once(keys: Path) -> None:
         await centre.stop()
         for relay in relays.values():
             relay.close()
+
+    run(work())
+
+
+@pytest.mark.skipif(
+    int(Path("/proc/sys/net/core/rmem_max").read_text()) < RECEIVE_BYTES, reason="net.core.rmem_max is below 4 MB"
+)
+def test_a_busy_centre_loses_no_packet_and_reads_a_certificate_once(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it is busy for a moment a thousand trains send 400 packets; each end of a connection reads the other's."""
+    counted: Counter[str] = Counter()
+
+    def read(certificate: Certificate) -> Peer:
+        counted["certificates"] += 1
+        return of(certificate)
+
+    def datagram(self: QuicServer, data: bytes, addr: Any) -> None:
+        counted["packets"] += data.startswith(b"burst")
+        if not data.startswith(b"burst"):
+            take(self, data, addr)
+
+    of, take = Peer.of, QuicServer.datagram_received
+    monkeypatch.setattr(Peer, "of", read)
+    monkeypatch.setattr(QuicServer, "datagram_received", datagram)
+
+    async def work() -> None:
+        got: list[bytes] = []
+        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload))
+        await centre.start()
+        train = TrainLinks(7, keys, create_bearers(centre.addresses, LOCAL))
+        await train.start()
+        await _until(lambda: len(train.protocols) == 2, 8.0)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as burst:
+            for k in range(400):  # nothing else runs meanwhile
+                burst.sendto(b"burst" + bytes(1100), centre.addresses["A"])
+                if k % 20 == 0:
+                    train.send(b"%d" % k)
+        await _until(lambda: counted["packets"] == 400 and len(got) == 20, 5.0)
+        assert (counted["packets"], len(got)) == (400, 20)
+        assert counted["certificates"] == 4
+        await train.stop()
+        await centre.stop()
 
     run(work())
 

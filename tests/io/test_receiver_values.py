@@ -18,7 +18,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages, rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import assemble_navigation
 from railfix.io.receiver.framing import Frames, find_frames
-from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.log import StreamState, _sec_siglog, decode
 from railfix.io.receiver.measurements import Measurements
 from test_receiver_logs import rtcm_message
 from test_receiver_rtcm import message, read_here
@@ -608,3 +608,25 @@ def test_health_of_galileo_is_packed_as_in_rinex(name: str, value: int, health: 
     fields = {"e1b_invalid": 0, "e1b_health": 0, "e5b_invalid": 0, "e5b_health": 0, name: value}
     record = read_here(message(1046, 0, {"number": 7, "toc_s": 0, "toe_sow_s": 0, **fields})).kepler
     assert record.health.tolist() == [health]
+
+
+@pytest.mark.requirement("A8")
+def test_a_message_that_is_broken_counts_unless_it_lies_inside_another() -> None:
+    """Bytes that look like a message within the payload of a good one are its content."""
+    broken = bytearray(frame(0x0A04, bytes(8)))
+    broken[-1] ^= 1
+    good = frame(0x0A04, bytes(4) + bytes(broken) + bytes(4))
+    for parts, bad in (((good,), 0), ((broken, good), 1), ((good, broken, good), 1), ((broken, good, broken), 2)):
+        found = find_frames(np.frombuffer(b"".join(parts), dtype=np.uint8))
+        assert (found.bad_checksums, len(found.start)) == (bad, parts.count(good))
+        assert found.skipped_bytes == len(broken) * bad
+
+
+@pytest.mark.requirement("B8")
+def test_a_log_of_signals_without_events_says_that_there_is_none() -> None:
+    nothing = np.array([1, 0, 0, 0, 0, 0, 0, 0], dtype=np.uint8)
+    found = _sec_siglog(nothing)
+    assert found is not None
+    assert found[0] == 0
+    assert _sec_siglog(nothing[:7]) is None
+    assert _sec_siglog(np.append(nothing, np.zeros(14, np.uint8))) is None

@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from conftest import ROOT
 from network_made import made_network
 from railfix.cli import app
 from railfix.ground.demo import run_demo
-from railfix.ground.web import Sessions, page_app
 from railfix.pipeline.config import Config
 from railfix.report import write_report
 from railfix.report.campaign import report_campaign, write_campaign_page
@@ -65,14 +63,13 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 async def centre_page() -> str:
     """Page of the centre at the end of the demonstration of the ground side."""
-    states: list[dict[str, Any]] = []
+    pages: list[str] = []
 
     async def keep(url: str) -> None:
-        states.append(json.loads(await asyncio.to_thread(lambda: urllib.request.urlopen(url + "state").read())))
+        pages.append(await asyncio.to_thread(lambda: urllib.request.urlopen(url).read().decode()))
 
     await run_demo(speed=25.0, password="secret", keep=keep)
-    shown = page_app(lambda: {**states[0], "done": True}, {}, sessions=Sessions(password="secret"))
-    return await asyncio.to_thread(lambda: TestClient(shown).get("/").text)
+    return pages[0]
 
 
 def site(folder: Path) -> Path:
@@ -80,7 +77,7 @@ def site(folder: Path) -> Path:
     pytest.importorskip("pydata_sphinx_theme")
     plain = [
         "-D",
-        "extensions=myst_parser,sphinx_design",
+        "extensions=myst_parser,sphinx_design,sphinx.ext.autodoc",
         "-D",
         "exclude_patterns=_templates,gallery,api*,auto_examples",
     ]

@@ -104,7 +104,8 @@ def test_a_click_shows_the_satellites_beside_the_chart_and_keys_go_on(page: Path
         shown.mouse.click(*centre_of(shown, "error-chainage", where[0], where[1]))
         panel = shown.locator(".skyplot.docked")
         panel.wait_for(state="visible")
-        # the chart stays in sight beside the panel
+        # the chart makes room, and stays in sight beside the panel
+        shown.locator("body.with-panel").wait_for()
         boxes = chart.bounding_box(), panel.bounding_box()
         assert boxes[0] is not None
         assert boxes[1] is not None

@@ -71,6 +71,7 @@ def test_probabilities_are_those_of_one_chain_of_all_states(heights: bool, monke
     monkeypatch.setattr(network_decode, "_BALLS", balls)
     monkeypatch.setattr(network_decode, "_BALLS_UP", 2)
     monkeypatch.setattr(network_decode, "SHIFTS_M", np.array([-4.0, 4.0]))
+    monkeypatch.setattr(network_decode, "_SHARES", np.array([0.5, 0.5]))
     residuals = _residuals(np.random.default_rng(3), n, heights=heights)
     net, candidates = _parallel(n)
     moves = Transitions(net, candidates, np.full(n - 1, STEP_M), residuals)

@@ -77,9 +77,9 @@ def service(
     verdict = [f"{len(found)} stretches of {stretch:g} m passed by {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
-            f"{len(served)} of them have a level within {limit:g} m in {_SERVED:.0%} of the epochs or more; "
+            f"{len(served)} of them have a level within {limit:g} m in {100 * _SERVED:.0f} % of the epochs or more; "
             f"worst stretch {worst['from_m']:.0f} to {worst['to_m']:.0f} m "
-            f"({worst['within_limit_share']:.0%} of its epochs)"
+            f"({100 * worst['within_limit_share']:.0f} % of its epochs)"
         )
     else:
         verdict.append("the runs have no filter and no levels; fractions are of single epochs")
@@ -163,7 +163,7 @@ def survey(
     ]
     if weak.mean() >= 0.005:
         verdict.append(
-            f"{weak.mean():.0%} of it is worse than twice the median: more runs there, or a dual-frequency"
+            f"{100 * weak.mean():.0f} % of it is worse than twice the median: more runs there, or a dual-frequency"
             " receiver help"
         )
     show_verdict(console, verdict)

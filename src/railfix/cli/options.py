@@ -211,7 +211,7 @@ def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any])
 
 
 class Choices(Settings):
-    """Settings of a run as the command line gives them; later fields override earlier ones."""
+    """Settings of a run from the command line; later fields override earlier ones."""
 
     preset: str | None = option(
         "Base preset; other settings override it: default; strict, fewer positions of higher integrity; p1, the "

@@ -95,7 +95,7 @@ def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> 
     unknown = [column for column in table.columns if column not in READ[name]]
     if unknown:
         raise InputFileError(
-            path, f"has a column {unknown[0]}, which {name} of EGNSS MATE has not; remove or rename it"
+            path, f"has a column {unknown[0]} that is not in {name} of EGNSS MATE; remove or rename it"
         )
     missing = [column for column in needed if column not in table.columns]
     if missing:

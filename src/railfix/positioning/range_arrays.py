@@ -68,7 +68,7 @@ class Ranges:
     code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
     groups: tuple[slice, ...]  #: Channels that share one receiver clock are adjacent; one slice per clock.
-    ties: InterSystemBiases | None = None  #: Known offsets between these clocks; None: none.
+    ties: InterSystemBiases | None = None  #: Known offsets between these clocks; None if there are none.
 
     def __len__(self) -> int:
         return len(self.code_m)

@@ -82,7 +82,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
     """Return the direction within a stretch in which it changes: at the longest stop, or open."""
     standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
     if not standing.any():
-        # Neighbours that see both directions need no stop between them.
+        # Between neighbouring pulses of both directions no stop is required.
         return np.full(len(step), np.nan)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(np.int8)))
     begin, end = edges[::2], edges[1::2]

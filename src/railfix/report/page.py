@@ -15,7 +15,7 @@ from railfix.core.files import path_names
 from railfix.core.staged_files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.evaluation_inputs import flat_settings
+from railfix.evaluate.evaluation_inputs import POSITIONS_TABLE, flat_settings
 from railfix.evaluate.tables import error_tables, group_tables, select_evaluation
 from railfix.report.charts_page import (
     Absent,
@@ -37,11 +37,18 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
+#: Errors in the table of all runs: kind of position and table of the evaluation, by their name in the heading.
+_JUDGED: Final = {
+    "filter": ("constrained", "train"),
+    "single epochs": ("constrained_ok", POSITIONS_TABLE),
+    "conventional": ("conventional", POSITIONS_TABLE),
+}
+
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
-    """Return one row per run and antenna: rates and, with a reference, errors."""
+    """Return one row per run and antenna: rates and, with a reference, the errors of the key figures."""
     head = ["run", "antenna", "settings", "epochs", "rate", "ok", "sigma p95"]
-    judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
+    judged = [name for kind in _JUDGED for name in (f"{kind} p95", "largest")] if evaluation else []
     rows = []
     for run in runs:
         asked = flat_settings(run.record.get("settings_asked") or {})
@@ -58,16 +65,19 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                 number(_plain(sigma.get("p95_m"))),
             ]
             if evaluation:
-                figures = {p: get_figures(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
-                row += [number(figures["constrained"].get(k)) for k in ("mean_m", "std_m", "p95_m", "max_m")]
-                row += [number(figures["conventional"].get(k)) for k in ("p95_m", "max_m")]
+                for position, table in _JUDGED.values():
+                    figures = get_figures(evaluation, run, antenna, position, table=table)
+                    row += [number(figures.get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
         "settings: preset and changed settings; rate: fraction of the epochs with observations that have a position; "
         "sigma p95: stated standard deviation along the line, in metres"
     )
     if evaluation:
-        caption += "; errors along the line in metres: mean and std of the signed error, p95 and largest of its size"
+        caption += (
+            "; 95th percentile and largest of the errors along the line in metres: of the filter at all epochs, of "
+            "single epochs that passed every check, and of conventional positions"
+        )
     columns = range(3, len(head) + len(judged))
     return Table(name="summary", head=[*head, *judged], rows=rows, caption=caption, numeric=columns)
 

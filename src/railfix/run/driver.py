@@ -364,7 +364,7 @@ _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 
 
 def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
-    """Return the meaning of a common sign of all satellites, the beginning of a sentence."""
+    """Return the meaning of a sign of interference as the beginning of a sentence."""
     if sign == "left_map":
         return "the 3-D positions have left the map (column interference_causes)"
     if sign == "contradicted":

@@ -179,7 +179,7 @@ class RouteOfLog:
         """Stretches on which another track has a probability of at least 1 %, the most probable first."""
         names = (*self.network.names, NONE)
         beside = np.where(self._on_route > 0.0, -1, self.matched.candidates.track)
-        found = []
+        known, found = np.flatnonzero(np.isin(self.matched.track, self.tracks)), []
         for track in (*np.unique(beside[beside >= 0]).tolist(), -1):
             share = self.unmapped
             if track >= 0:
@@ -192,18 +192,13 @@ class RouteOfLog:
                     found.append(
                         Alternative(
                             track=names[track],
-                            instead_of=names[self._track_of_route(top)],
+                            instead_of=names[self.matched.track[known[np.argmin(np.abs(known - top))]]],
                             first=self.log.time[part[0]],
                             last=self.log.time[part[-1]],
                             probability=float(share[top]),
                         )
                     )
         return tuple(sorted(found, key=lambda item: -item.probability))
-
-    def _track_of_route(self, row: int) -> int:
-        """Return the track of the route nearest in time to a matched position."""
-        known = np.flatnonzero(np.isin(self.matched.track, self.tracks))
-        return int(self.matched.track[known[np.argmin(np.abs(known - row))]])
 
     @property
     def names(self) -> list[str]:

@@ -122,7 +122,9 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
 
 
 def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
-    """Chainages of the beginning and end of tracks of a line, by file, file and name, or name; None is the line."""
+    """Return start and end chainages of a line's tracks by file, by file and name, or by name; None is the whole
+    line.
+    """
     spans: dict[str | None, tuple[float, float]] = {None: (0.0, float(track.chainage_m[-1]))}
     for source, (begin, end) in zip(track.sections, section_spans(track), strict=True):
         file, _, name = source.removesuffix(")").partition(" (")

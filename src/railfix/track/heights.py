@@ -194,7 +194,9 @@ def heights_of_file(
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Height datum and requested geoid, or those of a compound CRS; SettingsError when they contradict each other."""
+    """Height datum and requested geoid, or the datum and geoid of a compound CRS; SettingsError if they contradict each
+    other.
+    """
     vertical = get_vertical_datum(crs)
     if vertical is None:
         return height_datum, geoid

@@ -25,6 +25,8 @@ from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Netwo
 _UNMAPPED_COST: Final = 5.0
 #: Distances right of the nearest track at which a track that the map lacks can run beside it [m].
 SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
+#: Shares of these in the prior, in inverse proportion: tracks are mostly neighbours.
+_SHARES: Final = 1.0 / np.abs(SHIFTS_M) / (1.0 / np.abs(SHIFTS_M)).sum()
 #: Probability, from a position to the next, that such a track comes to be `SHIFTS_M` nearer or farther.
 _DRIFTS: Final = 1e-3
 _SHIFT_STEP_M: Final = 2.0
@@ -106,19 +108,15 @@ class Transitions:
         at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
         beyond = np.abs(residuals.beyond_m) / np.clip(_BEYOND_SIGMAS * residuals.sigma_m, *_BEYOND_M)[:, None]
         opens = at_end.any(axis=2) & (beyond > 1.0)
-        same = (self._track[:-1, :, None] == self._track[1:, None, :]) & (self._track[:-1, :, None] >= 0)
-        next_opens, last_open = (same & opens[1:, None, :]).any(axis=2), (same & opens[:-1, :, None]).any(axis=1)
+        self._same = (self._track[:-1, :, None] == self._track[1:, None, :]) & (self._track[:-1, :, None] >= 0)
         #: Whether an open end is passed in leaving a track, or in coming to one: the position after, or before, lies
-        #: beyond it, or farther still; shapes (n - 1, m).
-        self._left = next_opens | (opens[:-1] & ~same.any(axis=2))
-        self._entered = last_open | (opens[1:] & ~same.any(axis=1))
+        #: beyond it; shapes (n - 1, m).
+        self._left = (self._same & opens[1:, None, :]).any(axis=2)
+        self._entered = (self._same & opens[:-1, :, None]).any(axis=1)
         # errors do not change by metres in one step: a position beyond the end, next to one that is not, is no error
-        stays = np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2))
+        stays = np.where(opens, np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2)), 1.0)
         #: Likelihood of staying on a track where the position before, or after, is the only one beyond its open end.
-        self._stays = (
-            np.where(opens[:-1] & ~next_opens, stays[:-1], 1.0),
-            np.where(opens[1:] & ~last_open, stays[1:], 1.0),
-        )
+        self._stays = np.where(self._left, 1.0, stays[:-1]), np.where(self._entered, 1.0, stays[1:])
 
     @property
     def changes(self) -> Masks:
@@ -128,9 +126,7 @@ class Transitions:
 
     def __call__(self, k: int) -> Floats:
         """Return probabilities from epoch k to k + 1, shape (m + S + 1, m + S + 1), row by row."""
-        before, after = self._track[k], self._track[k + 1]
-        m, free = len(before), self._clear[k + 1] * _shares_of_shifts()
-        same = (before[:, None] == after) & (before[:, None] >= 0)
+        m, free, same = self._track.shape[1], self._clear[k + 1] * _SHARES, self._same[k]
         share = np.full((m + len(SHIFTS_M) + 1, m + len(SHIFTS_M) + 1), np.exp(-_LEAVE_COST))
         left, entered = self._left[k], self._entered[k]
         share[:m, -1] = np.where(left, np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
@@ -174,12 +170,6 @@ class Transitions:
             ways = dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach_m))
             self._ways[track, end] = (reach_m, ways)
         return ways
-
-
-def _shares_of_shifts() -> Floats:
-    """Return the shares of `SHIFTS_M` in the prior, in inverse proportion: tracks are mostly neighbours."""
-    near = 1.0 / np.abs(SHIFTS_M)
-    return np.asarray(near / near.sum())
 
 
 def _shifted(moved_m: float, turned: bool) -> Floats:
@@ -329,7 +319,7 @@ def _forward(
             mapped = np.isfinite(residuals.offset_m[k])
             entered = np.full(states, UNMAPPED_PRIOR * np.exp(-_ENTER_COST))
             entered[:m] = mapped * (1.0 - UNMAPPED_PRIOR) / max(mapped.sum(), 1)
-            entered[m:-1] = residuals.clear[k] * UNMAPPED_PRIOR * _shares_of_shifts()
+            entered[m:-1] = residuals.clear[k] * UNMAPPED_PRIOR * _SHARES
             share = entered[:, None, None] * lattice.first * likelihood
         elif k > start:
             move = moves(k - 1)

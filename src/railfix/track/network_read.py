@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Final
@@ -44,8 +44,11 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
         return _of_relations(tracks, relations, str(paths[0]))
     if all(track.nodes for track in tracks):
         return _of_nodes(tracks)
-    network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
-    note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
+    whole = Network(tracks=tuple(tracks), links=())
+    cuts = _places_of_ends(whole, tolerance_m)
+    network, _ = _divide(whole, cuts)
+    note = f"connections from ends within {tolerance_m:g} m; {len(cuts)} tracks divided where the end of another meets "
+    note += "them"
     if packed := [path for path in paths if ending(path) == ".pbf"]:
         note += f"; {packed[0]} is read without the ids of its nodes, which 'osmium cat FILE.osm.pbf -o FILE.osm' keeps"
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
@@ -54,24 +57,16 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
 def _of_nodes(tracks: list[Segment]) -> Network:
     """Connect ways of OpenStreetMap at their shared nodes, inner ones too, and nowhere else."""
     used = Counter(node for track in tracks for node in track.nodes)
-    parts: list[Segment] = []
-    divided = 0
+    inner = [[i for i, node in enumerate(t.nodes[1:-1], start=1) if used[node] > 1] for t in tracks]
     whole = Network(tracks=tuple(tracks), links=())
-    way_of_part: list[int] = []
-    for k, track in enumerate(tracks):
-        inner = [i for i, node in enumerate(track.nodes[1:-1], start=1) if used[node] > 1]
-        divided += bool(inner)
-        along = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
-        bounds = [0, *inner, len(track.nodes) - 1]
-        for number, (low, high) in enumerate(pairwise(bounds), start=1):
-            part = _part(track, along, float(along[low]), float(along[high]), number) if inner else track
-            parts.append(replace(part, nodes=track.nodes[low : high + 1]))
-            way_of_part.append(k)
-    network = Network(tracks=tuple(parts), links=())
+    network, way_of_part = _divide(
+        whole, {k: [float(whole.chainage_m[whole.first_point[k] + i]) for i in at] for k, at in enumerate(inner) if at}
+    )
+    bounds = [pair for t, at in zip(tracks, inner, strict=True) for pair in pairwise([0, *at, len(t.nodes) - 1])]
     ends: dict[str, list[tuple[int, int]]] = {}
-    for k, part in enumerate(parts):
-        for end in (0, 1):
-            ends.setdefault(part.nodes[-end], []).append((k, end))
+    for k, (low, high) in enumerate(bounds):
+        for end, at_node in enumerate((low, high)):
+            ends.setdefault(tracks[way_of_part[k]].nodes[at_node], []).append((k, end))
     _, outward = end_points(network)
     links = []
     for node, meeting in ends.items():
@@ -80,7 +75,7 @@ def _of_nodes(tracks: list[Segment]) -> Network:
             crosses = node.startswith(CROSSING) and way_of_part[a] != way_of_part[b]
             navigable = ahead and a != b and not crosses
             links.append(Link(first=a, first_end=first, second=b, second_end=second, navigable=navigable))
-    note = f"connections at the nodes that ways share; {divided} ways divided at inner nodes"
+    note = f"connections at the nodes that ways share; {sum(map(bool, inner))} ways divided at inner nodes"
     return network.connect(tuple(links), note)
 
 
@@ -151,8 +146,8 @@ def is_route(segments: Sequence[Segment]) -> bool:
     return bool((np.einsum("ij,ij->i", outward[:-1, 1], outward[1:, 0]) < -np.cos(_LARGEST_TURN_RAD)).all())
 
 
-def _divide(whole: Network, tolerance_m: float) -> tuple[Network, int]:
-    """Return tracks divided at inner points that are the end of another track, and the number of divided ones."""
+def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]]:
+    """Return the inner places of tracks at which another track ends, in order [m], by the number of the track."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -163,20 +158,23 @@ def _divide(whole: Network, tolerance_m: float) -> tuple[Network, int]:
         levels = {tracks[k].metadata.get("level", "") for k in (other, end // 2)} - {""}
         if other != end // 2 and len(levels) < 2 and tolerance_m < place < whole.length_m[other] - tolerance_m:
             cuts.setdefault(other, []).append(place)
-    if not cuts:
-        return whole, 0
-    parts: list[Segment] = []
-    for k, track in enumerate(tracks):
-        if k not in cuts:
-            parts.append(track)
-            continue
+    return {
+        k: [p for i, p in enumerate(sorted(at)) if i == 0 or p - sorted(at)[i - 1] > tolerance_m]
+        for k, at in cuts.items()
+    }
+
+
+def _divide(whole: Network, places: Mapping[int, Sequence[float]]) -> tuple[Network, list[int]]:
+    """Return the network with tracks divided at inner places [m], and the number of the whole track of each part."""
+    parts: list[tuple[Segment, int]] = []
+    for k, track in enumerate(whole.tracks):
         way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
-        places = sorted(cuts[k])
-        places = [p for i, p in enumerate(places) if i == 0 or p - places[i - 1] > tolerance_m]
-        bounds = [0.0, *places, float(way[-1])]
-        for number, (low, high) in enumerate(pairwise(bounds), start=1):
-            parts.append(_part(track, way, low, high, number))
-    return Network(tracks=tuple(parts), links=()), len(cuts)
+        bounds = pairwise([0.0, *places.get(k, ()), float(way[-1])])
+        parts += [
+            (_part(track, way, low, high, number) if k in places else track, k)
+            for number, (low, high) in enumerate(bounds, start=1)
+        ]
+    return Network(tracks=tuple(part for part, _ in parts), links=()), [k for _, k in parts]
 
 
 def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> Segment:
@@ -253,15 +251,14 @@ def check_network(network: Network) -> NetworkQuality:
     )
 
 
-def _finding(network: Network, kind: str, tracks: Sequence[int], end: int, sentence: str) -> NetworkFinding:
-    """Return a fault at an end of the first of some tracks, whose names replace {0} and {1} in the sentence."""
+def _finding(network: Network, kind: str, tracks: Sequence[int], point: int, sentence: str) -> NetworkFinding:
+    """Return a fault at a point of the first of some tracks, whose names replace {0} and {1} in the sentence."""
     names, segment = tuple(network.names[track] for track in tracks), network.tracks[tracks[0]]
-    k = -end  # 0 is the first point, -1 the last
     return NetworkFinding(
         kind=kind,
         tracks=names,
-        latitude_deg=float(segment.latitude_deg[k]),
-        longitude_deg=float(segment.longitude_deg[k]),
+        latitude_deg=float(segment.latitude_deg[point]),
+        longitude_deg=float(segment.longitude_deg[point]),
         sentence=sentence.format(*names),
     )
 
@@ -279,12 +276,12 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
         (t, e), (u, _) = loose[a], loose[b]
         gap = float(np.linalg.norm(points[a] - points[b]))
         yield _finding(
-            network, "gap", (t, u), e, f"{{0}} and {{1}} end {gap:.2f} m apart without a navigable connection"
+            network, "gap", (t, u), -e, f"{{0}} and {{1}} end {gap:.2f} m apart without a navigable connection"
         )
     paired = {k for pair in near for k in pair}
     for k, (t, e) in enumerate(loose):
         if k not in paired:
-            yield _finding(network, "dead end", (t,), e, "{0} ends without a connection")
+            yield _finding(network, "dead end", (t,), -e, "{0} ends without a connection")
 
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
@@ -295,11 +292,11 @@ def _joints(network: Network) -> Iterator[NetworkFinding]:
         gap = float(np.linalg.norm(ends[first] - ends[second]))
         if gap > _JOINT_M:
             sentence = f"the connected ends of {{0}} and {{1}} are {gap:.2f} m apart"
-            yield _finding(network, "joint", tracks, link.first_end, sentence)
+            yield _finding(network, "joint", tracks, -link.first_end, sentence)
         turn = 180.0 - np.degrees(np.arccos(np.clip(outward[first] @ outward[second], -1.0, 1.0)))
         if link.navigable and turn > _KINK_DEG:
             sentence = f"the direction changes by {turn:.0f} deg from {{0}} to {{1}}"
-            yield _finding(network, "kink", tracks, link.first_end, sentence)
+            yield _finding(network, "kink", tracks, -link.first_end, sentence)
 
 
 def _too_near(network: Network) -> Iterator[NetworkFinding]:
@@ -320,12 +317,8 @@ def _too_near(network: Network) -> Iterator[NetworkFinding]:
     for (a, b), points in sorted(pairs.items()):
         places = network.chainage_m[[k for k, _ in points]]
         if a < b and places.max() - places.min() >= _LEAST_WAY_M:
-            names = (network.names[a], network.names[b])
-            yield NetworkFinding(
-                kind="too near",
-                tracks=names,
-                latitude_deg=float(latitude[points[0][0]]),
-                longitude_deg=float(longitude[points[0][0]]),
-                sentence=f"{names[0]} and {names[1]} are {min(d for _, d in points):.2f} m apart over "
-                f"{places.max() - places.min():.0f} m away from their ends; the same track twice, or a crossing?",
+            sentence = (
+                f"{{0}} and {{1}} are {min(d for _, d in points):.2f} m apart over "
+                f"{places.max() - places.min():.0f} m away from their ends; the same track twice, or a crossing?"
             )
+            yield _finding(network, "too near", (a, b), points[0][0] - int(network.first_point[a]), sentence)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from math import fsum
 from typing import Literal
@@ -153,7 +152,7 @@ def find_route(network: Network, matched: Matched, path: str = "the log") -> tup
     routes = [network.route_over(passed)]
     if routes[0] is None:
         # the train turned back, the map has a gap, or positions lay on a track that was not passed
-        routes = [*_legs(network, passed), *(_choose_route(network, order, share) for order in (passed, passed[::-1]))]
+        routes = [_choose_route(network, order, share) for order in (passed, passed[::-1])]
     once = [part for route in routes if route is not None for part in _once(network, route)]
     # `fsum` rounds the same in any order: the return over the same tracks has the same length
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
@@ -207,21 +206,6 @@ def _joints(network: Network, route: list[int]) -> list[int]:
     return found
 
 
-def _legs(network: Network, passed: list[int]) -> list[list[int]]:
-    """Return the longest parts of a sequence of tracks that are a route."""
-    legs: list[list[int]] = []
-    start = 0
-    while start < len(passed):
-        rest = passed[start:]
-        # the longest prefix that is a route: every prefix of one is
-        count = bisect_left(range(2, len(rest) + 1), 1, key=partial(_ends_a_leg, network, rest)) + 1
-        legs.append(network.shortest_route(rest[:count]))
-        if count == len(rest):
-            break
-        start += max(count - 1, 1)
-    return legs
-
-
 def _choose_route(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
     """Choose a route over the most probable tracks, in the order in which each first comes: its parts are routes."""
     rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
@@ -235,8 +219,3 @@ def _choose_route(network: Network, passed: list[int], share: Mapping[int, float
         kept += rest[:count]
         rest = rest[count + 1 :]
     return network.shortest_route([t for t in dict.fromkeys(passed) if t in kept])
-
-
-def _ends_a_leg(network: Network, passed: list[int], count: int) -> int:
-    """1 where no route leads over the first tracks, else 0."""
-    return int(network.route_over(passed[:count]) is None)

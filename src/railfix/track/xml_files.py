@@ -33,7 +33,7 @@ class Relation:
     #: Names of the elements.
     first: str
     second: str
-    #: 0 where the start of the element is meant, 1 where its end.
+    #: 0 for the start of the element, 1 for its end.
     first_end: int
     second_end: int
     navigable: bool  #: Whether trains pass from one to the other.

@@ -26,7 +26,7 @@ _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSamples(RowArrays):
-    """Positions and distances once a second, shape (N,)."""
+    """Positions and distances once per second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
     #: Position along the line by satellites.

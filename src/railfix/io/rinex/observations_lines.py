@@ -93,14 +93,14 @@ class EpochHeads:
 FLAWS: Final = (
     "",
     "the epoch line is shorter than {width} characters",
-    "the epoch flag '{flag}' is none of 0 to 6",
+    "the epoch flag '{flag}' is not in 0 to 6",
     "the number of satellites '{count}' is no number",
     "the fields of the epoch line are not in their columns",
     "the year is no number",
     "the month is none of 1 to 12",
     "the day does not exist in its month",
-    "the hour is none of 0 to 23",
-    "the minute is none of 0 to 59",
+    "the hour is not in 0 to 23",
+    "the minute is not in 0 to 59",
     "the seconds are not from 0 to below 60",
 )
 _SHORT, _FLAG, _COUNT, _PLACES = 1, 2, 3, 4

@@ -201,7 +201,7 @@ def fix_integers(
     covariance_m2 : ndarray, shape (A, A) [m^2]
         Of noise alone.
     strength : ndarray, shape (A,)
-        Weight of each phase: the strongest of a group is what the others are differenced with.
+        Weight of each phase; the strongest phase of a group is the reference of its differences.
     channels : IntegerChannels
         Of the A arcs.
     map_sigma_m : tuple of float

@@ -14,7 +14,8 @@ from railfix.core.checksums import crc24q
 from railfix.core.notebook import NotebookTable
 
 Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections.
-#: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.
+#: Preambles of successive messages: three alternating patterns of eight bits (DO-229D, A.4.3.1); on L5 six patterns of
+#: four bits.
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
 #: Preamble, type and data; bytes of a message in `SbasMessages.bits`.
 DATA_BITS: Final = 226

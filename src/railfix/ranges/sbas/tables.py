@@ -183,7 +183,9 @@ class SatelliteTables:
         return Series.of(np.where(number > 0, number, -1), time, decoded)
 
     def _udre(self, messages: SbasMessages) -> Series:
-        """Fast corrections bring their own UDREI; type 6 renews those whose IODF it names, an alarm all."""
+        """Fast corrections have their own UDREI; type 6 updates the UDREI of the corrections with its IODF, an alarm
+        updates all.
+        """
         fast, six = self.fast, decode(messages, 6)
         time = np.repeat(messages.time[six["row"]], SLOTS)
         number = self.masks.current(np.tile(np.arange(SLOTS), len(six["row"])), time)

@@ -74,7 +74,7 @@ def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Float
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
-    """Return the time an epoch over the run, the mean of each chunk; of ``chunks`` of ``run.json``."""
+    """Return the processing time per epoch over the run, as means of the ``chunks`` of ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)
@@ -101,7 +101,7 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
 
 def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
     """Return satellites, reflections, fractions of epochs and levels of `compute_service` by chainage."""
-    level = [("median", "level_median_m", BLUE), ("95 %", "level_p95_m", RED)]
+    level = [("median", "level_median_m", BLUE), ("exceeded in 5 % of epochs", "level_p95_m", RED)]
     ends = np.array([service["from_m"].min(), service["to_m"].max()], dtype=float)
     limit = Curve(label="alarm limit", colour=GREEN, x=ends, y=np.full(2, limit_m), dash="dashed")
     fractions = [
@@ -109,12 +109,13 @@ def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
         ("filter with a level", "tracking_share", RED),
         (f"level within {limit_m:g} m", "within_limit_share", GREEN),
     ]
-    satellites = [("median", "satellites_median", BLUE), ("5 %", "satellites_p5", RED)]
+    satellites = [("median", "satellites_median", BLUE), ("fewer in 5 % of epochs", "satellites_p5", RED)]
+    distance = [("exceeded in 5 % of epochs", "reflection_p95_m", RED)]
     panels: tuple[tuple[str, str, list[Any], dict[str, Any]], ...] = (
         ("Satellites used", "satellites", satellites, {"y_range": None}),
-        ("Distance of the 3-D position from the line", "m", [("95 %", "reflection_p95_m", RED)], {}),
+        ("Distance of the 3-D position from the line", "distance [m]", distance, {}),
         ("Fraction of epochs", "fraction of epochs", fractions, {"y_range": (-0.03, 1.03)}),
-        ("Protection level", "m", level, {"y_scale": "log"}),
+        ("Protection level", "protection level [m]", level, {"y_scale": "log"}),
     )
     return tuple(
         Chart(

@@ -192,7 +192,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
     return Chart(
         name="error-ranges",
         title="Range of the errors",
-        caption=f"From the lowest to the highest signed error; the mark is the mean. {_SIGN}",
+        caption=f"From the lowest to the highest signed error, with failed checks; the mark is the mean. {_SIGN}",
         x_label=_ERROR_LABEL,
         y_label="",
         layers=tuple(layers),
