@@ -1,6 +1,6 @@
 """The errors that railfix raises, and the exit code of the command line for each.
 
-Every message is one sentence: the file (and line or field), what was expected, and what to do.
+Every message is one sentence: the file (and line or field), the expected content, and the remedy.
 Array functions raise `ValueError` when their contract is violated.
 
 ==== =====================================================================

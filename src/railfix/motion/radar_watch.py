@@ -1,4 +1,4 @@
-"""Alarms of a radar whose scale has stepped, or that is silent, by comparison with speeds by satellites."""
+"""Alarms for a radar with a scale step or without output, by comparison with satellite (Doppler) speeds."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _LEAST_SCATTER: Final = 0.001
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """Comparison of the radar's speeds with those by satellites."""
+    """Comparison of the radar's speeds with satellite speeds."""
 
     kind: Literal["mounting", "silent"]  #: A step of the ratio of the speeds; no speed while the train moves.
-    time: np.datetime64  #: From when on.
+    time: np.datetime64  #: Start of the alarm.
     #: Ratio less 1 before a step and after it.
     before: float = float("nan")
     after: float = float("nan")
@@ -80,12 +80,12 @@ class RadarWatch:
         return found
 
     def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
-        """Take speeds by satellites with the radar's own that are nearest to each; see `take`."""
+        """Add satellite speeds, each with the nearest radar speed; see `take`."""
         row = nearest_rows(radar.time, time, within_ns=_NEAR_NS)
         return self.take(time, np.append(radar.speed_mps, np.nan)[row], right_mps)
 
     def _close(self) -> list[RadarAlarm]:
-        """End a window; the alarm that it completes."""
+        """End a window; return the alarm that it completes, if any."""
         moving, count, product, square = self._sums.tolist()
         if moving >= _LEAST_SPEEDS:
             self.silent = self.silent + 1 if count == 0 else 0
