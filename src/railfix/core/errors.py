@@ -82,7 +82,7 @@ _MAKERS: Final = {
 
 
 def check_type(value: object, expected: type, what: str) -> None:
-    """Raise SettingsError where an argument is not of the expected type; it names the function that returns one."""
+    """Raise SettingsError where an argument is not of the expected type; it names the function for that type."""
     if not isinstance(value, expected):
         maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")

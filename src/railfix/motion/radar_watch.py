@@ -15,7 +15,7 @@ from railfix.motion.samples import RadarSpeeds
 #: The ratio is computed over windows of this length [ns] with this many speeds, of a train faster than this [m/s].
 _WINDOW_NS: Final = 30_000_000_000
 _LEAST_SPEEDS: Final = 10
-_NEAR_NS: Final = 150_000_000  #: A speed of the radar belongs to one by satellites that is so near [ns].
+_NEAR_NS: Final = 150_000_000  #: Largest time between the speeds that are compared [ns].
 _MOVING_MPS: Final = 3.0
 #: Windows before a step that are compared, at least and at most, and windows after it.
 _LEAST_BEFORE: Final = 5
@@ -64,7 +64,7 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Take speeds of both at the same later instants (NaN: not measured); return the alarms that they raise."""
+        """Add speeds of both at the same later instants (NaN: not measured); return the alarms that they raise."""
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])
         radar, right = np.abs(np.nan_to_num(radar_mps[moving])), np.abs(right_mps[moving])

@@ -62,7 +62,7 @@ SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
 _STANDING_MPS: Final = 0.5  #: A carried speed below this agrees with a stationary wheel.
 _PITCH_S: Final = 20.0
-_STEEPEST: Final = 0.1  #: Sine beyond which a pitch is none of a train: 35 permille of line, body and mounting [1].
+_STEEPEST: Final = 0.1  #: Sine beyond which a pitch is implausible: 35 permille of line, body and mounting [1].
 _FASTEST_MPS: Final = 100.0  #: A carried speed beyond this has expired.
 #: Time for which the body swings after a stop; its pitch afterwards is that of standstill.
 _SETTLING_S: Final = 2.0

@@ -153,7 +153,7 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Measured priors above this come from too few blocks of time to leave a level.
+LARGEST_PRIOR: Final = 0.05  #: Measured priors above this rest on too few blocks for a finite level.
 
 
 class FaultRate(Settings):

@@ -40,7 +40,7 @@ _RINEX_SHIFT_S: Final = 1.0
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One message as written: nanoseconds since 1980-01-06 in GPS time, PRN, type (-1 unsaid), hexadecimal digits."""
+    """One message as written: nanoseconds since 1980-01-06 in GPS time, PRN, type (-1: none), hexadecimal digits."""
 
     line: int
     time_ns: int

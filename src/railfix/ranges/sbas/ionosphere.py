@@ -61,7 +61,7 @@ def _band(band: int) -> list[tuple[int, int]]:
 
 
 def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.generic]) -> Integers:
-    """Return the number of grid points; coordinates are multiples of 5 degrees, longitudes of any turn."""
+    """Return the numbers of grid points; coordinates are multiples of 5 degrees, longitudes modulo 360."""
     row = np.rint((np.asarray(latitude_deg, dtype=np.float64) + 90.0) / 5.0).astype(np.int64)
     column = np.rint((np.asarray(longitude_deg, dtype=np.float64) + 180.0) / 5.0).astype(np.int64) % COLUMNS
     return row * COLUMNS + column

@@ -78,7 +78,7 @@ class SbasMessages(RowArrays, NotebookTable):
     #: The message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains
     #: it, then zeros; shape (N, 32).
     bits: Bytes
-    parity_bits: Integers  #: How many bits of parity the source carried, and were checked: 24, 6 or 0; shape (N,).
+    parity_bits: Integers  #: Parity bits in the source, which were checked: 24, 6 or 0; shape (N,).
     source: Integers  #: Row of `sources`, shape (N,).
     line: Integers  #: 1-based line of the file, shape (N,).
     sources: tuple[str, ...] = ()  #: Files.
