@@ -1,4 +1,4 @@
-"""Approximate positions of an antenna from raw ranges: where directions to satellites and delays are computed."""
+"""Approximate positions of an antenna from raw ranges: points at which directions and delays are computed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""3-D positions of several constellations, whose receiver clocks are tied by the biases known from earlier epochs.
+"""3-D positions of several constellations, with receiver clocks tied by biases from earlier epochs.
 
 The offsets of the constellations' clocks are stable to a metre over hours. Once an offset is known, even a single
 satellite of a constellation contributes, and every satellite is checked against all others. Offsets are estimated from

@@ -29,8 +29,8 @@ class Windows(NamedTuple):
     ) -> Windows:
         """Compute the ages by the rows of each antenna and its last epoch before these.
 
-        A window is `window_s` or `least_epochs` epochs, whichever is longer: during gaps nothing is forgotten faster
-        than per epoch.
+        A window is `window_s` or `least_epochs` epochs, whichever is longer: a gap counts as at most 1 / `least_epochs`
+        of a window.
         """
         times, ages = zip(*before, strict=True)
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)

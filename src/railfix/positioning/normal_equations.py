@@ -68,7 +68,7 @@ class ConstrainedLimits(Settings):
 
     #: Largest last step inside a section: after a step of 5 m the error is 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)  #: Steps, walks into a neighbouring section included.
+    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, into neighbouring sections included.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

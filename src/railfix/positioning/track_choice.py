@@ -25,8 +25,8 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UN
 #: Steps of the integrals along and across the track [m].
 _ALONG_M: Final = 0.25
 _ACROSS_M: Final = 0.3
-#: A train nearer to a track than this is off it because the map is displaced: less likely by this factor than a missing
-#: track, and not within the second value [m].
+#: Weight of a missing track within the clearance of a mapped track (the map would be displaced), relative to one
+#: farther away; 0 nearer than the second value [m].
 _BETWEEN_SHARE: Final = 0.1
 _BETWEEN_M: Final = 1.2
 #: A position farther than this from the most likely track, in standard deviations, gives no decision.

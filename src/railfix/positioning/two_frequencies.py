@@ -189,7 +189,7 @@ def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphe
 def _noise_scale(
     time: Datetimes, deviation: Floats, variance: Floats, known: Masks, own: TwoFrequencyState, ages: dict[str, float]
 ) -> tuple[Floats, Floats]:
-    """Return the variance of the differences over the assumed one, by the epochs before, shape (T,), and the sums."""
+    """Return the variance of the differences over the assumed one, from earlier epochs, shape (T,), and the sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
     sample = np.stack([channel_sums(size), channel_sums(known.astype(np.float64))], axis=1)
     last_epoch = [(own.last, own.age)]

@@ -103,7 +103,7 @@ class ContinuityLimits(Settings):
     #: curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
-    sigmas: float = Field(default=4.5, gt=0)  #: Standard deviations of the channel's residual that reject it.
+    sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
     #: Largest number of channels rejected; if more would be rejected, no channel continues.
     max_rejected: int = Field(default=8, ge=0)
     max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
