@@ -285,7 +285,7 @@ def demo(choices: DemoChoices) -> None:
 
 
 class CentreChoices(Settings):
-    """Options of a centre's page, and duration."""
+    """Options of a centre's page, and duration of the session."""
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(

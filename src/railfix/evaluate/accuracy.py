@@ -158,7 +158,7 @@ POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Columns of names that are categorical while grouping: many rows, few distinct names.
+#: Type of the name columns while grouping: many rows, few distinct names.
 WORDS: Final = pl.Categorical()
 #: Value in place of a name for all groups together.
 ALL: Final = "all"
@@ -324,7 +324,7 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
-    """Return the value of a column where another is largest, the first of equals; null where all of it are null."""
+    """Return the value of a column where another is largest, the first of equals; null where the other is all null."""
     return pl.col(column).get(pl.col(by).arg_max())
 
 

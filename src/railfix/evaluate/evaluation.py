@@ -48,7 +48,7 @@ class RunAndReference:
 
     run: Path
     reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` in the folder of the run's log.
-    configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
+    configuration: str | None = None  #: Name of its settings; None: the settings that differ between the runs.
     table: str = POSITIONS_TABLE  #: See `railfix.evaluate.evaluation_inputs.list_position_tables`.
     #: Another run on the same log, whose conventional positions replace the run's own: a run with the elevation and
     #: C/N0 screens alone has the conventional positions that P1 compares with.

@@ -94,7 +94,7 @@ def unpack_wheel(wheel: Path, folder: Path) -> None:
 
 
 def write_drive(recordings: Path, folder: Path) -> str:
-    """Write the drive as a held-out case of `railfix benchmark` into a folder; return how good its ground truth is.
+    """Write the drive as a held-out case of `railfix benchmark` into a folder; return the accuracy of its ground truth.
 
     The ground truth is RTKLIB's kinematic solution with the station, forward and backward, where `rnx2rtkp` is
     installed; otherwise the publisher's trajectory. The map is made of the ground truth. OutputError: RTKLIB fails.

@@ -85,7 +85,7 @@ class StationErrors:
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
-        """Return errors at other times, interpolated linearly, shape (T, K) [m]; NaN where the station sees nothing."""
+        """Return errors at other times, interpolated linearly, shape (T, K) [m]; NaN without observation there."""
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
         known = [k for k, name in enumerate(satellite.tolist()) if name in column]
         result = np.full((len(time), len(satellite)), np.nan)

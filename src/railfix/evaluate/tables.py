@@ -278,7 +278,7 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
     keys = ["run", "configuration", "line", "antenna", "group"]
     left, right = (rows.filter(position=position) for position in ("constrained", "conventional"))
     both = left.join(right, on=keys, how="left", suffix="_conventional", maintain_order="left")
-    # a single antenna has the same figures as both antennas together
+    # groups show both antennas together, not each antenna
     both = both.filter(antenna="all") if "all" in both["antenna"] else both
     # without satellites there are no observations: every epoch counts
     counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")

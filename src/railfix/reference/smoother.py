@@ -78,7 +78,7 @@ class SmoothedReference:
     #: Shape (N,).
     speed_mps: Floats
     speed_sigma_mps: Floats
-    wheel_scale: Floats  #: Fraction by which the wheel's distance is too long; NaN without a wheel; shape (N,).
+    wheel_scale: Floats  #: Scale error of the wheel's distance, positive if too long; NaN without a wheel; (N,).
 
 
 class _States:

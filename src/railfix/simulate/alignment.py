@@ -33,7 +33,7 @@ _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points that the curve is integrated to [m]; the spline between them is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-_ROUNDS: Final = 8  #: Rounds of the integration on the ellipsoid: each gains the factor (length / Earth radius).
+_ROUNDS: Final = 8  #: Rounds of the integration on the ellipsoid: each reduces the error by (length / Earth radius).
 
 #: Pattern of the simulated test line: length [m], radius (right positive) [m] and cant [m] at its end.
 PATTERN: Final = (

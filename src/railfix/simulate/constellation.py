@@ -80,7 +80,7 @@ def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, 
 
 
 def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:
-    """Indices of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
+    """Indices of a satellite's records in force from `first` to `last`, by transmission; none where one is missing."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
     # Of records sent at the same time, the one with the later reference time.

@@ -327,7 +327,7 @@ class FileLine:
 
 
 def line_of_file(settings: LineFile) -> FileLine:
-    """Return the line through the points of a track file; InputFileError where it has too few, or bends too sharply."""
+    """Return the line through the points of a track file; InputFileError where it has too few, or too sharp a curve."""
     track = read_track(
         settings.path,
         crs=settings.crs or None,

@@ -308,7 +308,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
 def _disturb(
     simulation: Simulation, receiver: Receiver, geometry: SightGeometry, cn0_dbhz: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return what the surroundings add to code [m], phase [m] and Doppler [Hz], and the C/N0 with it, each (T, M)."""
+    """Return the surroundings' effects on code [m], phase [m] and Doppler [Hz], and the resulting C/N0, each (T, M)."""
     code, phase, doppler = np.zeros((3, *cn0_dbhz.shape))
     for source in simulation.disturbances if receiver.antenna in ANTENNAS else ():
         more = source(geometry)

@@ -28,8 +28,7 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 class FastInForce:
     """Fast corrections in force, all (T, K)."""
 
-    #: Whether there is no fast correction; it is too old or of an inactive mask; type 7 is missing; a required rate is
-    #: missing.
+    #: In this order: no fast correction; too old, or of an inactive mask; no type 7; a required rate is missing.
     missing: Masks
     timed_out: Masks
     no_factor: Masks

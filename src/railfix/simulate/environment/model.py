@@ -66,7 +66,7 @@ class Conductor:
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:
-        """Field that the conductor removes from the direct signal, by obstructed fraction and cosine, shape (N,)."""
+        """Field removed from the direct signal by the conductor, by obstructed fraction and cosine, shape (N,)."""
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
         toward = (self.p * self.ray_p + self.q * self.ray_q) / plane
