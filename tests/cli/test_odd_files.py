@@ -110,7 +110,7 @@ def check(kind: str, odd: OddFile, bench: Bench) -> str:
     found = examine(odd.path, *others)
     usable = found["kind"] == wanted and found["facts"] != []
     options = found["options"]
-    faults = [text for text in found["problems"] if "does not say above what its heights are" not in text]
+    faults = [text for text in found["problems"] if "does not state its height datum" not in text]
     counts: dict[str, int] = {}
     for name, words in bench.commands(kind, odd.path).items():
         if "--lenient" in options:

@@ -270,7 +270,7 @@ def test_errors_across_the_join_are_the_short_way_round_by_both_methods(tmp_path
     track_file = tmp_path / "ring.csv"
     write_track_csv(Track.from_ecef(closed.ecef_m), track_file)
     opened = open_line((track_file,), None, antennas=("front",), reading=TrackReading(cache="skip"))
-    assert any(note.startswith("the line is closed: after 2513") for note in opened.notes)
+    assert any(note.startswith("the line is closed with a length of 2513") for note in opened.notes)
     assert opened.turns_m["front"] == pytest.approx(length, abs=0.01)
     record = {"inputs": [fingerprint("track", track_file)], "settings_used": {}, "line": opened.facts}
     (tmp_path / "run.json").write_text(json.dumps(record))

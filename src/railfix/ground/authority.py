@@ -1,6 +1,6 @@
-"""Messages of the centre to a train: how far it may run and how fast, and the order to brake.
+"""Messages from the centre to a train: movement authority with speed limits, and order to brake.
 
-An array of CBOR in canonical order: kind and version, then the fields.
+Each message is a canonical CBOR array: kind and version, then the fields.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ class Authority(Settings):
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
     number: Number  #: Rises with every message of the centre, also over its restarts.
-    #: Sequence number of the train's newest report that the centre has stored, 0 without one: an acknowledgement, and
-    #: the train's measure of the age of this message on its own clock.
+    #: Sequence number of the train's newest report that the centre has stored, 0 without one: it acknowledges the
+    #: report, and the train derives the age of this message from it by its own clock.
     report: Number
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
     stopped: bool  #: The train is ordered to stop.
-    #: The end is one that the train is asked to accept instead of a farther one, if it can stop before it.
+    #: The train is requested to accept this end instead of a farther end, if it can stop before it.
     shortens: bool = False
     session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Identifier of the on-board start that `report` belongs to.
-    overlap_cm: Number = 0  #: Way beyond the end that is kept for a train that passes it at release speed.
+    overlap_cm: Number = 0  #: Distance kept free beyond the end for a train that passes the end at release speed.
     #: Chainages, lower first, and highest speed [cm/s] of each speed restriction in the interval.
     restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()
-    #: Gradient in thousandths, uphill with rising chainage positive, from a chainage to that of the next part.
+    #: Gradient in thousandths, positive uphill with rising chainage, from each chainage to the next part's chainage.
     gradients: Annotated[tuple[GradientPart, ...], Field(max_length=MOST_PARTS)] = ()
 
     def encode(self) -> bytes:
@@ -53,7 +53,7 @@ class Authority(Settings):
 
     @classmethod
     def decode(cls, data: bytes) -> Authority:
-        """Return the authority, or the `BrakeOrder`, of some bytes.
+        """Return the authority, or the `BrakeOrder`, decoded from bytes.
 
         Raises
         ------
@@ -74,15 +74,15 @@ class Authority(Settings):
         if len(values) != len(model.model_fields):
             raise MessageError(f"has {len(values)} fields, {len(model.model_fields)} were expected")
         message = validate_message(model, dict(zip(model.model_fields, values, strict=True)))
-        if message.encode() != data:  # bytes behind it, a truth value for a number, another order
+        if message.encode() != data:  # trailing bytes, a boolean for a number, or another order
             raise MessageError("is no authority in its canonical form")
         return message
 
 
 class BrakeOrder(Authority):
-    """Order to brake to a stop: needs no store, grants nothing, and is repeated until a report names its number.
+    """Order to brake to a stop; it needs no store, grants nothing, and is repeated until a report names its number.
 
-    `number` is that of the latest authority; any later authority without `stopped` ends the order.
+    `number` is the latest authority's number; any later authority without `stopped` ends the order.
     """
 
     kind: ClassVar[int] = 2

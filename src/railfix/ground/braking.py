@@ -1,7 +1,7 @@
-"""Braking curves: how fast a train may run so that it stops before an end, on a line with gradients.
+"""Braking curves: permitted speed of a train that has to stop before an end, on a line with gradients.
 
-A simplified form of SUBSET-026 chapter 3.13: one deceleration of the train with a safety factor, gradients as steps, no
-rotating mass, no adhesion, no service brake, no display. Positions are distances in running direction.
+This is a simplified form of SUBSET-026 chapter 3.13, with one deceleration, a safety factor, and stepwise gradients.
+Rotating mass, adhesion, service brake and display are not modelled. Positions are distances in running direction.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 GRAVITY_MPS2: Final = 9.80665
-#: Highest speed that is searched for [m/s], and the number of halvings of it.
+#: Upper limit of the speed search [m/s], and the number of its bisections.
 _TOP_MPS, _HALVINGS = 150.0, 40
 
 
 class BrakeLimits(Settings):
-    """Brakes of a train, and times before them."""
+    """Brakes of a train, and the delays before they act."""
 
     #: Deceleration on level track, and the fraction of it that braking curves assume.
     braking_mps2: float = Field(default=0.5, gt=0)
     safety: float = Field(default=0.9, gt=0, le=1)
-    least_mps2: float = Field(default=0.05, gt=0)  #: Deceleration that is counted on down any gradient.
+    least_mps2: float = Field(default=0.05, gt=0)  #: Least deceleration assumed on any downhill gradient.
     build_up_s: float = Field(default=2.0, ge=0)  #: Time from the intervention until the brakes act.
-    cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most the time of the build-up.
-    traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until then.
+    cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most `build_up_s`.
+    traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
     reaction_s: float = Field(default=3.0, ge=0)  #: Time from the permitted speed to the intervention, for the driver.
     over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restriction at which the intervention begins.
 
 
 class Target(NamedTuple):
-    """Speed limit from a position on."""
+    """Speed limit that applies from a position on."""
 
     at_m: float
     speed_mps: float
@@ -50,7 +50,7 @@ class Steps(NamedTuple):
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed at a position from which full brakes lead to the speed of a target there [m2/s2].
+    """Return the square of the speed from which full braking at a position reaches a target at its speed [m2/s2].
 
     ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target negative.
     """
@@ -75,7 +75,7 @@ def deceleration_mps2(at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
 
 
 def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return where a train stops if it brakes now: after the build-up, under traction until it is cut [m]."""
+    """Return the stopping position of a train that brakes now, with build-up time and traction until cut-off [m]."""
     place, speed = _after_build_up(at_m, speed_mps, brakes)
     square, ahead = speed**2, [step for step in steps.from_m if step > place]
     for step in ahead:
@@ -98,9 +98,9 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
     """Return the speed above which the train is braked, now or after a given time [m/s].
 
-    The largest speed from which the train is on `braking_speed` when its brakes act. That position and the square of
-    the curve are linear in the speed between two changes of gradient: each gives a quadratic equation, solved from the
-    target backward.
+    It is the largest speed at which the train is on the curve of `braking_speed` when its brakes act. Between two
+    changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed. Each
+    such interval gives a quadratic equation; they are solved from the target backward.
     """
     if at_m >= target.at_m:
         return 0.0
@@ -120,7 +120,7 @@ def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLim
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Return the largest speed that fits, where all smaller ones do; 0 where none does."""
+    """Return the largest speed for which `fits` is true, if it is true for all smaller speeds; 0 if for none."""
     low, high = 0.0, _TOP_MPS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -129,7 +129,7 @@ def _largest(fits: Callable[[float], bool]) -> float:
 
 
 def release_mps(overlap_m: float, at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the speed at which a train may pass the end of its authority, as it stops within the overlap [m/s]."""
+    """Return the highest speed at which a train may pass the end of its authority and stop within the overlap [m/s]."""
     if overlap_m <= 0.0:
         return 0.0
     return _largest(lambda speed: stopping_m(at_m, speed, steps, brakes) <= at_m + overlap_m)
@@ -155,9 +155,9 @@ def supervise(
     steps: Steps | None = None,
     brakes: BrakeLimits,
 ) -> Supervised:
-    """Return the speeds of a train between its safe rear and front ends, the lowest of all its targets.
+    """Return the speeds of a train by its safe rear and front ends, the lowest over all its targets.
 
-    Restrictions: where they begin and end, and their speed; the whole train keeps them.
+    Each restriction has its start, end and speed, and applies to the whole train.
     """
     steps = steps or Steps()
     release = release_mps(overlap_m, end_m, steps, brakes)
@@ -178,7 +178,7 @@ def supervise(
 def _supervised(
     front_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, release: float = 0.0
 ) -> Supervised:
-    """Return the speeds ahead of one target; to a stop not below the release speed, up to the end."""
+    """Return the speeds ahead of one target; ahead of a stop they are at least the release speed, up to the end."""
     aimed = target if target.speed_mps == 0.0 else target._replace(speed_mps=target.speed_mps + brakes.over_mps)
     brake, warn = (intervention_mps(front_m, aimed, steps, brakes, before_s=s) for s in (0.0, brakes.warning_s))
     permitted = intervention_mps(front_m, target, steps, brakes, before_s=brakes.reaction_s)

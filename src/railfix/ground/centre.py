@@ -1,10 +1,10 @@
 """Control centre: state and displayed position of each train from its reports; a display, not a safety function.
 
-A pure state machine (P5 3.1): `report_received` and `time_passed` take the record of a train and return the new one.
+A pure state machine (P5 3.1): `report_received` and `time_passed` take a train's record and return its new record.
 The displayed position is indicative only; a train occupies the interval from its last safe rear end to the end of the
 authority (`railfix.ground.interlocking`).
 
-Reference run curve: position over running time of one direction, for simulated running.
+A reference run curve is the position over running time in one direction, for simulated running.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from railfix.core.arrays import Floats, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Acceleration of the reference run curve [m/s^2]; a train this near to a station is at it [m].
+#: Acceleration of the reference run curve [m/s^2]; distance within which a train is at a station [m].
 _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
 
 
@@ -29,7 +29,7 @@ class ReferenceCurve:
     """Reference run of one direction."""
 
     direction: int  #: Direction against chainage.
-    running_s: Floats  #: Running time without the standing times at stations, strictly rising; shape (N,).
+    running_s: Floats  #: Running time without the dwell times at stations, strictly rising; shape (N,).
     chainage_m: Floats  #: Front of the train, strictly rising or, with direction -1, falling; shape (N,).
     stations_m: Floats  #: Stopping positions of the front, in the order of the run; shape (K,).
 
@@ -43,7 +43,7 @@ class ReferenceCurve:
 
     @classmethod
     def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
-        """Return the curve of a run that starts and stops at each station with an even acceleration.
+        """Return the curve of a run that starts and stops at each station with constant acceleration.
 
         Stations, shape (K,) [m], are in the order of the run; where they are near each other the train does not reach
         its highest speed [m/s].
@@ -85,8 +85,8 @@ class ReferenceCurve:
     def progress(self, chainage_m: float) -> tuple[int, float]:
         """Return the section, by its first station, and the progress in it in running direction [%].
 
-        P5 3.1: a train reports the station at a station, otherwise the section and the progress, its length being 100
-        %.
+        P5 3.1: a train at a station reports the station, otherwise the section and the progress in percent of its
+        length.
         """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
@@ -99,7 +99,7 @@ class TrainState(Enum):
 
     #: No report with a position since the centre was started.
     UNKNOWN = "unknown"
-    #: Reports come in.
+    #: Reports arrive.
     TRACKED = "tracked"
     #: No report: shown by simulated running on the reference run curve.
     SIMULATED = "simulated"
@@ -114,10 +114,10 @@ class CentreLimits(Settings):
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)  #: After this time without a report the train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
-    #: Largest delay of a train's clock behind the instants of its positions, and largest unseen variation of its
+    #: Largest delay of a train's clock behind the instants of its positions, and largest undetected variation of its
     #: delays.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest lead of a sequence number over the newest, constant and per second since then.
+    #: Largest lead of a sequence number over the newest number: a constant, and an increase per second since then.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=20.0, gt=0)
 
@@ -135,10 +135,10 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 without one.
-    session: int = 0  #: Start on board that it is of.
-    retired: tuple[int, ...] = ()  #: Earlier starts on board: late messages of them are ignored.
+    session: int = 0  #: On-board start that the number belongs to.
+    retired: tuple[int, ...] = ()  #: Earlier on-board starts, whose late messages are ignored.
     counted_s: float | None = None  #: Centre's clock when that number arrived.
-    rejected: str | None = None  #: Why the newest report did not count.
+    rejected: str | None = None  #: Reason why the newest report was rejected.
     message: TrainMessage | None = None  #: Newest report with a position.
     heard_s: float = 0.0  #: Centre's clock (monotonic) when that report arrived.
     measured_s: float = 0.0  #: Centre's clock at the instant for which its position is valid.
@@ -148,7 +148,7 @@ class TrainRecord:
 
 
 class Rejection(Enum):
-    """Reason of a report that changes nothing."""
+    """Reason why a report changes nothing."""
 
     UNKNOWN_TRAIN = "of a train that is not supervised"
     OTHER_TRAIN = "of another train"
@@ -161,14 +161,14 @@ class Rejection(Enum):
     TOO_OLD = "position too old when it was sent, or later than the train's clock; set that clock"
 
 
-#: Number of earlier starts on board that are stored.
+#: Number of earlier on-board starts that are stored.
 _RETIRED = 16
 
 
 def report_received(
     record: TrainRecord, message: TrainMessage, now_s: float, *, limits: CentreLimits
 ) -> tuple[TrainRecord, Rejection | None]:
-    """Return the record after a report, and the reason where the report does not count.
+    """Return the record after a report, and the reason if the report is rejected.
 
     The instant of the measurement follows from the age that the train gives (both times by its own clock), so that
     clocks of train and centre need not agree; the delay of the link, which is unknown, is neglected.
@@ -229,7 +229,7 @@ def time_passed(
     curves : dict of int to ReferenceCurve
         By direction.
     authority_m : float, optional [m]
-        End of the train's authority: the simulated place ends there.
+        End of the train's authority: the simulated position stops there.
     limits : CentreLimits
     """
     if record.message is None or record.state is TrainState.UNKNOWN or record.message.chainage_cm is None:

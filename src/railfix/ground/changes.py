@@ -1,7 +1,7 @@
-"""Changes of trains by order: an interval corrected, trains entered, removed, joined and divided.
+"""Changes of trains by order: correct an interval; enter, remove, join and divide trains.
 
-Changes that reports cannot show, entered by a person who has seen them; each change leaves its trains stopped, to be
-released one by one (`railfix.ground.stops.release_train`), and frees nothing that a train may still occupy.
+Reports cannot show these changes; a person who has observed them enters them. Each change leaves its trains stopped, to
+be released one by one (`railfix.ground.stops.release_train`), and frees nothing that a train may still occupy.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Changed = tuple[Interlocking, str | None]
 def _placed(
     train: TrainInterval, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
 ) -> TrainInterval | str:
-    """Return a train between two chainages, without an authority; or why it cannot be there."""
+    """Return a train between two chainages, without an authority, or the reason why it cannot be there."""
     low, high = sorted((rear_m, front_m))
     if direction not in (-1, 1) or track not in (1, 2):
         return "direction is -1 or 1, and track 1 or 2"
@@ -58,8 +58,8 @@ def correct_interval(
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
 
-    Its routes and its authority end, and points that it no longer stands on are free. So the train has to report that
-    it obeys an order to brake which no authority on the way to it can end, unless all of them have `lapsed` on board.
+    Its routes and its authority end, and points no longer under it are free. The train must therefore report that it
+    obeys an order to brake that no authority in transit can end, unless all authorities have `lapsed` on board.
     """
     known = state.trains.get(train)
     if known is None:
@@ -76,7 +76,7 @@ def correct_interval(
 
 
 def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
-    """Return that a train may run by an authority on the way to it, None where it cannot."""
+    """Return a refusal if a train may still run by an authority in transit, None if it cannot."""
     if known.runs_by is None or lapsed:
         return None
     return f"train {known.train} has not reported that it obeys the order to brake, and may run on: wait for that"
@@ -93,7 +93,7 @@ def enter_train(
     front_m: float,
     track: int,
 ) -> Changed:
-    """Return the state with another train anywhere on the line, also one that reports nothing; a refusal's reason."""
+    """Return the state with a train added anywhere on the line, even one without reports; and a refusal's reason."""
     if train in state.trains:
         return state, f"there is a train {train} already"
     if not 0 < train < 1 << 32 or not length_m > 0.0:
@@ -109,7 +109,7 @@ def enter_train(
 def _refused_overlap(
     state: Interlocking, train: TrainInterval, layout: Layout, points: Mapping[PointName, PointState]
 ) -> Changed:
-    """Return the state with a train, unless another one is where it is to be."""
+    """Return the state with a train added, unless another train overlaps its interval."""
     pieces = pieces_of(train, layout)
     for other in state.trains.values():
         if other.train != train.train and overlap(pieces, pieces_of(other, layout)):
@@ -128,10 +128,10 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 
 
 def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
-    """Return the state without a train, whose sections are occupied by vehicles that report nothing.
+    """Return the state without a train; its sections are then occupied by vehicles that report nothing.
 
-    Their detection frees them, or an order of a person who has seen them free. So no authority on the way may let the
-    train run, as in `correct_interval`.
+    Their detection frees the sections, or an order of a person who has seen them free. No authority in transit may
+    therefore let the train run, as in `correct_interval`.
     """
     known = state.trains.get(train)
     if known is None:
@@ -151,7 +151,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
 
 
 def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
-    """Return the state in which one train becomes part of the one in front of it: both lengths, one interval."""
+    """Return the state in which one train joins the train in front of it, with both lengths and one interval."""
     first, second = state.trains.get(lead), state.trains.get(other)
     if first is None or second is None or lead == other:
         return state, "two trains of the line were expected"
@@ -180,9 +180,9 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
 
 
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
-    """Return the state in which the rear of a train, behind a length of it, is another train.
+    """Return the state in which the rear of a train, behind its first `length_m`, is another train.
 
-    Until the parts are apart, their intervals overlap where the bounds of the position leave it open.
+    Until the parts are apart, their intervals overlap by the uncertainty of the position.
     """
     known = state.trains.get(train)
     if known is None:

@@ -1,7 +1,7 @@
-"""Control centre at work: supervision with its store, the monitor of satellite positioning, log, and page values.
+"""Running control centre: supervision with its store, the monitor of satellite positioning, log, and page values.
 
-Acknowledged and granted changes are committed before they are sent: a centre that is killed at any moment continues
-from what its trains know.
+Acknowledged and granted changes are committed before they are sent: a centre that is killed at any moment restarts with
+everything its trains have received.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _CAUSE = "cause of the stop"
 
 
 def _severity(verdict: TriangleVerdict) -> int:
-    """Return the rank of a verdict: of the verdicts between two steps the highest counts."""
+    """Return the rank of a verdict; the highest rank between two steps counts."""
     if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
-        return 2  # a fix is absent: that stops only once it is late
+        return 2  # an absent fix stops trains only once it is late
     return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
 
 
 @dataclass(kw_only=True)
 class StopOrder:
-    """Order to stop that a train has: how long until it was acknowledged, and until the train was at rest [s]."""
+    """A train's order to stop, with the times until its acknowledgement and until standstill [s]."""
 
     number: int
     sent_s: float
@@ -49,7 +49,7 @@ class StopOrder:
     rest_s: float | None = None
 
     def take_report(self, message: TrainMessage, now_s: float) -> bool:
-        """Process a report; return whether the train has come to rest by it."""
+        """Process a report; return whether it is the first to show the train at rest."""
         taken = is_obeyed(message, self.number)
         if taken and self.acknowledged_s is None:
             self.acknowledged_s = now_s - self.sent_s
@@ -59,7 +59,7 @@ class StopOrder:
         return rests
 
     def __str__(self) -> str:
-        """The times in words."""
+        """Return the times in words."""
         taken = "not acknowledged" if self.acknowledged_s is None else f"acknowledged after {self.acknowledged_s:.1f} s"
         return taken if self.rest_s is None else f"{taken}, at rest after {self.rest_s:.1f} s"
 
@@ -74,11 +74,11 @@ class ControlCentre:
     send: Callable[[int, bytes], None]  #: Sends bytes to a train.
     clock: Callable[[], float]  #: Centre's clock, which never runs backwards [s].
     wall_ns: Callable[[], int]  #: Time for the log [ns].
-    monitor: MonitorState | None = None  #: Of satellite positioning; None without a triangle.
+    monitor: MonitorState | None = None  #: State of the monitor of satellite positioning; None without a triangle.
     times: MonitorLimits = field(default_factory=MonitorLimits)
     lines: list[str] = field(default_factory=list)
     reports: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)  #: Reports that did not count, by reason.
+    rejected: Counter[str] = field(default_factory=Counter)  #: Number of rejected reports, by reason.
     stop_s: float | None = None
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Trains that are ordered to stop.
     #: Access to the store; in a thread where the centre is a process.
@@ -128,7 +128,7 @@ class ControlCentre:
 
     @property
     def database(self) -> str | None:
-        """Why the database does not take the state, None where it does."""
+        """Reason why the database rejects the state, None if it accepts it."""
         return self.commits.alarm
 
     def log(self, text: str, *, train: int | None = None) -> None:
@@ -187,7 +187,7 @@ class ControlCentre:
             self.log(f"train {number}: {what}", train=number)
 
     def _hear_interference(self, message: TrainMessage) -> None:
-        """Store a train's suspicion, also of a report without a position, and log where it changes."""
+        """Store a train's suspected interference, also from a report without a position, and log its changes."""
         before = self.interference.get(message.train, SuspectedInterference.NONE)
         now = message.interference or SuspectedInterference.NONE
         if now is not before:
@@ -197,7 +197,7 @@ class ControlCentre:
 
     @property
     def alarms(self) -> list[str]:
-        """What the centre waits for after a start, and interference that trains suspect, one sentence each."""
+        """Sentences on reports awaited after a start, and on interference that trains suspect."""
         awaited = self.supervision.awaited_text
         waits = (
             [f"nothing is granted until these trains have reported since the start: {awaited} (confirm-start)"]
@@ -209,7 +209,7 @@ class ControlCentre:
         ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
+        """Process a verdict on satellite positioning from fixes of a given age; the worst between two steps counts.
 
         Fixes older than `MonitorLimits.late_s`, or from the future by as much, give no verdict.
         """
@@ -220,9 +220,10 @@ class ControlCentre:
             self._verdict = verdict, receiver
 
     def step(self) -> None:
-        """Judge; send orders to brake; release, route, extend; commit; then send. To be called several times a second.
+        """Judge and send: order braking, release points, set routes, extend authorities, commit, then send.
 
-        Orders to brake need no store. Authorities, and commands to points, leave once their state is committed.
+        It is to be called several times per second. Orders to brake need no store. Authorities, and commands to points,
+        are sent once their state is committed.
         """
         now = self.clock()
         self._monitor(now)
@@ -250,7 +251,7 @@ class ControlCentre:
         self.settle()
 
     def settle(self) -> None:
-        """Send messages whose commit is complete, and log where the database begins or ceases to fail."""
+        """Send messages whose commit is complete, and log when the database begins or ceases to fail."""
         self.commits.settle(self.clock())
         alarm = self.commits.alarm
         if alarm is not None and self._alarm is None:

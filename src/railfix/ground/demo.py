@@ -40,7 +40,7 @@ class RelaySettings(Settings):
     """Disturbances of a relay."""
 
     loss: float = Field(default=0.0, ge=0, le=1)  #: Probability that a datagram is lost.
-    #: Delay of each datagram, and the largest random one on top of it: datagrams overtake each other.
+    #: Delay of each datagram, and the largest additional random delay, by which datagrams overtake each other.
     delay_s: float = Field(default=0.0, ge=0)
     jitter_s: float = Field(default=0.0, ge=0)
     seed: int = 0
@@ -57,7 +57,7 @@ class LinkDisturbance:
         self._random = random.Random(settings.seed)
 
     def packet(self, data: bytes, send: Callable[[bytes], None]) -> None:
-        """Pass a packet on, by `send`, or not."""
+        """Forward a packet by `send`, or drop it."""
         if not self.up or self._random.random() < self.settings.loss:
             return
         delay_s = self.settings.delay_s + self._random.uniform(0.0, self.settings.jitter_s)
@@ -92,12 +92,12 @@ class Relay(asyncio.DatagramProtocol):
                 transport.close()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Pass a datagram of the client on."""
+        """Forward a datagram from the client."""
         self._client = addr
         self._pass(data, self._there, self._target)
 
     def back(self, data: bytes) -> None:
-        """Pass a datagram of the target back."""
+        """Return a datagram from the target to the client."""
         if self._client is not None:
             self._pass(data, self._here, self._client)
 
@@ -136,7 +136,7 @@ def draw_fixes(
     """Return fixes, one per second, from simulated ranges of fixed satellites.
 
     `common_m`, shape (T, 9): errors of the satellites, common to the receivers. `moved_m`, shape (T, 3, 2): east and
-    north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
+    north by which the fix of a receiver moves; NaN for a receiver without a fix, whose C/N0 has fallen.
     """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
@@ -165,7 +165,7 @@ def draw_fixes(
 
 
 HOSTS: Final[dict[LinkName, str]] = {"A": "127.0.1.1", "B": "127.0.2.1"}
-#: Simulated seconds: bearer A is out of service, both are, the satellite fault begins, the end.
+#: Simulated times at which bearer A fails, both bearers fail, the satellite fault begins, and the run ends [s].
 OUTAGE_A_S: Final = (40.0, 80.0)
 OUTAGE_BOTH_S: Final = (106.0, 118.0)
 FAULT_S: Final = 130.0
@@ -183,7 +183,7 @@ class LinkedTraffic(Traffic):
     rest_s: float | None = None  #: Time when all trains had stopped.
 
     def step(self) -> None:
-        """Run a step and note when the trains rest."""
+        """Run a step and note the time when all trains are at rest."""
         super().step()
         stopped = self.centre.state.stopped and all(t.speed_mps == 0.0 for t in self.trains.values())
         if stopped and self.rest_s is None:
@@ -203,7 +203,7 @@ class LinkedTraffic(Traffic):
 
 
 def _verdicts(seed: int) -> list[tuple[TriangleVerdict, int]]:
-    """Return the verdicts of the triangle, one a second; a satellite drifts away from `FAULT_S` on."""
+    """Return the verdicts of the triangle, one per second; the range of a satellite drifts from `FAULT_S` on."""
     epochs = int(END_S) + 1
     common = np.zeros((epochs, 9))
     common[:, 3] = 8.0 * np.clip(np.arange(epochs) - FAULT_S, 0.0, None)
@@ -252,7 +252,7 @@ async def run_demo(
 ) -> dict[str, Any]:
     """Run the demonstration and return its figures.
 
-    `speed` is in simulated seconds a second; the page, on the loopback address, is at the port (0 takes a free one),
+    `speed` is in simulated seconds per second; the page, on the loopback address, is at the port (0 takes a free port),
     and its password releases a stop. `announce` is called with its address, `keep` awaited with it at the end, before
     the page closes; `picture` is the path of the picture of response rates along the line.
     """

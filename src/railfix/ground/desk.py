@@ -1,7 +1,7 @@
-"""Orders of the page: who gave them, their effect, and which must be given twice.
+"""Orders of the page: their authors, their effects, and confirmation by a second order.
 
-Each order is a line of the log with its author and its outcome. Orders that rest on an observation which no report
-confirms are given twice: by two people, or by one after a minimum time.
+Each order is a line of the log with its author and its outcome. Orders based on an observation that no report confirms
+are given twice: by two people, or by one person after a minimum time.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from railfix.ground.web import Order
 
 #: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
-#: Longest reason that is taken [characters].
+#: Longest accepted reason [characters].
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
 
 
 def number_of(values: Values, name: str) -> int | str:
-    """Return an integer of an order, or the fault of it."""
+    """Return an integer of an order, or the sentence on its fault."""
     value = values.get(name)
     return value if type(value) is int else f"{name}: a number was expected"
 
 
 def metres_of(values: Values, *names: str) -> list[float] | str:
-    """Return numbers of an order, or the fault of the first that is not a number."""
+    """Return numbers of an order, or the sentence on the first that is not a number."""
     found = [values.get(name) for name in names]
     for name, value in zip(names, found, strict=True):
         if type(value) not in (int, float) or not abs(value) < 1e7:  # type: ignore[arg-type]
@@ -65,7 +65,7 @@ class OrderDesk:
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
-        """Return None where an order is the second one, in time; otherwise the next step."""
+        """Return None if an order confirms the first one in time, otherwise the next step."""
         key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
@@ -79,7 +79,7 @@ class OrderDesk:
         )
 
     def asked_s(self, name: str, values: Values) -> float:
-        """Return when an order was given the first time, now where it was not [s]."""
+        """Return the time at which an order was first given, or the present time [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
         return self._asked.get(key, (self.clock(), ""))[0]
 
@@ -100,7 +100,7 @@ class OrderDesk:
     def twice(
         self, name: str, change: Callable[[Values], tuple[Interlocking, str | None]], what: str, values: Values, by: str
     ) -> str | None:
-        """Carry a change of trains out at its second order; a reason in words is part of it."""
+        """Change trains at the second order, which must contain a reason in words."""
         reason = values.get("reason")
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
             return f"reason: one to {LONGEST_REASON} characters were expected: who has seen what"
@@ -160,7 +160,7 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Continue after a start without the trains that have not reported since: the database is the newest."""
+        """Continue after a start without the trains that have not reported since, if the database is no older copy."""
         if not self.supervision.awaited:
             return "every train has reported since the start"
         what = f"the database is no older copy, and these trains are silent: {self.supervision.awaited_text}"
@@ -169,7 +169,7 @@ class OrderDesk:
         return reason
 
     def section(self, values: Values, by: str, *, of: str) -> str | None:
-        """Bar a section, or end that; for a section that was occupied at the second order."""
+        """Bar a section, or remove its bar; an occupied section is freed at the second order."""
         supervision, name = self.supervision, str(values.get("section", ""))
         layout, state = supervision.layout, supervision.state
         if name not in layout.sections:
@@ -199,7 +199,7 @@ class OrderDesk:
         return None
 
     def restrict(self, values: Values, by: str) -> str | None:
-        """Set a temporary speed restriction by its name, or lift it, ordered twice."""
+        """Set a temporary speed restriction by its name, or lift it at the second order."""
         supervision, name = self.supervision, str(values.get("name", "")).strip()
         state = supervision.state
         if not 0 < len(name) <= 40:

@@ -14,7 +14,7 @@ class SimulatedPoints:
 
     move_s: float
     clock: Callable[[], float]
-    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that each leads to; 1 where none is given.
+    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that each set of points leads to; 1 by default.
     _moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
     _answers: dict[PointName, int | None] = field(default_factory=dict)
 
@@ -24,7 +24,7 @@ class SimulatedPoints:
         self._answers[point] = None
 
     def ask(self, point: PointName) -> None:
-        """Return the detected positions of points."""
+        """Request the detection of points; `take_detected` returns it."""
         self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
 
     def take_detected(self) -> Mapping[PointName, int | None]:

@@ -34,11 +34,11 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor_setup import parse_position
 
-#: Mean C/N0 over the satellites that is this far below its median over the epochs before counts as fallen [dB-Hz].
+#: Drop of the mean C/N0 over satellites, below its median over preceding epochs, that counts as fallen [dB-Hz].
 FALLEN_DBHZ = 6.0
-#: Epochs over which that median is taken.
+#: Number of epochs of this median.
 USUAL_EPOCHS: Final = 600
-#: Tags of different receivers that round to the same multiple of this are one epoch.
+#: Time tags of different receivers that round to the same multiple of this interval are one epoch.
 SAME_EPOCH = np.timedelta64(100, "ms")
 
 
@@ -46,7 +46,7 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 class StationFixes(FrozenArrays):
     """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
-    time: Datetimes  #: Epochs that all logs have, rounded to 0.1 s; shape (T,).
+    time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
     points_m: Floats  #: Known points, east and north of the first; shape (N, 2).
     fixes_m: Floats  #: NaN where the common satellites are too few; shape (T, N, 2).
     n_satellites: Integers  #: Shape (T,).
@@ -113,7 +113,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
     """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
 
-    At T times, from N ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
+    The fixes are at T times, from the ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
     """
     plane = axes_at(points_ecef_m[0])[:2]
     fixes = [
@@ -132,8 +132,9 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
     """Read the positions of three receivers (`computed`), or compute them from their observations.
 
-    `points` are the known points as texts, one per log, or none: those of the headers. SettingsError: navigation or
-    points are missing, or have no use. MismatchError: a header has no position, or the logs nothing in common.
+    `points` are the known points as texts, one per log; without any, the headers' positions are used. SettingsError:
+    navigation or points are missing, or not applicable. MismatchError: a header has no position, or the logs have no
+    epoch in common.
     """
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:
@@ -156,7 +157,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
     """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
 
-    Whether they are from the same satellites is not known: `n_satellites` is 0. MismatchError: no epoch in common.
+    It is unknown whether they are from the same satellites: `n_satellites` is 0. MismatchError: no epoch in common.
     """
     known = [np.flatnonzero(np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time)) for log in logs]
     time, rows_of = _common_epochs([log.time[rows] for log, rows in zip(logs, known, strict=True)])
@@ -167,7 +168,7 @@ def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> St
 
 
 def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]]:
-    """Return the rounded epochs that all logs have, and their rows in each log; MismatchError without one."""
+    """Return the rounded epochs common to all logs, and their rows in each log; MismatchError if there are none."""
     epochs = [round_tags(time) for time in times]
     common = reduce(np.intersect1d, epochs)
     if not len(common):
@@ -203,7 +204,7 @@ def mean_cn0(log: Observations) -> Floats:
 def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
     """Return where the mean C/N0 of a receiver has fallen by `FALLEN_DBHZ`, shape (T, N).
 
-    Against its median over the `USUAL_EPOCHS` before each epoch, of the `earlier_dbhz` too, shape (M, N).
+    The reference is its median over the `USUAL_EPOCHS` before each epoch, including `earlier_dbhz`, shape (M, N).
     """
     table = pl.DataFrame(np.vstack([earlier_dbhz, level_dbhz])).fill_nan(None)
     usual = table.select(pl.all().rolling_median(USUAL_EPOCHS, min_samples=1).shift(1)).to_numpy()
@@ -215,11 +216,11 @@ _LONGEST_QUEUE: Final = 1000
 
 
 class StationStreams:
-    """Fixes of receivers at known points from their epochs as they arrive.
+    """Fixes of receivers at known points, computed from epochs as they arrive.
 
-    An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
-    therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
-    the navigation known from the start; epochs at whole seconds are used. `counts`: epochs "used",
+    An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver sends nothing
+    there are therefore no fixes at all, and the monitor detects that they are late. Records from the streams are added
+    to the navigation known from the start; epochs at whole seconds are used. `counts` has the numbers of epochs "used",
     "incomplete", and "without common satellites".
     """
 
@@ -232,11 +233,11 @@ class StationStreams:
         self._levels = np.empty((0, len(points_ecef_m)))
 
     def add_navigation(self, navigation: Navigation) -> None:
-        """Take navigation records."""
+        """Add navigation records."""
         self._known = receive(self._known, self._config, np.datetime64("NaT", "ns"), navigation=navigation)
 
     def push(self, receiver: int, epoch: Observations) -> StationFixes | None:
-        """Take one epoch of a receiver; return the fixes where all receivers have sent theirs."""
+        """Process one epoch of a receiver; return the fixes once all receivers have sent the epoch."""
         tag = round_tags(epoch.time)[0]
         tag_ns = int(tag.astype(np.int64))
         if tag_ns % 1_000_000_000 or tag <= self._done:
@@ -275,8 +276,8 @@ async def stream_fixes(
 ) -> AsyncIterator[StationFixes]:
     """Yield the fixes of one epoch at a time, until every source has ended.
 
-    The sources are as of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files), and RINEX
-    files too. InputFileError: when a source cannot be opened, or breaks and is not opened again.
+    The sources are as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files), and
+    RINEX files too. InputFileError: when a source cannot be opened, or breaks and is not opened again.
     """
     stations = StationStreams(points_ecef_m, navigation=navigation)
     queue: asyncio.Queue[tuple[int, ReceivedData | None]] = asyncio.Queue(2 * len(sources))

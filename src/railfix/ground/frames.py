@@ -1,7 +1,8 @@
 """Redundancy layer above two links: frames with sequence number and time stamp, and the defences of EN 50159.
 
 The links below encrypt and authenticate (QUIC, TLS 1.3); the CRC is a check against faults of the layers between,
-not cryptography. A receiver takes each frame once, whichever link brings it first, and no older one after a newer.
+not cryptography. A receiver uses each frame once, whichever link delivers it first, and no frame that is older than a
+used one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from railfix.core.settings import Settings
 _HEAD: Final = struct.Struct("!BIQQq")
 _ECHO: Final = struct.Struct("!Qqqq")
 _CHECK: Final = struct.Struct("!I")
-#: Longest payload [bytes]: with the head it fits a datagram of QUIC.
+#: Longest payload [bytes]: with the header it fits a QUIC datagram.
 LONGEST_PAYLOAD: Final = 1100
 #: Number of recent sequence numbers that are stored individually, and of earlier starts of the sender.
 REMEMBERED: Final = 4096
@@ -29,7 +30,7 @@ RETIRED: Final = 64
 
 
 def draw_session() -> int:
-    """Return the number of a start: no clock decides which of two starts is the newer."""
+    """Return a random number that identifies a start: no clock decides which of two starts is newer."""
     return secrets.randbits(62)
 
 
@@ -62,7 +63,7 @@ class Frame:
 
     kind: FrameKind
     sender: int
-    session: int  #: Start of the sender, a number drawn at random.
+    session: int  #: Random number that identifies the sender's start.
     sequence: int
     time_ns: int  #: Sender's monotonic clock when it was sent.
     payload: bytes = b""
@@ -76,7 +77,7 @@ class Frame:
 
 
 class Echo(NamedTuple):
-    """Answer to a frame: its number, when it was sent (sender's clock), received and answered (answerer's clock)."""
+    """Answer to a frame: its number, and times of sending (sender's clock), reception and answer (answerer's clock)."""
 
     sequence: int
     sent_ns: int
@@ -101,7 +102,7 @@ class ReceiverLimits(Settings):
     """Limits of a receiver."""
 
     delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed one.
-    #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
+    #: Largest relative drift of the clocks; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
     #: Largest lead of a sequence number over the newest one, and its growth per second since then.
     jump: int = Field(default=1000, ge=1)
@@ -110,7 +111,7 @@ class ReceiverLimits(Settings):
 
 @dataclass(kw_only=True)
 class _Seen:
-    """Sequence numbers that have come: the newest and when, and the last ones as bits."""
+    """Received sequence numbers: the newest with its time, and the most recent ones as bits."""
 
     newest: int = -1
     at_ns: int = 0
@@ -139,9 +140,9 @@ class _Seen:
 class FrameReceiver:
     """Receiver of the frames of one sender over any number of links."""
 
-    sender: int  #: The only one whose frames count; the certificate of the connection names it.
+    sender: int  #: Only sender whose frames are accepted; the certificate of the connection names it.
     limits: ReceiverLimits = field(default_factory=ReceiverLimits)
-    #: Frames that were rejected, by threat; deletions are the numbers that a newer one has skipped.
+    #: Frames that were rejected, by threat; deletions are the skipped sequence numbers.
     threats: Counter[Threat] = field(default_factory=Counter)
     _session: int | None = None
     _retired: deque[int] = field(default_factory=lambda: deque(maxlen=RETIRED))
@@ -181,7 +182,7 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Begin a new start of the sender, with other origins of numbers and clock; late frames are rejected."""
+        """Reset for a new start of the sender, with new origins of numbers and clock; late frames are rejected."""
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None

@@ -1,10 +1,10 @@
 """Authorities, routes and points of a single line with passing loops.
 
-A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
-Authorities are extended up to the nearest of: another train's interval, a section that is closed or occupied, points
-that are not locked and detected for the train, the end of its route; less a margin. They are shortened by agreement
-only (`railfix.ground.stops`); reports move the intervals (`railfix.ground.reports`). It is not a national rule book: no
-shunting, no overlaps behind signals, no level crossings, no degraded working by hand.
+A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority.
+Authorities are extended, less a margin, to the nearest of these limits: another train's interval, a section that is
+closed or occupied, points that are not locked and detected for the train, the end of its route. They are
+shortened by agreement only (`railfix.ground.stops`); reports move the intervals (`railfix.ground.reports`). It is not a
+national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by hand.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from railfix.ground.state import Interlocking, InterlockingLimits, PointState, T
 class NearbyTrains:
     """Trains by the location of their intervals and routes, with one more route included.
 
-    Computed once per step, so that the cost of a step grows with the number of trains and not of pairs.
+    They are computed once per step, so that the cost of a step grows with the number of trains, not of pairs.
     """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
@@ -43,7 +43,7 @@ class NearbyTrains:
 
 
 def stop_orders(state: Interlocking) -> dict[int, str]:
-    """Return the trains that are ordered to stop, and why: those stopped themselves, and the nearest on either side."""
+    """Return the trains ordered to stop, with reasons: stopped trains, and the nearest train on either side of each."""
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not found:
         return {}
@@ -51,8 +51,8 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
     by_high = sorted((high, low) for low, high, _ in by_low)
     free = [span for span in by_low if span[2] not in found]
     for number in list(found):
-        # the trains beside it, the nearest on either side, and the trains beside the nearest: on other tracks of its
-        # station
+        # Trains on other tracks of its station, the nearest on either side, and trains on other tracks of the nearest
+        # train's station.
         low, high = state.trains[number].span_m
         if (k := bisect_left(by_low, (high,))) < len(by_low):
             high = by_low[bisect_right(by_low, (by_low[k][0], math.inf)) - 1][1]
@@ -96,7 +96,7 @@ def route_requested(
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
     """Return the state with a route to the next station, the points to be moved, and the reason of a refusal.
 
-    With `NearbyTrains` and `stop_orders` of the step where available.
+    `NearbyTrains` and `stop_orders` of the step are used where given.
     """
     here = state.trains[train]
     begin, direction = here.station, here.direction
@@ -124,7 +124,7 @@ def route_requested(
 
 
 def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: Mapping[int, str]) -> str | None:
-    """Return why a train gets no route, whatever else is on the line."""
+    """Return the reason why a train gets no route, regardless of other trains."""
     target = here.station + here.direction
     if here.asked_m is not None:
         return "a shorter authority is being agreed with the train"
@@ -148,7 +148,7 @@ def reached(train: TrainInterval, station: int, layout: Layout) -> bool:
 
 
 def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: NearbyTrains) -> str | None:
-    """Return the obstacle on the way to the next station, or on its track there."""
+    """Return the obstacle between a train and the next station, or on its track there."""
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
@@ -177,7 +177,7 @@ def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str,
 def comes_the_other_way(other: TrainInterval, direction: int, section: int, layout: Layout) -> bool:
     """Return whether an opposing train has its route or interval between a station and the next.
 
-    Their points are omitted.
+    The points of both stations are omitted.
     """
     if other.direction == direction:
         return False
@@ -205,7 +205,7 @@ def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby
 def due_commands(
     state: Interlocking, layout: Layout, stored: Interlocking
 ) -> tuple[Interlocking, dict[PointName, int]]:
-    """Return the state in which every command to points is given that is due, and these: tracks by points.
+    """Return the state after all due commands to points, and these commands: tracks by points.
 
     Only stored commands are due. Points whose detection is awaited, or that are under an interval, get no command.
     """
@@ -253,9 +253,9 @@ def extend_authorities(
     nearby: NearbyTrains | None = None,
     stopped: Mapping[int, str] | None = None,
 ) -> Interlocking:
-    """Return the state with the authorities of trains, of all without `trains`, extended as far as they may be.
+    """Return the state with the authorities of trains, by default of all, extended as far as possible.
 
-    With `NearbyTrains` and `stop_orders` of the step where they are at hand.
+    `NearbyTrains` and `stop_orders` of the step are used where given.
     """
     if state.stopped:
         return state

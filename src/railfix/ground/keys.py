@@ -1,7 +1,7 @@
-"""Keys and certificates of the links: made, renewed with overlap, revoked, and looked at before they end.
+"""Keys and certificates of the links: creation, renewal with overlap, revocation, and warning before expiry.
 
-One authority signs the certificates of the centre and of the trains. Its key stays in the folder where keys are made,
-and is not handed out.
+One authority signs the certificates of the centre and of the trains. Its key stays in the folder where keys are
+created, and is not distributed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ with needs_extra():
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
-#: Validity of the certificates, of the authority's own, and the time before the end at which it is an alarm [days].
+#: Validity of the certificates, of the authority's certificate, and remaining validity that raises an alarm [days].
 VALID_DAYS: Final = 365
 AUTHORITY_DAYS: Final = 3650
 WARNING_DAYS: Final = 30
@@ -28,7 +28,7 @@ _PEM: Final = serialization.Encoding.PEM
 
 
 def check_keys(folder: Path, name: str) -> None:
-    """Raise InputFileError where a file that an end of the links needs is not there."""
+    """Raise InputFileError if a file that an end of the links requires is missing."""
     for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
         if not (folder / file).is_file():
             raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
@@ -56,21 +56,21 @@ class Peer(NamedTuple):
 
 
 class Revoked(NamedTuple):
-    """Certificates that do not count any more: by name, such as ``train-7``, and by serial number."""
+    """Revoked certificates: by name, such as ``train-7``, and by serial number."""
 
     names: frozenset[str] = frozenset()
     serials: frozenset[int] = frozenset()
 
     def has(self, peer: Peer) -> bool:
-        """Return whether the certificate of a peer is one of them."""
+        """Return whether a peer's certificate is revoked."""
         return peer.name in self.names or peer.serial in self.serials
 
 
 def read_revoked(folder: Path) -> Revoked:
-    """Return the certificates that do not count any more: the words of ``revoked.txt``.
+    """Return the revoked certificates, listed as words in ``revoked.txt``.
 
-    A name (``train-7``) revokes every certificate of it, also later ones; a serial number (``0x5a1f...``, as
-    `railfix ground keys` prints it) that one alone, so that a train whose key was lost gets another.
+    A name (``train-7``) revokes all its certificates, including later ones; a serial number (``0x5a1f...``, as
+    `railfix ground keys` prints it) revokes one certificate, so that a train whose key was lost can get a new one.
     InputFileError: when the file is there and cannot be read.
     """
     path = folder / "revoked.txt"
@@ -85,16 +85,16 @@ def read_revoked(folder: Path) -> Revoked:
 
 
 def ending_sentence(name: str, ends: datetime) -> str:
-    """Return that a certificate ends soon, and the remedy."""
+    """Return the sentence that a certificate expires soon, with the remedy."""
     return f"the certificate {name} ends on {ends.date().isoformat()}; renew it (railfix ground keys --renew)"
 
 
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
-    """Return the certificates of an end, and of the authority, that end within `WARNING_DAYS`, a sentence each."""
+    """Return one sentence per certificate, of an end or the authority, that expires within `WARNING_DAYS`."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):
-        # of an authority that was renewed the newest counts
+        # the newest certificate of a renewed authority counts
         newest = max(x509.load_pem_x509_certificates((folder / file).read_bytes()), key=lambda c: c.not_valid_after_utc)
         if newest.not_valid_after_utc <= limit:
             found.append(ending_sentence(file, newest.not_valid_after_utc))
@@ -102,12 +102,11 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
 
 
 def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write the authority's key and certificate, and those of ``centre`` and of each ``train-N``; return the files.
+    """Write keys and certificates of the authority, of ``centre`` and of each ``train-N``; return the files.
 
-    In a folder with an authority only missing files are written, which adds trains. ``authority.key`` stays
-    there; it is in no folder that is handed to a train or a centre. Keys can be read by their owner alone.
-    OutputError: when there is nothing to write, or a file cannot be written. InputFileError: when a file of the
-    authority cannot be read.
+    In a folder with an authority only missing files are written, which adds trains. ``authority.key`` stays in this
+    folder and is never given to a train or a centre. Only their owner can read the keys. OutputError: when there is
+    nothing to write, or a file cannot be written. InputFileError: when a file of the authority cannot be read.
     """
     names = ["centre", *(f"train-{number}" for number in trains)]
     if (folder / "authority.key").exists():
@@ -129,9 +128,10 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
 def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
     """Replace keys and certificates of the centre and of trains by new ones; return the files.
 
-    Those before stay valid until their end, so that each end takes its new files over by itself, at its next start or
-    connection. An authority that would end before them is renewed as well: ``authority.pem`` has the old and the new
-    certificate, and is handed to every end before the new ones. InputFileError, OutputError as `write_keys`.
+    The previous certificates stay valid until they expire, so that each end can change to its new files at its next
+    start or connection. An authority that would expire before the new certificates is renewed as well:
+    ``authority.pem`` then has the old and the new certificate, and is given to every end before the new files.
+    InputFileError, OutputError: as `write_keys`.
     """
     signing, issuer = _read_authority(folder)
     parts: dict[str, bytes] = {}
@@ -161,7 +161,7 @@ def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
 
 
 def _within(issuer: x509.Certificate, days: int) -> int:
-    """Return a validity that ends with the authority's [days]."""
+    """Return a validity limited to the authority's remaining validity [days]."""
     return min(days, (issuer.not_valid_after_utc - datetime.now(UTC)).days)
 
 
@@ -200,7 +200,7 @@ def _signed(
 
 
 def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path]:
-    """Write files, keys for their owner alone, each whole or not at all; return their paths."""
+    """Write each file atomically, keys readable by their owner alone; return their paths."""
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.settings import Settings
 from railfix.track.network import Network
 
-#: Points: station and side, -1 at its lower end of chainage, 1 at its upper.
+#: Points: station and side, -1 at the end of lower chainage, 1 at the end of higher chainage.
 PointName = tuple[int, int]
 #: Most changes of gradient in one authority.
 MOST_PARTS: Final = 16
@@ -180,7 +180,7 @@ class Layout(Settings):
 
 
 def along(between_m: tuple[float, float], direction: int) -> tuple[float, float]:
-    """Return two chainages, lower first, as distances in a running direction: the near one and the far one [m]."""
+    """Return two chainages, lower first, as distances in a running direction: near end and far end [m]."""
     low, high = between_m
     return (low, high) if direction > 0 else (-high, -low)
 
@@ -209,7 +209,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
     Its chainage begins at one end and follows the single line and track 1 of each station. A station is a pair of
     tracks between the same two switches; the line is single between stations and beyond the outer ones. Points reach
     from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the side on
-    which they drive: their track is track 1. MismatchError: when the network is something else: several lines,
+    which they drive: their track is track 1. MismatchError: the network is not such a line: several lines,
     branches, stations of three tracks, loops of unequal length.
     """
     ends = network.joints.tolist()
@@ -267,7 +267,7 @@ def _points_m(network: Network, track: int, *, backward: bool) -> Floats:
 
 
 def _side(first: Floats, second: Floats) -> float:
-    """Return on which side of the first line the middle of the second lies, positive to its right [m]."""
+    """Return the lateral offset of the second line's middle from the first line, positive to the right [m]."""
     middle = len(first) // 2
     ahead = first[middle + 1] - first[middle - 1]
     right = np.cross(ahead / np.linalg.norm(ahead), first[middle] / np.linalg.norm(first[middle]))

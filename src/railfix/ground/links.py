@@ -24,12 +24,12 @@ from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, Receive
 from railfix.ground.keys import WARNING_DAYS, Revoked, ending_sentence, list_ending, read_revoked
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen
 
-#: Results that are kept: an hour of ten frames a second.
+#: Number of stored results: one hour at ten frames per second.
 KEPT: Final = 36_000
 
 
 class LinkResult(NamedTuple):
-    """Result of a frame: when and where it was sent, and its round trip [s], NaN where it was not answered in time."""
+    """Result of a frame: time and position of sending, and round-trip time [s], NaN if not answered in time."""
 
     sent_s: float
     chainage_m: float
@@ -39,12 +39,12 @@ class LinkResult(NamedTuple):
 class LinkLimits(Settings):
     """Limits of the links."""
 
-    #: An echo that takes longer counts as none (T); a centre lets one wait up to 0.2 s for an authority to go with.
+    #: A longer time to the echo is a miss (T); a centre delays an echo by up to 0.2 s to send it with an authority.
     answer_s: float = Field(default=1.0, gt=0)
-    misses: int = Field(default=3, ge=1)  #: Misses in a row after which the spare link is taken.
-    good: int = Field(default=10, ge=1)  #: Answers in a row before the normal link is taken again.
-    good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is taken again.
-    window: int = Field(default=60, ge=1)  #: Frames of the response rate.
+    misses: int = Field(default=3, ge=1)  #: Consecutive misses after which the spare link is used.
+    good: int = Field(default=10, ge=1)  #: Consecutive answers before the normal link is used again.
+    good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is used again.
+    window: int = Field(default=60, ge=1)  #: Number of frames in the response rate.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
     #: A connection without any packet for this time, at most 10 s, is opened again, so that trains reconnect after a
     #: centre was killed.
@@ -56,7 +56,7 @@ class LinkMeter:
     """Response rate and round-trip time of one link."""
 
     limits: LinkLimits = field(default_factory=LinkLimits)
-    #: Misses, and answers, in a row.
+    #: Consecutive misses, and consecutive answers.
     misses: int = 0
     good: int = 0
     #: Answered and sent frames by position and running direction.
@@ -122,14 +122,15 @@ class LinkChoice:
     """Link in use with a normal link A and a spare link B."""
 
     active: LinkName = "A"
-    since_s: float = 0.0  #: When it was taken.
+    since_s: float = 0.0  #: Time since which the link is in use.
     switches: int = 0
 
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:
         """Return the choice after new results of both links.
 
-        The spare link is taken after misses of the normal one in per row, unless it misses as well; the normal link
-        again after answers in a row and a time, or at once where only the spare one misses.
+        The spare link is used after consecutive misses of the normal link, unless the spare link misses as well. The
+        normal link is used again after consecutive answers and a minimum time, or at once if only the spare link
+        misses.
         """
         limits = normal.limits
         lost_normal, lost_spare = normal.misses >= limits.misses, spare.misses >= limits.misses
@@ -156,7 +157,7 @@ def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]
 
 
 def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
-    """Return the time from the first frame [s], chainage [m] and round trip [s] of all frames, NaN: not answered."""
+    """Return the time from the first frame [s], chainage [m] and round trip [s] of all frames, NaN if not answered."""
     results = sorted(result for meter in meters for result in meter.results)
     table = np.array(results, dtype=np.float64).reshape(-1, 3)
     return table[:, 0] - table[:1, 0].sum(), table[:, 1], table[:, 2]
@@ -248,7 +249,7 @@ class TrainLinks:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
-        """Begin to connect; connections that end are made again."""
+        """Start to connect; connections that end are reopened."""
         self._tasks = [asyncio.create_task(self._keep(name)) for name in BEARERS]
 
     async def stop(self) -> None:
@@ -281,7 +282,7 @@ class TrainLinks:
             await asyncio.sleep(RETRY_S)
 
     def send(self, payload: bytes, *, chainage_m: float | None = None, direction: int = 0) -> None:
-        """Send a payload: with its echo on both links; in mode "spare" only the active one carries the payload."""
+        """Send a frame on both links; in mode "spare" the active link carries the payload, the other an empty probe."""
         now_ns, now_s = time.monotonic_ns(), time.monotonic()
         self._sequence += 1
         self._newest = payload
@@ -303,7 +304,7 @@ class TrainLinks:
         protocol.send(frame.encode())
 
     def _resend(self, name: LinkName) -> None:
-        """Send the newest payload at once where a link is back and no other one is there."""
+        """Send the newest payload at once if a link is restored and no other link is connected."""
         if self._newest is not None and len(self.protocols) == 1:
             self._sequence += 1
             self._put(name, FrameKind.DATA, self._newest, time.monotonic_ns())
@@ -320,12 +321,12 @@ class TrainLinks:
 
 
 class CentreLinks:
-    """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
+    """The centre's end: listens at one address per bearer, answers every frame, and delivers each payload once.
 
-    `received` is called with the train's number and the payload; by default ports are any free ones, listed in
-    `addresses` by bearer. Answers wait up to `wait_s` for a payload to go with. `masquerades` counts connections that
-    were rejected for their certificate, `heard_s` has the monotonic clock of a train's last frame over a bearer, by
-    train and bearer, and `alarm` the fault of the list of revoked certificates.
+    `received` is called with the train's number and the payload; by default any free ports are used, listed in
+    `addresses` by bearer. Answers are delayed by up to `wait_s` to be sent with a payload. `masquerades` counts
+    connections that were rejected for their certificate, `heard_s` has the monotonic time of the last frame received,
+    by train and bearer, and `alarm` the fault of the list of revoked certificates.
     """
 
     def __init__(

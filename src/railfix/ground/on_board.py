@@ -20,13 +20,14 @@ ROLLED_M: Final = 50.0
 #: Number of reports whose time of sending is stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
-LONGEST_FRESH_S: Final = 45.0  #: Longest time limit of authorities: one that is older when it arrives is not taken.
+#: Longest time limit of authorities: an authority older than this on arrival is rejected.
+LONGEST_FRESH_S: Final = 45.0
 
 
 class OnBoardLimits(BrakeLimits):
     """Limits on board."""
 
-    #: Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
+    #: Time limit of authorities: the train brakes if the newest authority answers a report sent longer ago.
     fresh_s: float = option(
         "Time limit of authorities: older ones brake the train.",
         15.0,
@@ -35,7 +36,8 @@ class OnBoardLimits(BrakeLimits):
         gt=0,
         le=LONGEST_FRESH_S,
     )
-    #: A train without a position continues from the last one for this time, at its highest speed; then it brakes.
+    #: A train without a position is extrapolated from its last position for this time, at its highest speed; then it
+    #: brakes.
     placeless_s: float = Field(default=5.0, ge=0)
     clock: Clock = option(
         "Positions are of a recording: report each as of now, at the recording's own pace.", "live", name="--replay"
@@ -55,7 +57,7 @@ class Motion:
 
 @dataclass(kw_only=True)
 class OnBoard:
-    """Authority of a train, as known on board.
+    """On-board authority of a train.
 
     The age of an authority is counted from the sending of the report that it answers, on the train's monotonic clock.
     It is never too small, whatever the links do, and the clocks of train and centre need not agree.
@@ -71,11 +73,11 @@ class OnBoard:
     number: int = -1  #: Number of the newest authority, -1 before the first.
     stopped: bool = False  #: The newest authority is an order to stop.
     order: BrakeOrder | None = None  #: Order to brake that the train obeys.
-    authority: Authority | None = None  #: The newest one.
+    authority: Authority | None = None  #: Newest authority.
     #: Stopping position of the train's safe front end if it braked now, the farther of the last two positions; None:
-    #: it agrees to no shorter end.
+    #: the train accepts no shorter end.
     stops_at_m: float | None = None
-    #: When the newest report was sent that an authority has answered; None before the first.
+    #: Time of sending of the newest report that an authority has answered; None before the first.
     answered_s: float | None = None
     #: Newest report from before the last change of ends, or from before this start: answers to it or to an older one
     #: are rejected.
@@ -103,7 +105,7 @@ class OnBoard:
         safe_rear_m: float | None = None,
         now_s: float | None = None,
     ) -> None:
-        """Store the train's safe ends and speed; a single wrong position agrees to no shorter end.
+        """Store the train's safe ends and speed; a single wrong position cannot accept a shorter end.
 
         A train that has rolled back brakes: earlier grants of the centre do not include it. Without a position or a
         speed it continues from the previous one (`OnBoardLimits.placeless_s`).
@@ -137,11 +139,11 @@ class OnBoard:
         self._granted = False
 
     def receive(self, authority: Authority) -> bool:
-        """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
+        """Process an authority; return whether it is accepted: newer, for this direction, and from after the last turn.
 
-        One that answers a report from before the last change of ends may have been granted for the direction of now
-        two changes ago; one that has lapsed on the way counts no more. An order to brake always counts; one that is
-        late lasts until the next authority.
+        An authority that answers a report from before the last change of ends may have been granted for the present
+        direction two changes ago. An authority that has lapsed in transit is rejected. An order to brake is always
+        accepted; a late order lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
             # also from a centre whose database is an older copy, with smaller numbers than the train's
@@ -158,7 +160,7 @@ class OnBoard:
             return False
         if authority.shortens and (self._granted or authority.stopped):
             self.end_m = self.direction * min(end, held) if agrees else self.end_m
-        elif not authority.stopped:  # an order to stop gives nothing
+        elif not authority.stopped:  # an order to stop grants nothing
             self.end_m, self._granted = self.direction * (end if self._begins() else max(end, held)), True
         self.number, self.stopped, self.authority = authority.number, authority.stopped, authority
         self.order = None
@@ -167,7 +169,7 @@ class OnBoard:
         return True
 
     def _ends_order(self, authority: Authority) -> bool:
-        """Return whether an authority ends the order to brake; one that does not counts for nothing but its age."""
+        """Return whether an authority ends the order to brake; otherwise only its age is used."""
         assert self.order is not None
         if authority.number > self.order.number and not authority.stopped:
             return True
@@ -191,7 +193,7 @@ class OnBoard:
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
         """Return whether a shorter end may be accepted: an authority from before the start is unknown.
 
-        It brakes until it can agree.
+        The train brakes until it can accept the end.
         """
         return not authority.shortens or agrees or self._granted
 
@@ -204,7 +206,7 @@ class OnBoard:
         return {"authority": self.number, "authority_end_cm": end_cm, **order}
 
     def age_s(self, now_s: float) -> float:
-        """Age of the newest authority at most [s]; infinite before the first."""
+        """Largest possible age of the newest authority [s]; infinite before the first."""
         return float("inf") if self.answered_s is None else now_s - self.answered_s
 
     def _steps(self) -> Steps:
@@ -212,7 +214,8 @@ class OnBoard:
         parts = () if self.authority is None else self.authority.gradients
         if self.direction > 0:
             return Steps([c / 100.0 for c, _ in parts], [p / 1000.0 for _, p in parts])
-        # backward: a gradient applies from the begin of the next part down to its own, and before the first it is level
+        # backward: a gradient applies from the start of the next part down to its own start, and before the first it is
+        # level
         ends = [-c / 100.0 for c, _ in parts[::-1]]
         return Steps([-math.inf, *ends], [*(-p / 1000.0 for _, p in parts[::-1]), 0.0])
 
@@ -246,7 +249,7 @@ class OnBoard:
         return motion.speed_mps * max(now_s - motion.at_s, 0.0)
 
     def brake_reason(self, now_s: float) -> str | None:
-        """Return why the train brakes, None where it may run on."""
+        """Return the reason why the train brakes, None if it may continue."""
         if self.order is not None:
             return f"ordered to stop: {self.order.reason}" if self.order.reason else "ordered to stop"
         if self.stopped:
@@ -254,14 +257,14 @@ class OnBoard:
         return self.stale_reason(now_s) or self.curve_reason(now_s)
 
     def stale_reason(self, now_s: float) -> str | None:
-        """Return which input is too old to run by: the authority, or the position."""
+        """Return the input that is too old, the authority or the position; None if neither is."""
         if self.age_s(now_s) > self.limits.fresh_s:
             return "no fresh authority"
         at_s = None if self._motion is None else self._motion.at_s
         return "no place" if at_s is not None and now_s - at_s > self.limits.placeless_s else None
 
     def curve_reason(self, now_s: float) -> str | None:
-        """Return why the train is braked by its curve: the speed, the permitted speed, and the overrun."""
+        """Return the reason why the curve brakes the train: speed, permitted speed, and overrun."""
         found, motion = self.supervised(now_s), self._motion
         if found is None or motion is None or motion.speed_mps <= found.intervention_mps:
             return None
@@ -273,7 +276,7 @@ class OnBoard:
         return f"{motion.speed_mps:.1f} m/s where {found.intervention_mps:.1f} m/s lead to {target}{overruns}"
 
     def turn(self, direction: int, front_m: float) -> None:
-        """Begin in the other direction, without an authority."""
+        """Change to a running direction, without an authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
         self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
         self._motion, self.authority = None, None

@@ -1,4 +1,4 @@
-"""Position messages of a train from lines of JSON: as they are measured, or of a recording, at its own pace."""
+"""Position messages of a train from JSON lines: as they are measured, or from a recording at its own pace."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LONGEST_LINE: Final = 100_000
 #: Bytes that are read at once.
 _READ: Final = 1 << 16
 
-#: Whether positions are of now, or of a recording.
+#: Whether positions are live, or from a recording.
 Clock = Literal["live", "replay"]
 
 
@@ -26,8 +26,8 @@ async def read_positions(
 ) -> AsyncIterator[TrainMessage]:
     """Yield the position messages in lines; other lines are rejected with a sentence, and the next line counts.
 
-    With the clock "replay" messages are delayed as their positions were recorded. Its times are then replaced by the
-    present, so that the centre accepts the position as new.
+    With the clock "replay" messages are delayed as their positions were recorded. Their times are then replaced by the
+    present time, so that the centre accepts the positions as new.
     """
     first: tuple[int, int] | None = None
     number = 0

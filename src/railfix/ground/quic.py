@@ -37,8 +37,8 @@ WAIT_S: Final = 0.2
 ACKNOWLEDGE_S: Final = 1.5
 #: Largest number of handshakes of one peer in progress.
 MOST_HANDSHAKES: Final = 64
-#: Room for packets that arrive while the centre is busy; the usual room loses those of a thousand trains after 0.1 s.
-#: The system may allow less (Linux: net.core.rmem_max).
+#: Receive buffer for packets that arrive while the centre is busy; the default one overflows with a thousand trains
+#: after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
 _REJECTED: Final = 0x101
 
@@ -59,7 +59,7 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
 
 
 class Handshakes:
-    """Handshakes that are not done, of each peer at most `MOST_HANDSHAKES`: with another one the oldest ends."""
+    """Handshakes in progress, at most `MOST_HANDSHAKES` per peer: a further one ends the oldest."""
 
     def __init__(self) -> None:
         self._open: dict[str, dict[LinkProtocol, None]] = {}
@@ -187,7 +187,7 @@ class LinkProtocol(QuicConnectionProtocol):
 
 @contextmanager
 def address_errors(host: str, port: int) -> Iterator[None]:
-    """Name the address in an OSError of listening there, and the remedy."""
+    """Add the address and the remedy to an OSError from listening at an address."""
     try:
         yield
     except OSError as error:
@@ -206,10 +206,10 @@ async def listen(
     rejected: Callable[[], None],
     wait_s: float = WAIT_S,
 ) -> tuple[QuicServer, tuple[str, int]]:
-    """Listen for connections at an address; port 0 takes a free one. Return the server and its address.
+    """Listen for connections at an address; port 0 takes a free port. Return the server and its address.
 
-    Answers and acknowledgements to a verified peer are delayed up to `wait_s`, to be sent with a message. A peer
-    proves that it has its address before anything is kept of it (Retry, RFC 9000, 8.1.2).
+    Answers and acknowledgements to a verified peer are delayed up to `wait_s`, to be sent with a message. A peer must
+    prove its address before any of its data are stored (Retry, RFC 9000, 8.1.2).
     """
     handshakes = Handshakes()
     with address_errors(*address):
@@ -235,7 +235,7 @@ async def connection(
     received: Callable[[LinkProtocol, bytes], None],
     timeout_s: float = 5.0,
 ) -> AsyncIterator[LinkProtocol]:
-    """Connect from a local address, that of the bearer's interface.
+    """Connect from the local address of the bearer's interface.
 
     ConnectionError, TimeoutError: the other end rejects the certificate, has another name, or does not answer.
     """
@@ -250,7 +250,7 @@ async def connection(
             await protocol.wait_connected()
         yield protocol
     finally:
-        protocol._connected_waiter = None  # after a time-out nobody takes the error that closing gives it
+        protocol._connected_waiter = None  # after a time-out nothing retrieves the error set by closing
         protocol.close()
         await asyncio.sleep(0)
         transport.close()

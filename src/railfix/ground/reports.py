@@ -1,11 +1,11 @@
 """Effect of a position report on the interval of its train: pure functions.
 
-Nothing here proves a report right: `CHECKS` find reports that cannot be right given the earlier ones. Undetected
-errors (within the train's own bounds) are assumed away in ``docs/ground.md``.
+No check proves a report correct: `CHECKS` detect reports that contradict earlier reports. Undetected errors (within the
+train's own bounds) are excluded by an assumption in ``docs/ground.md``.
 
-The safe rear end moves to the position that two reports in a row confirm, of a complete train of its configured length.
-A report that contradicts the record of its train stops that train and its neighbours. Whatever the contradiction, the
-interval is extended to the reported position, as far as the train can have run.
+The safe rear end moves to the position confirmed by two consecutive reports of a complete train of its configured
+length. A report that contradicts the record of its train stops that train and its neighbours. Whatever the
+contradiction, the interval is extended to the reported position, as far as the train can have run.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Largest rounding difference between a reported and the configured length [m].
 LENGTH_ROUNDING_M: Final = 0.02
-#: Largest speed of a standing train; and against the facing, beyond which a train rolls back [m/s].
+#: Largest speed of a standing train, and largest speed against the facing that is not rolling back [m/s].
 STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
-#: Largest sum of over- and under-reading amount of a report that is taken.
+#: Largest sum of over- and under-reading amount of an accepted report.
 WIDEST_M: Final = 1000.0
 #: Uncertainty of the instants of positions for intervals: the largest age of a position when it is sent [s].
 INSTANT_S: Final = 5.0
@@ -38,7 +38,7 @@ def is_placed(message: TrainMessage) -> bool:
 
 
 def is_newer(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report comes after those that are known: of a later start on board, or a higher number."""
+    """Return whether a report is newer than all known reports: from a later on-board start, or of a higher number."""
     return (message.session or 0) != known.session or message.sequence > known.sequence
 
 
@@ -73,12 +73,12 @@ class PlacedReport:
 
     @property
     def over_m(self) -> float:
-        """Distance that the front end is behind the reported one at most [m]."""
+        """Largest distance of the front end behind the reported front end [m]."""
         return (self.message.over_cm or 0) / 100.0
 
     @property
     def under_m(self) -> float:
-        """Distance that the front end is ahead of the reported one at most [m]."""
+        """Largest distance of the front end ahead of the reported front end [m]."""
         return (self.message.under_cm or 0) / 100.0
 
     @property
@@ -98,7 +98,7 @@ class PlacedReport:
 
     @property
     def held_m(self) -> float | None:
-        """End of the authority that the train has, at most the end of the line; None where it names none [m]."""
+        """End of the authority that the train has, at most the end of the line; None if the report names none [m]."""
         end_cm, stations = self.message.authority_end_cm, self.layout.stations
         return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
 
@@ -109,18 +109,18 @@ class PlacedReport:
 
 
 def no_length(report: PlacedReport) -> str | None:
-    """Return the reason of a report without a train length."""
+    """Return the reason if a report has no train length."""
     return "the report has no train length" if report.message.length_cm == 0 else None
 
 
 def other_line(report: PlacedReport) -> str | None:
-    """Return the reason of a report of another line."""
+    """Return the reason if a report is from another line."""
     line, known = report.message.line, report.known.line
     return None if known in (None, line) else f"the report is of line {line}, the train is on line {known}"
 
 
 def wide_bounds(report: PlacedReport) -> str | None:
-    """Return the reason if a position is hardly known."""
+    """Return the reason if the bounds of a position are too wide."""
     wide = report.over_m + report.under_m > WIDEST_M
     return f"the bounds of the position are wider than {WIDEST_M:g} m" if wide else None
 
@@ -133,13 +133,13 @@ def off_line(report: PlacedReport) -> str | None:
 
 
 def moving_standstill(report: PlacedReport) -> str | None:
-    """Return the reason of a standstill with a speed."""
+    """Return the reason if a standstill is reported with a speed."""
     moving = report.message.standstill and not stands(report.message)
     return f"the train stands, and runs at {report.speed_mps:.1f} m/s" if moving else None
 
 
 def unknown_authority(report: PlacedReport) -> str | None:
-    """Return the reason for an authority that is not in the centre's database."""
+    """Return the reason if an authority is not in the centre's database."""
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None
@@ -147,7 +147,7 @@ def unknown_authority(report: PlacedReport) -> str | None:
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
-    """Return the contradiction of a change of ends: the train stands where it stood, its rear end is now the front."""
+    """Return the contradiction of a change of ends: position unchanged, with the rear end as the new front end."""
     if not report.turns:
         return None
     if not report.message.standstill:
@@ -173,7 +173,7 @@ def holds_more(report: PlacedReport) -> str | None:
 
 
 def too_fast(report: PlacedReport) -> str | None:
-    """Return the reason of a speed that no train has."""
+    """Return the reason if a speed exceeds the highest speed of trains."""
     fast = report.speed_mps is not None and report.speed_mps > report.limits.speed_mps
     return f"the speed {report.speed_mps:.0f} m/s is above {report.limits.speed_mps:g} m/s" if fast else None
 
@@ -185,7 +185,7 @@ def older_place(report: PlacedReport) -> str | None:
 
 
 def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
-    """Return how far a train can have run, between reports of its speed where it has given both [m]."""
+    """Return the longest distance that a train can have run, by its speeds at both reports where known [m]."""
     top = limits.speed_mps
     if before is not None and now is not None:
         # speeds in between exceed both ends by at most this much
@@ -221,7 +221,7 @@ def rolled_back(report: PlacedReport) -> str | None:
 
 
 def runs_backward(report: PlacedReport) -> str | None:
-    """Return the reason of a train that runs against its facing."""
+    """Return the reason if a train runs against its facing."""
     message, speed = report.message, report.speed_mps
     backward = message.direction == -report.known.direction and (speed is None or speed > STANDING_MPS)
     return "the train runs backward" if backward and not message.standstill and not report.turns else None
@@ -236,7 +236,7 @@ CHECKS: tuple[Check, ...] = (
 
 
 def compute_contradiction(report: PlacedReport) -> str | None:
-    """Return the contradiction of a report with a position, None if it may be right."""
+    """Return the contradiction of a report with a position, None without one."""
     return next((reason for check in CHECKS if (reason := check(report)) is not None), None)
 
 
@@ -300,10 +300,10 @@ def report_received(
 ) -> Interlocking:
     """Return the state after a position report.
 
-    A train that faces the other way than before has changed ends; that counts only at a standstill inside its station,
-    and the interval still covers the earlier position. A report that contradicts the record stops the train and moves
-    its interval outward only. `elapsed_s` is the longest time since the previous position, by the centre's own clock,
-    where known.
+    A train that faces the other way than before has changed ends. This is accepted only at standstill inside its
+    station, and the interval still covers the earlier position. A report that contradicts the record stops the train
+    and moves its interval outward only. `elapsed_s` is the longest time since the previous position, by the centre's
+    own clock, where known.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):
@@ -330,18 +330,18 @@ def report_received(
     if confirmed and before.claimed_m is not None and before.stop is None:
         agreed = agreed_rear(facing, rear, before.claimed_m)
         known = replace(known, rear_m=facing * furthest(facing, agreed, before.rear_m))
-    # of a stopped train the interval only grows
+    # the interval of a stopped train only grows
     front = ahead if before.stop is None else facing * max(facing * ahead, facing * before.front_m)
     return with_train(state, replace(known, front_m=front))
 
 
 def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:
-    """Return the rear end of two reports in a row, along the facing: one wrong report alone moves it nowhere [m]."""
+    """Return the rear end confirmed by two consecutive reports, along the facing; one alone cannot move it [m]."""
     return min(facing * rear_m, facing * claimed_m)
 
 
 def furthest(facing: int, agreed_m: float, known_m: float) -> float:
-    """Return the rear end that is kept, along the facing: no wider bound moves it back [m]."""
+    """Return the further of two rear ends along the facing: a wider bound does not move it back [m]."""
     return max(agreed_m, facing * known_m)
 
 

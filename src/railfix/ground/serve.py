@@ -1,4 +1,4 @@
-"""The centre as a process: its file, links, page, and simulated points."""
+"""Process of the centre: its configuration file, links, page, and simulated points."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from railfix.track.network_read import read_network
 STEP_S = 0.1
 #: Longest wait for a commit in progress at the end [s].
 ENDING_S = 3.0
-#: Thresholds of the garbage collection: with a thousand connections a whole one takes 0.3 s, and is made rarely.
+#: Thresholds of the garbage collection: with a thousand connections a full collection takes 0.3 s, and is made rarely.
 COLLECTION = 10_000, 20, 50
-#: Document with the stations and trains that the database is of.
+#: Document with the stations and trains that the database belongs to.
 _BELONGS_TO = "stations and trains"
 
 
@@ -69,7 +69,7 @@ class TrainPlace(Settings):
     number: int = Field(gt=0, lt=1 << 32)
     station: str
     track: Literal[1, 2]
-    direction: Literal[-1, 1]  #: In which the front looks, against chainage.
+    direction: Literal[-1, 1]  #: Direction of the front along the chainage.
     #: Front end and length.
     front_m: float
     length_m: float = Field(gt=0)
@@ -79,7 +79,7 @@ class TrainPlace(Settings):
 class TriangleInputs(Settings):
     """Reference triangle on live streams."""
 
-    sources: tuple[str, str, str]  #: Length of the train, as in ``railfix live``; 3 elements.
+    sources: tuple[str, str, str]  #: Streams of the three receivers, as in ``railfix live``.
     points: tuple[Place, Place, Place]  #: Latitude, longitude and height of the known points; length 3 [deg, deg, m].
     nav: tuple[Path, ...] = ()  #: Navigation known from the start; records from the streams are added.
     limits: TriangleLimits = TriangleLimits()
@@ -94,25 +94,25 @@ class CentreFile(Settings):
 
     keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key`` of ``railfix ground keys``.
     listen: dict[LinkName, Address]  #: Address of each bearer.
-    stations: tuple[LoopStation, ...] = ()  #: The line; or else
+    stations: tuple[LoopStation, ...] = ()  #: Stations of the line, unless `network` is given.
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
-    gradients: tuple[Gradient, ...] = ()  #: Stations of the line, in order of chainage.
-    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection. It answers by the
-    #: order ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise the section is unknown.
+    gradients: tuple[Gradient, ...] = ()  #: Gradients of the line, in order of chainage.
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection. The detection answers by the order
+    #: ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise the section is unknown.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
     #: Initial stations of the trains; later starts read them from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
-    database: str = "centre.db"  #: File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
+    database: str = "centre.db"  #: SQLite file, or the address of an SQL database (``postgresql+psycopg://...``).
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
     #: Whether a train that nears the end of its track is given the route to the next station.
     routes: Literal["automatic", "by hand"] = "automatic"
     speed_mps: float = Field(default=20.0, gt=0)  #: Speeds of the reference run curve, for simulated running.
     #: Time in which simulated points move: railfix has no interface to real ones.
     points_s: float = Field(default=5.0, ge=0)
-    #: Judges satellite positioning; the first start is then a stop, to be released by hand. Without it nothing
-    #: integrates satellites.
+    #: Reference triangle that monitors satellite positioning; the first start is then a stop, to be released by hand.
+    #: Without it satellite positioning is not monitored.
     triangle: TriangleInputs | None = None
     #: `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
     centre: CentreLimits = CentreLimits()
@@ -199,10 +199,10 @@ async def run_centre(
     Returns whether SIGTERM ended it, and figures of the session.
 
     The page is at a host and port, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
-    centre's certificate. `password` is for orders, those of `people` by their names; orders have a separate address
-    where one is given, otherwise that of the page. `announce` is called with each address once trains can connect.
-    InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an address
-    cannot be listened at.
+    centre's certificate. `password` permits orders, and `people` has personal passwords by name. Orders have a separate
+    address where one is given, otherwise the page's address. `announce` is called with each address once trains can
+    connect. InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an
+    address cannot be listened at.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
@@ -322,13 +322,13 @@ def _stored_points(store: Store) -> dict[PointName, int]:
 
 
 def _call_in(loop: asyncio.AbstractEventLoop, work: Callable[[], None]) -> None:
-    """Call some work in the loop, from another thread; not where the loop has ended."""
+    """Call a function in the loop from another thread, unless the loop has ended."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(work)
 
 
 def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
-    """Return when each train was last received over each bearer, as the page shows it."""
+    """Return the time of each train's last frame over each bearer, as shown on the page."""
     now = time.monotonic()
     return [
         {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,
@@ -353,7 +353,7 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
 
 
 async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> None:
-    """Judge satellite positioning by the streams of the triangle; where they end, its lateness stops the trains."""
+    """Judge satellite positioning by the streams of the triangle; if they end, late fixes stop the trains."""
     if (triangle := settings.triangle) is None:
         return
     try:
@@ -370,7 +370,7 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
 
 
 def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
-    """Store at the first start what the database belongs to; raise if the file differs later."""
+    """Store the stations and trains of the file at the first start; raise if the file differs later."""
     under = {f"station {s.name}": s.model_dump_json() for s in settings.stations}
     under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
@@ -396,9 +396,9 @@ def _is_loopback(host: str) -> bool:
 
 
 def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
-    """Return the password in the first line of a file, and those of people in the others, each ``NAME PASSWORD``.
+    """Return the password in the first line of a file, and personal passwords in the other lines, ``NAME PASSWORD``.
 
-    InputFileError: when the file cannot be read, is empty, has another form, or others than its owner can read it.
+    InputFileError: when the file cannot be read, is empty, has another form, or is readable by others than its owner.
     """
     try:
         shared = path.stat().st_mode & 0o077

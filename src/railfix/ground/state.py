@@ -1,6 +1,6 @@
 """State of the interlocking: intervals of trains, points, bars and speed restrictions; and its texts for the store.
 
-Texts: the head, one a train, one a pair of points. Values are never written to: each step returns new ones.
+The texts are the head, one per train, and one per set of points. Values are immutable: each step returns new ones.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class TrainInterval:
     rear_m: float
     front_m: float
     end_m: float  #: End of the authority.
-    sequence: int  #: Newest report, and the start on board that it is of (`TrainMessage.session`).
+    sequence: int  #: Newest report, and the on-board start that it belongs to (`TrainMessage.session`).
     session: int = 0
     tracks: Mapping[int, int]  #: Track in each station of the route.
     station: int  #: Station where the route ends.
@@ -64,9 +64,9 @@ class TrainInterval:
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
     #: Number of the newest authority by which it may run, sent or named by a report; None before the first, and once a
-    #: report names an order to brake of that number or a later one: none that is still on the way ends that order.
+    #: report names an order to brake of that number or a later one: no authority in transit ends that order.
     runs_by: int | None = None
-    stop: str | None = None  #: Why the train is stopped, until it is released by hand.
+    stop: str | None = None  #: Reason of the stop, until the train is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests it.
     held: bool = False  #: A route was taken back: the next one is set by hand.
@@ -109,11 +109,11 @@ ROUNDING_M: Final = 0.02
 class PointState:
     """Positions of the points in the interlocking."""
 
-    wanted: int = 1  #: Track they are commanded to.
-    detected: int | None = 1  #: Track they are detected at; None while they move, or before the field has answered.
+    wanted: int = 1  #: Commanded track.
+    detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
     #: The field has been given the command since `wanted` was stored.
     commanded: bool = True
-    #: Trains that lock them: None until the train's rear end has passed, then the time of release [s].
+    #: Trains that lock the points: None until the train's rear end has passed, then the time of release [s].
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
@@ -138,9 +138,10 @@ class Interlocking:
     points: Mapping[PointName, PointState]
     stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
     granted: int = 0  #: Number of the last authorities that were sent.
-    #: Last number before this start by the database, and first of this start: those between are of a newer database.
+    #: Last number before this start by the database, and first number of this start; numbers between belong to a newer
+    #: database.
     skipped: tuple[int, int] = (0, 0)
-    #: Sections (`Layout.sections`) that no authority reaches into, each with why: `railfix.ground.stops.BARS`.
+    #: Sections (`Layout.sections`) that no authority reaches into, each with its reason: `railfix.ground.stops.BARS`.
     bars: frozenset[tuple[str, str]] = frozenset()
     restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: By name.
 
@@ -159,13 +160,13 @@ def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Inte
     return state
 
 
-#: Name of the text without trains and points, and beginnings of the names of theirs.
+#: Name of the head text, and prefixes of the names of train and point texts.
 HEAD: Final = "interlocking"
 _TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
 
 
 def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str | None]:
-    """Return the texts by name; with a state before only those that may have changed, None for one to be removed."""
+    """Return the texts by name; with a previous state only texts that may have changed, None for a removed text."""
     head = {
         "stopped": state.stopped,
         "granted": state.granted,
@@ -185,7 +186,7 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
-    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
+    """Return the state from its texts. Times of release restart: the earlier process's clock is unknown.
 
     InputFileError: when an older version wrote them.
     """

@@ -1,8 +1,8 @@
-"""Stops by order: of a train, of all, of a section; of trains whose intervals meet; and their release by hand.
+"""Stops of one train, all trains, a section, or trains whose intervals overlap, and their release by hand.
 
-Until then everything that was granted stays occupied. The train agrees where it can stop before the shorter end; every
-authority from the asking on carries that end, and on board one with an older number is refused, so that none can
-lengthen it again by being late.
+Until the release everything that was granted stays occupied. The train accepts a shorter end if it can stop before it.
+Every authority from the request on contains this end, and the train rejects authorities with older numbers, so that a
+late authority cannot lengthen it again.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from railfix.ground.layout import Layout, Piece, PointName, overlap
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
 
-#: Why a section is barred: closed by hand; occupied by vehicles that report nothing, by hand or by its detection;
-#: its detection has not answered. `BARS` are those that stop the trains inside.
+#: Reasons why a section is barred: closed by hand; occupied by vehicles that report nothing, by hand or by its
+#: detection; its detection has not answered. `BARS` are the reasons that stop the trains inside.
 CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
@@ -31,7 +31,7 @@ def pieces_of(train: TrainInterval, layout: Layout) -> list[Piece]:
 
 
 def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
-    """Return the state with the trains stopped whose intervals overlap: of trains at rest whose bounds have grown."""
+    """Return the state with overlapping trains stopped: the bounds of trains at rest may have grown."""
     spans = sorted((*train.span_m, number) for number, train in state.trains.items())
     for k, (_, high, number) in enumerate(spans):
         for low, _, other in spans[k + 1 :]:
@@ -47,7 +47,7 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
 
 
 def parted_cleared(state: Interlocking) -> Interlocking:
-    """Return the state in which trains that were divided, and are apart, count as any others."""
+    """Return the state in which divided trains that are apart are treated as any other trains."""
     for train in [train for train in state.trains.values() if train.parted is not None]:
         rear = state.trains.get(train.parted or 0)
         if rear is None or not train.overlaps(*rear.span_m):
@@ -84,7 +84,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
         points[name] = replace(points[name], locked={**points[name].locked, train: None})
     direction = known.direction  # where the train ran too far, its authority now ends there
     end = direction * max(direction * known.end_m, direction * known.front_m)
-    station = known.station  # after a wrong change of ends one behind the train
+    station = known.station  # after a wrong change of ends a station behind the train
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
         station += direction
     moved = replace(known, stop=None, end_m=end, line=None, station=station)
@@ -95,7 +95,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
 
 
 def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[PointName], layout: Layout) -> str | None:
-    """Return that points under an interval do not lead its train to its tracks."""
+    """Return the refusal if points under an interval do not lead its train to its tracks."""
     for name in under:
         point = state.points[name]
         if not (point.lies and point.wanted == train.tracks.get(name[0])):
@@ -127,7 +127,7 @@ def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Inter
 
 
 def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[str]) -> Interlocking:
-    """Return the state in which sections are barred that are detected occupied, and not by a train that reports."""
+    """Return the state with sections barred that are detected as occupied, but not by a reporting train."""
     for section in sections:
         pieces = layout.sections[section]
         if (section, OCCUPIED) not in state.bars and not any(

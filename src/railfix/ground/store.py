@@ -1,6 +1,6 @@
 """Stored state of the centre: trains, authorities and the log, in SQLite (WAL) or another SQL database.
 
-Everything that is acknowledged or granted is committed before: a centre that is killed at any moment finds it again.
+Everything is committed before it is acknowledged or granted: a centre that is killed at any moment can restore it.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Store:
     def take_charge(self) -> None:
         """Make this process the only writer: an earlier centre cannot commit any more.
 
-        InputFileError: when another process on this machine has the database of SQLite.
+        InputFileError: when another process on this machine uses the SQLite database.
         """
         database = self._engine.url.database
         if self._engine.dialect.name == "sqlite" and database:
@@ -116,7 +116,7 @@ class Store:
         self._engine.dispose()
 
     def save(self, *records: TrainRecord, documents: Mapping[str, str | None] | None = None) -> None:
-        """Commit reports of trains, named texts (None removes one) and the lines of the log; they count then.
+        """Commit train reports, named texts (None removes a text) and the lines of the log.
 
         InputFileError: when another centre has taken charge of the database since `take_charge`. DatabaseError: when
         the database fails; nothing is stored then, and the lines of the log are kept.
@@ -155,7 +155,7 @@ class Store:
                 self._forget_old_lines(len(notes))
 
     def _forget_old_lines(self, added: int) -> None:
-        """Delete the oldest lines of the log beyond the most that are kept; looked at once in a hundredth of these."""
+        """Delete the oldest log lines beyond the limit; checked once per hundredth of the limit."""
         self._written += added
         if self._written <= self._most_lines // 100:
             return
@@ -164,7 +164,7 @@ class Store:
         self._connection.execute(LOG.delete().where(LOG.c.number <= newest - self._most_lines))
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
-        """Take a line of the log, to be committed with the next `save` or at the end."""
+        """Add a line to the log, to be committed with the next `save` or at the end."""
         self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
@@ -188,7 +188,7 @@ class Store:
             return self._connection.execute(sql.select(DOCUMENTS.c.text).where(DOCUMENTS.c.name == name)).scalar()
 
     def documents(self, beginning: str) -> dict[str, str]:
-        """Return the texts whose names begin so."""
+        """Return the texts whose names have a prefix."""
         named = sql.select(DOCUMENTS.c.name, DOCUMENTS.c.text).where(
             DOCUMENTS.c.name.startswith(beginning, autoescape=True)
         )
@@ -203,7 +203,7 @@ class Store:
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
     def _put(self, key: sql.Column[Any], rows: list[dict[str, Any]]) -> None:
-        """Replace rows by their key; of several with one key the last counts."""
+        """Replace rows by their key; of rows with the same key the last counts."""
         if rows := list({row[key.name]: row for row in rows}.values()):
             self._connection.execute(
                 key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]
@@ -221,7 +221,7 @@ def _time_outs(url: str) -> dict[str, Any]:
 
 
 def _durable(connection: Any, _record: object) -> None:
-    """Set a connection of SQLite to write-ahead logging, each commit on the disk before it returns."""
+    """Set an SQLite connection to write-ahead logging, with each commit on disk before it returns."""
     cursor = connection.cursor()
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=1000"):
         cursor.execute(f"PRAGMA {pragma}")

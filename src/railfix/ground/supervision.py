@@ -1,6 +1,6 @@
-"""Supervision of the trains of a line by the centre: reports in, authorities out, without input or output.
+"""Supervision of a line's trains by the centre: authorities from reports, without input or output.
 
-The one path for `railfix.ground.control` (the centre with its store and page) and for simulated traffic
+It is common to `railfix.ground.control` (the centre with its store and page) and simulated traffic
 (`railfix.ground.traffic`).
 """
 
@@ -41,9 +41,9 @@ from railfix.io.train_message import TrainMessage
 ROUTE_AHEAD_M = 700.0
 #: A train is sent an authority at its report, at a stop, and otherwise this often [s].
 AUTHORITY_S = 1.0
-#: Numbers of authorities that are skipped at least at a start.
+#: Least number of authority numbers that are skipped at a start.
 SKIPPED: Final = 1 << 20
-#: An authority has lapsed on board this long after the report that it answers: longer than `LONGEST_FRESH_S` [s].
+#: Time after the answered report at which an authority has lapsed on board: longer than `LONGEST_FRESH_S` [s].
 LAPSED_S: Final = 60.0
 #: Largest drift between clocks of a train and of the centre.
 CLOCK_DRIFT: Final = 1e-4
@@ -55,7 +55,7 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    #: Called with points that have to move and the track they are to lead to; `set_detected` gets the field's reports.
+    #: Called with points to be moved and their target track; `set_detected` gets the field's reports.
     command: Callable[[PointName, int], None] = lambda *_: None
 
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -64,11 +64,11 @@ class Supervision:
     records: dict[int, TrainRecord] = field(default_factory=dict)
     routes_set: int = 0
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since the last authorities.
-    #: When a train was sent its last authority [s], and whether it was an order to stop.
+    #: Time of the last authority sent to a train [s], and whether it was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
-    granted_s: dict[int, float] = field(default_factory=dict)  #: When a train was last sent an authority to run [s].
+    granted_s: dict[int, float] = field(default_factory=dict)  #: Time of the last authority to run sent to a train [s].
 
-    #: When a train was sent the order to brake that it has not acknowledged yet, and the number of the order.
+    #: Time of sending, and number, of a train's order to brake that it has not acknowledged yet.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)
     issued: dict[int, set[int]] = field(default_factory=dict)  #: Numbers of all orders to brake since the start.
     begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
@@ -76,14 +76,14 @@ class Supervision:
     awaited: set[int] = field(default_factory=set)
     #: Sections that are detected as occupied; None: not answered yet, or too long ago.
     detected: dict[str, bool | None] = field(default_factory=dict)
-    #: When the detection of a section has answered last [s], of those that have to repeat it.
+    #: Time of a section detection's last answer [s], for detections that must be repeated.
     answered_s: dict[str, float] = field(default_factory=dict)
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
     _asked_s: dict[PointName, float] = field(default_factory=dict)
 
     def report(self, message: TrainMessage, now_s: float) -> Rejection | None:
-        """Take a report; return why it does not count, None where it does."""
+        """Process a report; return the reason of its rejection, None if it is accepted."""
         number = message.train
         if number not in self.state.trains:
             return Rejection.UNKNOWN_TRAIN
@@ -119,7 +119,8 @@ class Supervision:
     ) -> tuple[float | None, tuple[float, float]]:
         """Return the longest time since the train's previous position (None: unknown), and the clock's delay.
 
-        By the least delay of earlier reports; after a start on board, whose clock is new, by the centre's alone.
+        The least delay of earlier reports is used; after an on-board start, whose clock is new, the centre's clock
+        alone.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -147,7 +148,8 @@ class Supervision:
     def has_lapsed(self, train: int, now_s: float) -> bool:
         """Return whether every authority by which a train may run has lapsed on board.
 
-        Each answers a report that arrived before it was sent, so that its age is counted from then at the latest.
+        Each authority answers a report that arrived before it was sent, so that its age is counted from its sending at
+        the latest.
         """
         record = self.records.get(train)
         counted_s = math.inf if record is None or record.counted_s is None else record.counted_s
@@ -161,8 +163,8 @@ class Supervision:
         authorities unknown to the database, and the train accepts no late authority of the earlier centre any more. The
         stored detection of points is dropped.
 
-        Numbers begin at the microseconds `wall_us` of the computer's clock, so that they are above those of every
-        earlier start; where that clock has been set back, above those of the database.
+        Numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers of every
+        earlier start, or if that clock was set back, the numbers in the database.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
         first = max(last + SKIPPED, wall_us)
@@ -201,7 +203,7 @@ class Supervision:
         return reason
 
     def command_points(self, stored: Interlocking) -> None:
-        """Return the commands to points that are due, in a stored state; none before every train has reported."""
+        """Give the due commands to points of a stored state; none before every train has reported."""
         if self.awaited:
             return
         self.state, commands = due_commands(self.state, self.layout, stored)
@@ -217,14 +219,14 @@ class Supervision:
             self.awaited.discard(number)
 
     def advance(self, now_s: float) -> list[Authority]:
-        """Watch, work, and give the commands to points at once, where nothing is stored; return the authorities."""
+        """Watch, work and command points at once, without a store; return the authorities."""
         self.watch(now_s)
         authorities = self.work(now_s)
         self.command_points(self.state)
         return authorities
 
     def watch(self, now_s: float) -> list[BrakeOrder]:
-        """Find trains that have to stop, whatever the store does; return the orders to brake that are to be sent.
+        """Find trains that have to stop, independent of the store; return the orders to brake to be sent.
 
         An order is repeated every `AUTHORITY_S` until a report of the train names it.
         """
@@ -327,7 +329,7 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names an order to brake, or one from after it."""
+    """Return whether a report names an order to brake, or a later order."""
     return (message.brake_order or -1) >= number
 
 

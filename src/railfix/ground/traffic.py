@@ -1,4 +1,4 @@
-"""Simulated traffic of a line: trains and points, every invariant checked at each step of time."""
+"""Simulated traffic of a line: trains and points, with every invariant checked at each time step."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SimulatedTrain:
 
     number: int
     front_m: float
-    tracks: dict[int, int]  #: Track in each station that the points have led it to.
+    tracks: dict[int, int]  #: Track in each station that the points have led the train to.
     on_board: OnBoard
     length_m: float = 80.0
     speed_mps: float = 0.0
@@ -135,7 +135,7 @@ class Traffic:
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)  #: Invariants that were broken, by kind and in seconds.
     moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
-    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that points lead to; 1 where none is given.
+    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that points lead to; 1 by default.
     _stopped_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -147,7 +147,7 @@ class Traffic:
         return self.centre.layout
 
     def step(self) -> None:
-        """Run everything for a step of time and check the invariants."""
+        """Simulate one time step and check the invariants."""
         self.now_s += STEP_S
         self.disturb()
         self._field()
@@ -175,7 +175,7 @@ class Traffic:
         raise NotImplementedError
 
     def authority(self, authority: Authority) -> None:
-        """Take an authority on board."""
+        """Deliver an authority to its train."""
         self.trains[authority.train].on_board.receive(authority)
 
     def command(self, name: PointName, track: int) -> None:
@@ -195,7 +195,7 @@ class Traffic:
                 self.centre.set_detected(name, track)
 
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
-        """Let points lead a train that runs onto them."""
+        """Set the track of a train that runs onto points, and count violations."""
         for name in self.centre.state.points:
             near, _ = along(self.layout.zone_m(name), train.direction)
             if not train.direction * before_m < near <= train.direction * train.front_m:
@@ -247,7 +247,7 @@ class Traffic:
                 self.violations["opposing trains in a section"] += 1
 
     def _check_stops(self) -> None:
-        """Trains brake once their authority is too old, and so at the latest after an order to stop."""
+        """Check that trains brake once their authority is too old, and thus at the latest after an order to stop."""
         stopped = self.centre.state.stopped and self.centre_works
         self._stopped_s = (self.now_s if self._stopped_s is None else self._stopped_s) if stopped else None
         for train in self.trains.values():

@@ -1,4 +1,4 @@
-"""A train's end of the links, and its supervision by the newest authority of the centre and that one's time limit."""
+"""A train's end of the links, and its supervision by the centre's newest authority and the authority's time limit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def run_train(
     Ends with the positions, once the last report is answered or `ANSWER_S` after it. Returns the number of reports and
     of authorities.
 
-    With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as written by
+    The folder `keys` has the train's own two files and ``authority.pem``. The positions are messages as written by
     `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
     (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, its `is_complete` replaces
     that of the messages. InputFileError: when a key is not there.
@@ -135,7 +135,7 @@ class _Desk:
 
     @staticmethod
     def _note_position(on_board: OnBoard, message: TrainMessage, now_s: float) -> None:
-        """Let the braking curve follow a position."""
+        """Update the braking curve with a position."""
         place, over, under = message.chainage_cm, message.over_cm, message.under_cm
         if place is None or over is None or under is None or message.speed_cmps is None:
             on_board.note_position(None, None, now_s=now_s)
@@ -150,7 +150,7 @@ class _Desk:
         )
 
     def receive(self, payload: bytes) -> None:
-        """Take an authority from the links."""
+        """Process an authority from the links."""
         try:
             authority = Authority.decode(payload)
         except MessageError as error:
@@ -170,7 +170,7 @@ class _Desk:
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(now), 3), **self._speeds(now))
 
     def _speeds(self, now_s: float) -> dict[str, float]:
-        """Return the speed that the train may run at, its target, and the release speed there."""
+        """Return the permitted speed, its target, and the release speed at the target."""
         assert self._on_board is not None
         if (found := self._on_board.supervised(now_s)) is None:
             return {}

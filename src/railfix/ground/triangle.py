@@ -1,11 +1,11 @@
 """Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points; its monitor.
 
 P3 (reference triangle): each fix is compared with its point by a circle of allowable error, and the vectors between
-neighbouring fixes (distance and bearing) with those between the points. P3 treats a fix inside its circle as the point
-itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes: errors common to
-the three receivers cancel in them, their limit can be far below the radius, and such a drift is detected.
+neighbouring fixes (distance and bearing) with the vectors between the points. P3 treats a fix inside its circle as the
+point itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes: errors
+common to the three receivers cancel in them, their limit can be far below the radius, and such a drift is detected.
 
-The monitor is a pure state machine, suspension of satellite positioning with a latched stop and release by hand:
+The monitor is a pure state machine that suspends satellite positioning, with a latched stop and release by hand:
 `advance` takes the state and one sample, and returns the new state with the orders to be sent.
 """
 
@@ -34,13 +34,13 @@ YEAR_S: Final = 31_557_600.0
 class TriangleVerdict(IntEnum):
     """Verdict on one set of three fixes; every one from `ONE_RECEIVER` on stops the trains."""
 
-    #: Every fix inside its circle, every side as it should be.
+    #: Every fix is inside its circle, and every side within its limit.
     HEALTHY = 0
     #: Every fix is inside its circle, but one side, or both sides of one receiver, differ: a warning.
     RECEIVER_DRIFTING = 1
-    #: One fix outside its circle, and both its sides differ.
+    #: One fix is outside its circle, and both its sides differ.
     ONE_RECEIVER = 2
-    #: Three fixes outside, the shape kept: satellites or a disturbance that acts on all alike.
+    #: Three fixes are outside, with the shape kept: a fault of satellites, or a disturbance common to all.
     SATELLITES_OR_JAMMING = 3
     #: The fixes coincide: one false signal for all three receivers.
     SPOOFING = 4
@@ -59,10 +59,10 @@ STOPPING: Final = frozenset(verdict for verdict in TriangleVerdict if verdict >=
 class TriangleLimits(Settings):
     """Limits of the triangle."""
 
-    #: Radius of the circle of allowable error. An error of up to this size stays unseen: it belongs into the error
+    #: Radius of the circle of allowable error. An error of up to this size is not detected: it is part of the error
     #: budget of the trains.
     radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
-    #: Largest deviation of the vector between two fixes from that between their points.
+    #: Largest deviation of the vector between two fixes from the vector between their points.
     side_m: float = option("Largest deviation of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
 
     @model_validator(mode="after")
@@ -75,9 +75,9 @@ class TriangleLimits(Settings):
 def limits_for_false_stops(
     sigma_m: float, own_sigma_m: float, *, stops_per_year: float, independent_s: float = 100.0
 ) -> TriangleLimits:
-    """Return the limits that give a rate of false stops a year.
+    """Return the limits for a number of false stops per year.
 
-    The length of a horizontal error of standard deviation sigma an axis is Rayleigh distributed:
+    The length of a horizontal error of standard deviation sigma per axis is Rayleigh distributed:
     ``P(e > R) = exp(-R^2 / (2 sigma^2))``. Half of the false stops are allotted to the three circles, half to the
     three sides; a year has as many independent samples as `independent_s` fit into it.
 
@@ -86,10 +86,10 @@ def limits_for_false_stops(
     sigma_m : float [m]
         Standard deviation of a fix per axis.
     own_sigma_m : float [m]
-        That of the part which the other receivers do not share; a side has it twice.
+        Standard deviation of the part not common to the other receivers; a side contains it twice.
     stops_per_year : float
     independent_s : float [s]
-        Time after which the errors of a fix are independent of those before.
+        Time after which the errors of a fix are independent of earlier errors.
 
     Raises
     ------
@@ -234,7 +234,7 @@ class MonitorState:
     stopped: bool = True  #: True before the first healthy period was released, and from a stop to its release.
     cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None at the start.
     receiver: int = -1  #: Receiver that the cause names, -1 where it names none.
-    since_s: float = 0.0  #: When the stop was given.
+    since_s: float = 0.0  #: Time of the stop.
     complete_s: float = 0.0  #: Time of the last set of three fixes.
     healthy_since_s: float | None = None  #: Start of the present healthy time.
 
@@ -250,7 +250,7 @@ def advance(
     now_s : float [s]
         Clock of the monitor, which never runs backwards (monotonic).
     verdict : TriangleVerdict or None
-        Of the newest fixes; None where nothing has come since.
+        Verdict on the newest fixes; None without new fixes.
     receiver : int
         Receiver that the verdict names.
     limits : MonitorLimits
@@ -332,7 +332,7 @@ class MonitoredLog:
 
 @dataclass(kw_only=True)
 class Monitor:
-    """Monitor of fixes in order of time, in pieces of any number of epochs; released at the start."""
+    """Monitor of fixes in order of time, in blocks of any number of epochs; released at the start."""
 
     limits: TriangleLimits
     times: MonitorLimits
@@ -346,8 +346,8 @@ class Monitor:
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
         """Process fixes at a clock time, by default each at its tag; return their verdicts with the orders to be sent.
 
-        Fixes that are late after those before stop the trains, in a log as in a stream.
-        The cause of an order is the one that the stop has at the end of the fixes: it may have become more exact.
+        Fixes that are late after the previous ones stop the trains, in a log as in a stream.
+        The cause of an order is the cause of the stop at the end of the fixes, which may have become more exact.
         SettingsError: the sides of the triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
@@ -364,7 +364,7 @@ class Monitor:
         return MonitoredLog(fixes=fixes, triangle=triangle, orders=latched)
 
     def silent(self, now_s: float) -> tuple[Order, ...]:
-        """Process that nothing has come since the last epoch; return the orders to be sent where it is late."""
+        """Process a time without new fixes; return the orders to be sent if fixes are late."""
         if now_s - self.state.complete_s <= self.times.late_s:
             return ()
         self.state, orders = advance(self.state, now_s, None, limits=self.times)

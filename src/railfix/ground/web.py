@@ -33,7 +33,7 @@ with needs_extra():
 EVENT_S: Final = 0.5
 #: A log-in ends after this time without an order [s].
 SESSION_S: Final = 1800.0
-#: Wrong passwords of an address within `WRONG_S` after which its log-ins are refused for that time.
+#: Number of wrong passwords of an address within `WRONG_S` after which its log-ins are refused for that time.
 MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
 #: A connection without a whole request for this time ends, at the latest after twice this time [s].
@@ -60,7 +60,7 @@ Order = Callable[..., str | None]
 class Sessions:
     """Log-ins of the page.
 
-    `password` is that of the operator ``""``; `others` are passwords by name, each of one person or interface.
+    `password` belongs to the operator ``""``; `others` are passwords by name, each of one person or interface.
     """
 
     password: str
@@ -71,7 +71,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None where the password is wrong, or too many of the address were."""
+        """Open a session and return its token; None if it is wrong, or after too many wrong ones."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
@@ -113,7 +113,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     newest: tuple[float, str, bool] | None = None
 
     def snapshot_text() -> tuple[str, bool]:
-        """Return the snapshot as JSON, and whether it is the last: made once for all who read within `EVENT_S`."""
+        """Return the snapshot as JSON, and whether it is the last: computed once for all readers within `EVENT_S`."""
         nonlocal newest
         now = time.monotonic()
         if newest is None or now - newest[0] >= 0.9 * EVENT_S:
@@ -215,7 +215,7 @@ async def _values(request: Request) -> dict[str, Any] | None:
 
 
 class _TimedProtocol(H11Protocol):
-    """HTTP whose connections end without a whole request, however slowly its bytes come.
+    """HTTP protocol that ends connections without a complete request, however slowly its bytes arrive.
 
     At most `MOST_IDLE` connections of a peer wait for a request: one more ends the longest waiting, so that a peer that
     opens many blocks neither others nor its own next request.
@@ -236,7 +236,7 @@ class _TimedProtocol(H11Protocol):
         self._look(waited=False)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the connection."""
+        """Drop the connection."""
         mine = self.waiting.get(self._peer, {})
         mine.pop(self, None)
         if not mine:
@@ -268,7 +268,7 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """Server of the page, at port 0 a free one; by TLS where a certificate and its key are given."""
+    """Server of the page; port 0 takes a free port, and TLS is used if a certificate and its key are given."""
 
     def __init__(
         self, app: Starlette, *, host: str = "127.0.0.1", port: int = 0, certificate: tuple[Path, Path] | None = None

@@ -1,6 +1,4 @@
-"""Commits to the store parallel to the centre's work: in a thread, one at a time, so that a hanging database delays
-only messages that wait for their commit.
-"""
+"""Commits to the store in a thread, one at a time, so that a hanging database delays only uncommitted messages."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ RETRY_S: Final = 1.0
 class ThreadWriter:
     """Executor of commits in a separate thread, which does not keep the process from ending.
 
-    `done` is called, in that thread, after each work.
+    `done` is called in that thread after each function.
     """
 
     def __init__(self, done: Callable[[], None] = lambda: None) -> None:
@@ -32,7 +30,7 @@ class ThreadWriter:
         self._thread.start()
 
     def submit(self, work: Callable[[], None]) -> Future[None]:
-        """Begin some work after that before; return its outcome."""
+        """Start a function after the previous one; return its outcome."""
         outcome: Future[None] = Future()
         self._queue.put((work, outcome))
         return outcome
@@ -50,7 +48,7 @@ class ThreadWriter:
 
 
 def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
-    """Do some work; return its outcome, which the future takes."""
+    """Run a function; set its outcome in the future and return it."""
     try:
         work()
     except Exception as error:  # noqa: BLE001 (the caller of `result` gets it)
@@ -64,10 +62,10 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
 class Commits:
     """Commits of the centre, one at a time, and their fault.
 
-    `alarm`: why the store rejects the state; nothing is granted meanwhile, but stops are sent.
+    `alarm` is the reason why the store rejects the state; nothing is granted meanwhile, but stops are sent.
     """
 
-    writer: ThreadWriter | None = None  #: Without one a commit is carried out at once.
+    writer: ThreadWriter | None = None  #: Executor; without one a commit is carried out at once.
     alarm: str | None = None
     _open: tuple[Future[None], Callable[[], None], float] | None = None
     _failed_s: float = float("-inf")
