@@ -1,14 +1,8 @@
-"""Protection level of the filtered position at every epoch, from a filter with sub-filters over epochs one second
-apart.
+"""Protection level of the filtered position at every epoch, from a filter with sub-filters over epochs a second apart.
 
 The bank of `railfix.tracking.bank` costs as many filters as there are satellites, and codes of neighbouring epochs have
-nearly the same errors. A second filter with the bank therefore processes one epoch per second. Let s and v be its
-position and speed, L and V their levels, tau the time since its last epoch, and a the largest acceleration. The error
-of the position p of the main filter is at most::
-
-    |p - s - v tau| + L + V tau + a tau^2 / 2
-
-with the sum of the risks of L and V; the risk of V is a hundredth of the risk of L.
+nearly the same errors. A second filter with the bank therefore processes one epoch per second. docs/filter-equations.md
+has the level that is carried to the epochs between; the bound of the speed uses a hundredth of its risk.
 """
 
 from __future__ import annotations
@@ -62,13 +56,11 @@ class AccumulatedIncrement:
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return the mask of selected epochs, the selected epochs with accumulated measurements, and the remainder after
-    them.
+    """Return the indices of selected epochs, these epochs with accumulated measurements, and the remainder after them.
 
-    The selected epochs are None if there is none. A carrier phase continues if it did so at all epochs between.
-    Distances between epochs are summed and forces averaged; balises belong to the next selected epoch; positions from
-    features and ranges to ground units are used at selected epochs only. `since` is the remainder of the previous
-    chunk.
+    A carrier phase continues if it did so at all epochs between. Distances between epochs are summed and forces
+    averaged; balises belong to the next selected epoch; positions from features and ranges to ground units are used at
+    selected epochs only. `since` is the remainder of the previous chunk.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since

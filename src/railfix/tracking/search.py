@@ -20,8 +20,7 @@ from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 #: Largest spacing of the points at which the line is searched; a Gaussian of `START_SIGMA_M` covers the positions
 #: between, and the code variance includes the error of a position between two points [m].
 _SPACING_M: Final = 15.0
-#: Required redundancy of codes beyond position and clocks for a search: with a redundancy of one a wrong position fits
-#: as well.
+#: Required redundancy of codes beyond position and clocks for a search: with one a wrong position fits as well.
 REDUNDANT: Final = 2
 #: Positions whose log likelihood is this far below the best get no hypothesis.
 _WORSE: Final = 25.0
@@ -275,10 +274,8 @@ def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
     """Add hypotheses slightly ahead of and behind separate hypotheses, the most probable first; return their number.
 
     Where a line turns back within some tens of metres, Dopplers fit travel forward on one leg and backward on the other
-    equally well, and equations linearised before the bend do not reach beyond it. If motion contradicts the position,
-    positions beyond the bend must therefore be tried, with any speed. Motion that contradicts the best hypothesis also
-    contradicts another lap of it, so each lap gets its own neighbouring positions; otherwise the other lap would lose
-    probability to them.
+    equally well, and equations linearised before the bend do not reach beyond it. Each lap gets its own neighbouring
+    positions, with any speed; otherwise another lap would lose probability to those of the best one.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

@@ -1,14 +1,8 @@
-"""Smoothed positions: the filter's estimates combined with all later measurements.
+"""Smoothed positions: the filter's estimates combined with all later measurements (docs/filter-equations.md).
 
-The adjoint form of the smoother (G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
-doi:10.1080/00207177308932424): the information of all later measurements on an epoch's unknowns is a vector l and a
-matrix L, and the smoothed mean and covariance are
-
-    mean + P l,   P - P L P
-
-l and L are propagated backward through updates and predictions without inverting a covariance. The measurement weights
-are the filter's; the hypotheses are those that led to the last one. Information from after the start of a hypothesis
-does not reach the epochs before it.
+The adjoint form: G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
+doi:10.1080/00207177308932424. The measurement weights are the filter's; the hypotheses are those that led to the last
+one. Information from after the start of a hypothesis does not reach the epochs before it.
 """
 
 from __future__ import annotations

@@ -93,8 +93,7 @@ class TrackState:
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     #: Time at which each was last measured; shape (N - ix.SATELLITES,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Mean normalised innovation of each satellite's codes (`railfix.kernels.tracking.adaptation`); shape (N -
-    #: ix.SATELLITES,).
+    #: Mean normalised innovation of each satellite's codes (`kernels.tracking.adaptation`); shape (N - ix.SATELLITES,).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
     #: Clocks that have had an observation; shape (len(ix.CLOCKS),).
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))

@@ -1,9 +1,8 @@
 """Adaptation to the measurements: phase and Doppler noise, doubt, length errors of the map, faulty satellites.
 
 The normalised innovations of a satellite's codes have a mean near 0 over a minute, even with reflections, which come
-and go. A wrong clock record or a persistent reflection gives innovations of constant sign. The mean of the innovations
-shows such a fault, and the satellite's codes are left out (`is_faulty`). Each innovation is clipped to one standard
-deviation, so that single large innovations have little effect.
+and go. A wrong clock record or a persistent reflection gives innovations of constant sign: their mean, each clipped to
+one standard deviation, shows the fault (`is_faulty`).
 """
 
 from __future__ import annotations

@@ -19,9 +19,7 @@ def before_measurements(
 ) -> tuple[Floats, Floats]:
     """Carry the information of later epochs on the unknowns backward through an epoch's measurements.
 
-    For one measurement with row h, innovation y and ``S = h' P h + r`` (G. J. Bierman, 1973)::
-
-        l = h y / S + (I - h g' / S) l          L = h h' / S + (I - h g' / S) L (I - g h' / S)          g = P h
+    docs/filter-equations.md has the formula of one measurement (G. J. Bierman, 1973).
 
     The measurements, shapes (M, N), (M,), (M,), are in the order of the filter and are processed backward from the
     last. P, shape (N, N), is the covariance before the measurements; `vector` and `matrix`, shapes (N,) and (N, N), are

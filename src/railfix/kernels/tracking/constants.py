@@ -34,16 +34,15 @@ OFFSET_PRIOR_M: Final = 30.0
 MAP_ROUGHNESS_M: Final = 0.3
 MAP_CORRELATION_M: Final = 50.0
 MAP_SCALE_M: Final = 0.03  #: Random walk of a length along the map [m per square root of m].
-#: Length over which the absolute error of the map changes; its sigma is the map's stated accuracy.
-MAP_ABSOLUTE_M: Final = 500.0
+MAP_ABSOLUTE_M: Final = 500.0  #: Length over which the absolute error of the map changes; its sigma is the map's.
 CODE_CLOCK_SIGMA_M: Final = 1e3  #: Prior standard deviation of the code clock about the median of an epoch [m].
 #: Random walks of the sensors' scale factors and offset, per square root of a second. A car's wheel scale factor
 #: changed by 2 % within half a minute in bends; an accelerometer's offset follows its temperature.
 WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
-#: Fraction of the map's height error that changes over `MAP_CORRELATION_M`. For the error across it is 1, because
-#: height errors of a survey or a terrain model extend over longer distances.
+#: Fraction of the map's height error that changes over `MAP_CORRELATION_M`; across it is 1. Height errors of a survey
+#: or a terrain model extend over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
 LEAST_STEP_M2: Final = 1e-6  #: Minimum variance of a step of position and of speed [m2, m2/s2].
 
@@ -80,7 +79,7 @@ SCALE_S: Final = 60.0  #: Time over which the scales of Dopplers and phases are 
 LEAST_SCALE: Final = -1.5
 LARGEST_SCALE: Final = 3.0
 #: Fractions of an interval by which the doubt timers of motion and of codes fall at an epoch without doubt. They are
-#: below 1, because weights that alternate about the limit are a contradiction as well.
+#: not reset, because weights that alternate about the limit are a contradiction as well.
 MOTION_LEAK: Final = 0.5
 CODE_LEAK: Final = 1.0
 
@@ -91,19 +90,15 @@ BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
 BIAS_SHORT: Final = -0.55
-#: Orbit, clock and ionospheric errors of a satellite last for hours; a mean innovation below this is no sign of a wrong
-#: map [m].
+#: Errors of orbit, clock and ionosphere last for hours: a smaller mean innovation is no sign of a wrong map [m].
 NOMINAL_M: Final = 0.8
 #: No protection level is given if more satellites than this are beyond `BIAS_FAULTY` and one of them is too short: the
 #: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
-#: Factor on the variance of codes that are left out; their innovations still show the end of the fault.
-BIAS_INFLATED: Final = 1e6
-#: Standard deviation added to the position when a satellite is left out, because its codes have affected the position
-#: so far [m].
+BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out; their innovations show the end.
+#: Standard deviation added to the position when a satellite is left out: its codes have affected it so far [m].
 INFLATED_M: Final = 15.0
-#: Satellites are not left out where all codes are off by more sigmas than this: the codes may have stepped together.
-INFLATED_SIGMAS: Final = 3.0
+INFLATED_SIGMAS: Final = 3.0  #: Not added where all codes are off by more sigmas: they may have stepped together.
 
 # Length errors of the map.
 #: Time over which codes must contradict the length (`TrackingLimits.map_misfit_sigmas`), and time constant with which
@@ -123,8 +118,7 @@ MISFIT_LARGEST: Final = 8.0
 SPEED_SIGMAS: Final = 4.0  #: A measured speed bounds the true speed within this many standard deviations.
 
 # Branches.
-#: Smallest distance of two branches at which half of their difference is attributed to the map: three times an error of
-#: 2 m.
+#: Smallest distance of two branches at which half of their difference counts as the map's: three errors of 2 m.
 MAP_BRANCH_M: Final = 6.0
 #: Standard deviation of the common code error across the line: reflections from one side of a street.
 CODE_COMMON_M: Final = 10.0
@@ -149,8 +143,7 @@ LOST_CODE_S: Final = 20.0
 #: Where motion contradicts the track, positions at this distance (and twice as far) ahead and behind are tried.
 BEND_M: Final = 20.0
 EXPIRED_SIGMA_M: Final = 200.0  #: Largest standard deviation of a predicted position.
-#: Probability ratio that another hypothesis must exceed to be reported; without it, nearly equal hypotheses would
-#: alternate.
+#: Probability ratio for another hypothesis to be reported; nearly equal hypotheses would alternate without it.
 SWITCH: Final = 3.0
 #: Laps within this many `MAP_BRANCH_M` of each other cannot be distinguished permanently. Among these the filter
 #: reports the lap that recent codes prefer: the mean over this time [s] of log odds that are clipped to this value.
@@ -161,14 +154,13 @@ RECENT_MOST: Final = 3.0
 MOST_ODDS: Final = 2.25
 #: Largest log odds from the motion of a second, or of an epoch; larger values are reflections.
 MOST_MOTION: Final = 5.0
-#: A leading hypothesis whose probability was recently below this value has taken over from others that all failed, so
-#: the position is searched for again. The minimum log probability recovers by `LEAST_RISE` per second. The rule does
-#: not apply in the first seconds, when all hypotheses are new.
+#: A leading hypothesis whose probability was recently below this value has taken over from others that all failed: the
+#: position is searched for again, but not in the first seconds, when all hypotheses are new. The minimum log
+#: probability recovers by `LEAST_RISE` per second.
 TAKEOVER: Final = -6.0
 LEAST_RISE: Final = 0.3
 TAKEOVER_AFTER_S: Final = 15.0
-#: Minimum numbers of satellites with phase or Doppler, and of codes, for an epoch's evidence: fewer fit any speed and
-#: position.
+#: Least numbers of satellites with phase or Doppler, and of codes, for evidence: fewer fit any speed and position.
 MOTION_SATELLITES: Final = 4
 MOTION_M: Final = 3.0  #: Travel that allows one unit of log odds from motion [m]; at rest the tangents do not differ.
 #: Time of contradicted motion [s] after which neighbouring positions are tried, and after which the track is lost
@@ -184,12 +176,10 @@ LEVEL_DOUBT_CODE_S: Final = 8.0
 #: a loss of track there is none for this time.
 LEVEL_START_S: Final = 15.0
 LEVEL_HOLD_S: Final = 5.0  #: Time from the last contradiction until the protection level is available again.
-#: The velocity is compared with the line at the position, and at this many position standard deviations, or metres,
-#: ahead and behind.
+#: The velocity is compared with the line at the position, and this many sigmas, or metres, ahead and behind.
 REACH_SIGMAS: Final = 2.0
 REACH_M: Final = 3.0
-#: Velocity error in addition to its covariance [m/s], and smallest error of the line's direction as a fraction of the
-#: speed.
+#: Velocity error besides its covariance [m/s], and least error of the line's direction as a fraction of the speed.
 VELOCITY_FLOOR_MPS: Final = 0.15
 DIRECTION_SHARE: Final = 0.03
 #: Cumulative sum of squared contradictions (E. S. Page, 1954): bound of one square, and decrement per second.
@@ -203,38 +193,31 @@ CONTRADICTION_TAKEN: Final = 60.0  #: Sum that is set after a takeover: larger t
 #: mean of the position shifts that codes imply, and log variance of the map's lengths (6 times the assumed error).
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
-#: Limit of the mean weight of Dopplers and phases over `MOTION_FIT_S`, below which they do not agree on a speed; it
-#: applies while no sensor on board measures the speed. A train that has passed a bend ahead of its estimated position
-#: appears to stand still.
+#: Least mean weight of Dopplers and phases over `MOTION_FIT_S` while no sensor on board measures the speed. With less
+#: they agree on no speed, as beyond a bend that the estimated position has not reached.
 MOTION_FIT: Final = 0.6
 MOTION_FIT_S: Final = 2.0
 #: A lateral map displacement, estimated by the sub-filter for a wrong map, is significant beyond this many of its
 #: standard deviations and metres.
 BESIDE_SIGMAS: Final = 4.5
 BESIDE_M: Final = 8.0
-#: New hypotheses give no bound until one of them has this probability, because the true position may not be among them
-#: yet.
+#: New hypotheses give no bound until one has this probability: the true position may not be among them yet.
 YOUNG: Final = 0.99
 YOUNG_HOLD_S: Final = 1.0
 #: All codes have stepped together if they imply a shift of more than this many standard deviations for this long [s].
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
-#: No protection level for this long after a step of all codes [s], because the position then depends on the codes
-#: alone.
-STEP_HOLD_S: Final = 300.0
+STEP_HOLD_S: Final = 300.0  #: No protection level for this long after a step of all codes, which lead the position.
 
 # Protection levels.
-#: Fraction of a distance without codes that may be in error: a worn wheel or a wrong diameter setting.
-SCALE_BOUND: Final = 0.02
+SCALE_BOUND: Final = 0.02  #: Fraction of a distance without codes that may be in error: a worn or wrong wheel.
 #: A source that is not measured needs no sub-filter once its effect has left the filter: position and standard
 #: deviation differ by less than this fraction of the standard deviation.
 JOINED: Final = 0.05
 #: The Newton iteration of the level ends at a step below this [m], or after this many steps.
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
-#: The risk of a pair of satellites below this fraction of the total is subtracted, instead of adding a term for the
-#: pair.
+#: The risk of a satellite pair below this fraction of the total is subtracted instead of adding a term for it.
 PAIR_SHARE: Final = 1e-3
-#: If less than this fraction of the position information remains without a pair, the position counts as undetermined.
-PAIR_LEFT: Final = 1e-3
+PAIR_LEFT: Final = 1e-3  #: With less of the position information left without a pair, nothing bounds the position.
 AHEAD: Final = 0.3  #: Smallest component of the line of sight along the track for a satellite ahead or behind.

@@ -32,20 +32,10 @@ def reweigh(
 ) -> None:
     """Update the branch probabilities, and their part due to codes, by the evidence of motion and codes.
 
-    With d the distance of a branch from the most probable one, the difference of the evidence is weighted by ``d^2 /
-    (d^2 + map_branch_m^2)``, because branches within the map error have the same range difference at every epoch.
-
-    Errors of the motion (Dopplers, phases, sensors) are correlated over seconds. The evidence of a second therefore
-    counts once at any epoch rate, and by at most `MOST_MOTION` per second. Its log odds are bounded by
-    ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2, and by one per `MOTION_M` of travel.
-
-    All satellites on one side of a street share code errors for minutes. The log odds of codes are bounded by ``n d^2 /
-    (2 CODE_COMMON_M^2)``, the information of n independent epochs with such an error; n is 1, plus one per
-    `CODE_COMMON_S` or `CODE_COMMON_TRAVEL_M`. The odds of a branch within `BRANCH_FLOOR_M` are never below
-    `BRANCH_FLOOR`, whatever the codes showed while the branches were further apart.
-
-    For laps within `ALIKE` times map_branch_m the recent evidence of codes is kept as `log_recent`; only `find_leading`
-    uses it.
+    The bounds of both are in docs/filter-equations.md. Branches within the map error have the same range difference at
+    every epoch. Errors of the motion are correlated over seconds, so that a second counts once at any epoch rate. All
+    satellites on one side of a street share code errors for minutes. For laps within `ALIKE` times map_branch_m the
+    recent evidence of codes is kept as `log_recent`; only `find_leading` uses it.
 
     `evidence` and `code_evidence`, shape (H,), are the log evidence of the motion, and of the codes given the motion;
     `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].

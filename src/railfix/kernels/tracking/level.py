@@ -1,14 +1,6 @@
-"""Protection level of the filtered position by solution separation over sub-filters, other branches and satellite
-pairs.
+"""Protection level of the filtered position by solution separation; its equation is in docs/filter-equations.md.
 
-Let s be the position and sigma its standard deviation, s_b and sigma_b those of sub-filter b, Q the upper tail of the
-normal distribution, and p_b the probability that source b is faulty or that an earlier fault is still in the filter.
-The level L solves::
-
-    2 Q(L / sigma) + sum over b of p_b [Q((L - |s - s_b|) / sigma_b) + Q((L + |s - s_b|) / sigma_b)] = risk
-
-of an independent error. Other branches and satellite pairs are further sources with their own probabilities. Every
-hypothesis thus uses the risk that it needs instead of an equal fraction (hypotheses of R. G. Brown and P. W. McBurney,
+Every hypothesis uses the risk that it needs instead of an equal fraction (hypotheses of R. G. Brown and P. W. McBurney,
 1988, allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, here for a filter instead of an epoch). The
 separation bounds the error and is not a test, because robust filters can converge to different modes without a fault.
 """
@@ -41,9 +33,7 @@ class Alternatives(NamedTuple):
 
 @inner
 def find_other_positions(given: Given, state: State) -> tuple[Alternatives, float]:
-    """Return all hypotheses except the first, and the probability of those further along the line than a level may
-    reach.
-    """
+    """Return the hypotheses except the first, and the probability of those beyond `start_separation_m`."""
     others = slice(1, state.monitors[0].hypotheses)
     along = np.abs(state.x[others, ix.ARC] - state.x[0, ix.ARC])
     sigma = np.sqrt(state.P[others, ix.ARC, ix.ARC])
@@ -62,11 +52,7 @@ def find_other_positions(given: Given, state: State) -> tuple[Alternatives, floa
 
 @inner
 def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple[float, float]:
-    """Return position and variance of a Gaussian for another prior sigma of the slow code error n.
-
-    The information on n changes by ``-d``, ``d = 1 / slow^2 - 1 / tilt^2``, so that the position is ``s + P_sn d n / (1
-    - d P_nn)`` and its variance ``P_ss + P_sn^2 d / (1 - d P_nn)``.
-    """
+    """Return position and variance of a Gaussian for another prior sigma of the slow code error."""
     less = 1.0 / slow_m**2 - 1.0 / tilt_m**2
     gain = P[ix.ARC, ix.SLOW_CODE] * less / (1.0 - less * P[ix.SLOW_CODE, ix.SLOW_CODE])
     return x[ix.ARC] + gain * x[ix.SLOW_CODE], P[ix.ARC, ix.ARC] + gain * P[ix.ARC, ix.SLOW_CODE]
@@ -120,12 +106,9 @@ def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level
 def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, float]:
     """Return the positions without both satellites of a pair, and the risk used by pairs that need no term.
 
-    Information is additive: the information on the position without both satellites is the sum of the information
-    without each, less the information with all in view. The standard deviation is mostly within a tenth of the value
-    from a filter without both; with few satellites it can be half of it.
-
-    Pairs need no term if they require less than the level so far, or if the position is undetermined without them, as
-    they are then unbounded.
+    Information is additive; the standard deviation is mostly within a tenth of the value from a filter without both,
+    with few satellites down to half of it. Pairs need no term if they require less than the level so far, or if nothing
+    bounds the position without them.
     """
     source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
     most = satellites * (satellites - 1) // 2
@@ -176,12 +159,9 @@ def find_unchecked(state: State) -> float:
 def write_level(given: Given, state: State, positions: Alternatives, unbounded: float, result: Record) -> None:
     """Write the level of the first hypothesis and its parts.
 
-    The level is infinite without sub-filters, and where unbounded satellite pairs are more probable than the risk. It
-    is also infinite where a sub-filter has been contradicted by its measurements for longer than
-    `constants.LEVEL_DOUBT_S`: the sub-filter has converged to a wrong position, or began where the fault of its source
-    had led the filter. Along the line the level is infinite where another position on the line, further away than a
-    level may reach, is more probable than the risk. The straight distance includes all branches and a laterally
-    displaced map.
+    The level is infinite without sub-filters, where one has been contradicted for longer than `LEVEL_DOUBT_S`, and
+    where unbounded satellite pairs are more probable than the risk; along the line also where a position further away
+    than a level may reach is. The straight distance includes all branches and a laterally displaced map.
     """
     parameters, source, first = given.parameters[0], state.source, len(state.hypothesis)
     others = find_other(state, ix.ALL_DOPPLERS)

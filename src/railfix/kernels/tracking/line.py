@@ -70,11 +70,9 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def excess_beyond_end(line: Record, arc: float, sigma: float) -> float:
-    """Return the distance of a position beyond an open end [m]; 0 within two of its standard deviations, which is
-    noise.
+    """Return the distance of a position beyond an open end [m]; 0 within two of its standard deviations.
 
-    Beyond the end the line is continued straight; a position held at the end would stand still while the train leaves
-    the map.
+    Beyond the end the line is continued straight: the train may leave the map.
     """
     excess = abs(min(max(arc, line.start_m), line.end_m) - arc)
     return excess if excess > 2.0 * sigma else 0.0

@@ -20,11 +20,9 @@ from railfix.kernels.tracking.subfilters import find_other
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the squared difference between measured velocity and velocity along the line, over its variance; NaN
-    without a velocity.
+    """Return the squared difference of the measured velocity from the line's, over its variance; NaN without one.
 
-    The difference is taken along and across the line, at the best of three positions within the position's standard
-    deviation.
+    It is taken along and across the line, at the best of three positions within the position's standard deviation.
     """
     epoch, line, x, P = given.epoch[t], given.line[0], state.x[h], state.P[h]
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance

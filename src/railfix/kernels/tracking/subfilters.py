@@ -67,13 +67,11 @@ def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
 
 @inner
 def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leading: int) -> None:
-    """Correct all sub-filters, already predicted to the epoch; `leading` is the correction of the leading hypothesis
-    `best`.
+    """Correct all sub-filters, predicted to the epoch; `leading` is the leading hypothesis, `best` its correction.
 
-    Each sub-filter has its own equations, because those of the filter do not apply where the line bends between the two
-    positions. A sub-filter that its own measurements contradict has converged to a wrong position and restarts. For a
-    source that the filter has not absorbed, the filter itself is the sub-filter. If all restart, a sub-filter with all
-    satellites in view restarts too, as the reference of the pairs, until it equals the filter.
+    Each has its own equations, because the line may bend between its position and the filter's. If its own measurements
+    contradict it, it restarts. The filter itself is the sub-filter of a source that it has not absorbed. If all
+    restart, a sub-filter with all satellites in view does too, for the pairs, until it equals the filter.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_other(state, ix.ALL_IN_VIEW)

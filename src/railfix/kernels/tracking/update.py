@@ -1,17 +1,8 @@
-r"""Sequential correction of Gaussians by the measurements of an epoch, with Student's t errors.
+"""Sequential correction of Gaussians by the measurements of an epoch, with Student's t errors.
 
-The measurements of an epoch depend on a Gaussian x ~ N(x, P) through Q quantities ``q = H x``: one per code, six of the
-motion that all phases and Dopplers share, one per sensor. A code or a sensor measures its quantity, a phase or a
-Doppler a sum of the six::
-
-    code, sensor      y_j = q_j + e_j                phase, Doppler    y_j = design_j q_motion + e_j
-
-with e_j ~ N(0, r_j / w_j). The weights w of Student's t follow from the residuals, and the residuals from the weights,
-in rounds of reweighting. Three properties keep this cheap, and no matrix is inverted:
-
-- the rounds correct the Gaussian of the quantities, N(0, H P H'), instead of the state;
-- at given weights all phases and Dopplers are equivalent to six rows ``T q_motion = z + N(0, I)`` (`compress`);
-- a Gaussian is corrected by one measurement after the other, each by a division (`correct`).
+The measurements depend on a Gaussian N(x, P) through the quantities ``q = H x`` of docs/filter-equations.md. Rounds of
+reweighting correct the Gaussian of the quantities, N(0, H P H'), instead of the state; all phases and Dopplers are
+compressed to six rows; and one measurement after the other is a division, so that no matrix is inverted.
 
 Named tuples of array views belong to one Gaussian: `Equations` has the measurements, `Fit` the results.
 """
@@ -185,11 +176,9 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the initial weights from the innovations over their variances without the clock; GNSS innovations less the
-    median of their kind.
+    """Write the initial weights from the innovations, of GNSS less the median of their kind.
 
-    The clocks are nearly unknown at the start of every epoch; a variance that included their prior would hide every
-    outlier.
+    Their variances are without the clocks, whose prior would hide every outlier.
     """
     covariance, without_clock = expected
     design, value, codes = equations.design, equations.value, rows.code.stop
