@@ -180,7 +180,7 @@ def _where(path: str, line: int) -> str:
 
 
 def _passed(time: Datetimes) -> tuple[Integers, Integers]:
-    """Return how many of the epochs before each one have later tags, and how many after it earlier ones."""
+    """Return the numbers of preceding epochs with later tags and of following epochs with earlier tags."""
     reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
     passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
     for step in range(1, reach + 1):

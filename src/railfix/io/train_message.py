@@ -62,7 +62,7 @@ class Unknown(IntFlag):
     """Unknown properties of the train."""
 
     FACING = 1  #: The orientation of the front end: `over_cm` and `under_cm` cover both directions.
-    FRONT_END = 2  #: Where the front end is: `chainage_cm` refers to the reference point, an antenna or its vehicle.
+    FRONT_END = 2  #: The front end: `chainage_cm` refers to the reference point, an antenna or its vehicle.
     LENGTH = 4  #: The train's length.
 
 

@@ -269,7 +269,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by a wheel if any, otherwise by Dopplers."""
+        """Return the distance travelled up to instants and its variance: by wheel if available, else by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

@@ -145,7 +145,7 @@ def _field(values: Floats) -> Strings:
 
 
 def _records(satellite: Strings, time: Datetimes, numbers: Floats) -> Strings:
-    """Format records: satellite, time, three clock fields, then four a line, blank ones at its end omitted."""
+    """Format records: satellite, time, three clock fields, then four per line, trailing blank fields omitted."""
     text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(numbers.T):
         if i >= 3 and i % 4 == 3:

@@ -58,7 +58,7 @@ class CycleSlipLimits(Settings):
 
     #: Longest interval that is bridged: the interval of a station's log, 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Limit of the phase change against its Doppler: constant part, and part in proportion to the interval. On real
+    #: Limit of the phase change against its Doppler, constant and in proportion to the interval. On real
     #: receivers at 1 Hz the median of the metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
     doppler_mps: float = Field(default=0.05, gt=0)
