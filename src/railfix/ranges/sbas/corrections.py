@@ -127,8 +127,7 @@ class SbasCorrections:
     def satellites(
         self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None
     ) -> SatelliteCorrections:
-        """Return the fast and long-term corrections of T epochs by K satellites; those that the mask does not know are
-        NOT_IN_MASK.
+        """Return the fast and long-term corrections of T epochs by K satellites; NOT_IN_MASK where not in the mask.
 
         A long-term correction is applied only if a record of `navigation` has its issue of data; otherwise the previous
         correction, of another issue, is tried. Without navigation data the newest correction is applied unchecked.
