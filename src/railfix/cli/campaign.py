@@ -70,11 +70,11 @@ def campaign(
 
     `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too.
 
-    Into DIR come `runs/train=A/day=2024-03-05/` with the files of `railfix run` for each run (together one
+    DIR receives `runs/train=A/day=2024-03-05/` with the files of `railfix run` for each run (together one
     hive-partitioned data set), `campaign.csv` with one row per run, and `campaign.html`, a page on all of them: lines,
     errors (with `reference`) and levels by run, and the worst ten epochs with their explanations. A run that fails is
     a row with its error.
-    Runs whose results are there, of the same inputs and settings, are not repeated.
+    Runs whose results exist, for the same inputs and settings, are not repeated.
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
@@ -103,7 +103,7 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print how many runs are done, earlier calls included, and the time left."""
+    """Print the number of finished runs, earlier calls included, and the remaining time."""
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} from before)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
@@ -117,7 +117,7 @@ _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 def _prepare_worker() -> None:
     """Let the signals that were blocked while a worker process began end it.
 
-    polars, once imported, takes the place of the default handlers, and ignores Ctrl-C.
+    polars, once imported, replaces the default handlers and ignores Ctrl-C.
     """
     for each in _ENDING:
         signal.signal(each, _end)
@@ -191,13 +191,13 @@ def benchmark(
         [sha256]
         "rover.rnx" = "2c26b46b..."
 
-    `positions` are those of other programs (RTKLIB, NMEA, CSV), moved to the nearest point of the line and judged by
-    the same code, as RTKLIB's single point is where `rnx2rtkp` is installed. `scenario` describes the recording as
-    EN 16803-2 requires for record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`.
-    A case with `held_out` is for the benchmark alone: settings that were made from its files are rejected.
+    `positions` are those of other programs (RTKLIB, NMEA, CSV), moved to the nearest point of the line and evaluated by
+    the same code, like RTKLIB's single point where `rnx2rtkp` is installed. `scenario` describes the recording as EN
+    16803-2 requires for record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`. A
+    case with `held_out` is for the benchmark alone: settings derived from its files are rejected.
 
-    Into DIR come `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that is
-    there, of the same inputs and settings, is not repeated.
+    DIR receives `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that exists,
+    for the same inputs and settings, is not repeated.
 
     Example: `railfix benchmark cases --out benchmark`
 
@@ -208,7 +208,7 @@ def benchmark(
 
 
 def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> None:
-    """Run the cases of a folder, and print the table, notes and files; errors as `benchmark`."""
+    """Run the cases of a folder, and print the table, notes and files; errors as for `benchmark`."""
     with open_executor(workers, None) as (executor, lost):
         prepare_kernels()
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
@@ -267,7 +267,7 @@ def ablate(
 
 
 def show_ablation(ablation: Ablation) -> None:
-    """One table an antenna, the notes, and where the results are."""
+    """Print one table per antenna, the notes, and the location of the results."""
     console = TableConsole()
     for antenna in dict.fromkeys(effect.antenna for effect in ablation.effects):
         _show(console, [effect for effect in ablation.effects if effect.antenna == antenna])

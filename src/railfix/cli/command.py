@@ -76,7 +76,7 @@ class Commands(TyperGroup):
     """A group whose commands end with one sentence and the exit code of the error's class."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; an error that the user can mend is reported in one sentence."""
+        """Run the command; an error that the user can fix is reported in one sentence."""
         try:
             _check_surroundings()
             with needs_extra(), warnings.catch_warnings():
@@ -122,7 +122,7 @@ class LazyCommands(Commands):
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that is called, imported; of an unknown one the nearest is named."""
+        """Return the command that is called, imported; for an unknown command the nearest name is suggested."""
         known = self.list_commands(ctx)
         word = args[0] if args else ""
         near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
@@ -182,7 +182,7 @@ def _end(error: RailfixError) -> NoReturn:
 
 
 def _check_surroundings() -> None:
-    """Raise where no command could work: no working directory, or names that are not text."""
+    """Raise an error where no command can work: no working directory, or names that are not text."""
     try:
         os.getcwd()  # noqa: PTH109
     except OSError:
@@ -196,7 +196,7 @@ def _check_surroundings() -> None:
 
 
 def _discard_output() -> None:
-    """Send the rest of the standard output nowhere, so that nothing fails when the program ends."""
+    """Discard the rest of the standard output, so that no error occurs when the program ends."""
     with suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())

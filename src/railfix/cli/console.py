@@ -69,7 +69,7 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
 
 
 def describe_errors(evaluation: Evaluation) -> str:
-    """Return how good the positions of a run are against its ground truth, in one sentence: the filter's positions
+    """Return the accuracy of a run's positions against its ground truth, in one sentence: the filter's positions
     where there are any, errors above their protection level, and the conventional positions.
     """
     rows = evaluation.figures.filter(
@@ -115,21 +115,21 @@ def _judge(row: Mapping[str, Any]) -> str:
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels that this machine has no code of, before a command needs them."""
+    """Compile the kernels without compiled code on this machine, before a command needs them."""
     if not kernels.is_compiled():
         import_module("railfix.live.warm_up").prepare_kernels()
 
 
 #: Width of tables where the output is no terminal, so that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
-#: Findings of a map printed before the rest is only counted.
+#: Number of map findings printed; further findings are only counted.
 MOST_FINDINGS: Final = 40
-#: Signs of a page in the characters of every terminal.
+#: Characters of a page replaced by characters of every terminal.
 _PLAIN: Final = str.maketrans("−–", "--")
 
 
 class TableConsole(Console):
-    """The standard output: text as it is; a table that is wider is printed in parts, and no number is cut or folded."""
+    """The standard output: text unchanged; a wider table is printed in parts, and no number is cut or folded."""
 
     def __init__(self) -> None:
         super().__init__(highlight=False, markup=False)
@@ -197,7 +197,7 @@ def show_table(console: Console, table: Table, *, most: int | None = None) -> No
 
 
 def show_verdict(console: Console, lines: Iterable[str]) -> None:
-    """Print the first lines of a command, and a blank one."""
+    """Print the first lines of a command, and a blank line."""
     for line in lines:
         console.print(line)
     console.print()
@@ -231,7 +231,7 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
     def show(*, epochs: int, fraction: float) -> None:
-        bar.start()  # its thread starts with the first epochs: a run forks before it has threads
+        bar.start()  # its thread starts with the first epochs: a run forks before it starts threads
         elapsed = bar.tasks[task].elapsed or 0.0
         bar.update(task, completed=fraction, epochs=epochs, rate=epochs / elapsed if elapsed > 0 else 0.0)
 

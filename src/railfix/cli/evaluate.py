@@ -51,13 +51,13 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Rows of sections, and epochs with an error beyond the level, that are shown; the files have all.
+#: Numbers of rows of sections, and of epochs with an error beyond the level, that are shown; the files have all.
 _MOST_SECTIONS: Final = 20
 _MOST_BEYOND: Final = 5
 
 
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
-    """Figures of each run, then by groups, then where the files are."""
+    """Print the figures of each run, then by groups, then the location of the files."""
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
     for run in evaluation.runs:
@@ -168,7 +168,7 @@ def reference(
     variances, and the closing error of each gap is distributed over it. Written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
-    - `fixes.csv`: every position with its verdict and measurements
+    - `fixes.csv`: every position with its test result and measurements
     - `reference.json`: versions, hashes of the inputs, settings given and used, counts by reason, gaps
 
     Gaps that are too long and instants of too large a standard deviation are left out, counted and named. All times are
@@ -186,7 +186,7 @@ def reference(
 
 
 def show_reference(summary: ReferenceSummary) -> None:
-    """Counts by antenna, the notes, and where the results are."""
+    """Print counts by antenna, the notes, and the location of the results."""
     for name, part in summary.built.items():
         source = part.reference.source
         counts = part.fixes.counts()

@@ -31,7 +31,7 @@ app = command_group("ground")
 
 @app.callback()
 def ground() -> None:
-    """Judge satellite positioning from the ground, and show the ground side at work.
+    """Monitor satellite positioning from the ground, and demonstrate the ground side.
 
     A reference triangle of three receivers finds satellite faults, disturbances and failed receivers; a control centre
     supervises trains over two encrypted links, gives each the distance it may run and sets points.
@@ -128,7 +128,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
     async def work() -> None:
         async for fixes in _fixes(logs, choices):
-            # recorded streams have the clock of their tags
+            # recorded streams use the clock of their time tags
             judged = monitor.judge(fixes, None if recorded else time.monotonic())
             choices.out.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if counts else "wb") as file:
@@ -182,7 +182,7 @@ async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[Stat
 
 
 class KeyChoices(Settings):
-    """Trains that get keys."""
+    """Trains for which keys are made."""
 
     train: tuple[int, ...] = option("Trains, from 1.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
@@ -285,7 +285,7 @@ def demo(choices: DemoChoices) -> None:
 
 
 class CentreChoices(Settings):
-    """Page of a centre, and its end."""
+    """Options of a centre's page, and duration of the session."""
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
@@ -355,7 +355,7 @@ def centre(
 
 
 class TrainChoices(Settings):
-    """A train's end of the links."""
+    """Options of a train's end of the links."""
 
     keys: Path = option("authority.pem and the train's own two files.", metavar="DIR")
     centre: tuple[str, ...] = option("Centre's address: of bearer A, then of B.", metavar="HOST:PORT")

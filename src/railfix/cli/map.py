@@ -40,7 +40,7 @@ TracksArgument = Annotated[
     typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."),
 ]
 
-#: Reading of a map for commands whose output does not depend on its accuracy.
+#: Options for reading a map, for commands whose output does not depend on its accuracy.
 PointsReading = Annotated[
     TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma", "plan_sigma")
 ]

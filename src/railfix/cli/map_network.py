@@ -29,9 +29,9 @@ from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 
-#: Settings of reading a track that only a run needs.
+#: Settings for reading a track that only a run needs.
 RUN_ALONE = ("reference", "cache")
-#: Reading of a map by itself.
+#: Options for reading a map alone.
 MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]
 
 
@@ -57,7 +57,7 @@ class RouteChoice(Settings):
 
 
 class Connecting(Settings):
-    """How tracks are connected, and how positions are matched to them."""
+    """Settings of track connections, and of matching positions to tracks."""
 
     tolerance: float = option(
         "Ends nearer than this are one point, where the file has no connections.", TOLERANCE_M, metavar="M", gt=0.0
@@ -70,7 +70,7 @@ class Connecting(Settings):
 
 
 class MatchOptions(Settings):
-    """How far from a track positions are expected, and what is written."""
+    """Expected distances of positions from a track, and outputs."""
 
     sigma: float | None = option(
         "Standard deviation of the distance from the track, map included; by default that of LOG, or one estimated "
@@ -212,7 +212,7 @@ def _route_tracks(
 def _in_frame_of(
     net: Network, log: PlanLog, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
-    """Return the positions of a log in the frame of the network, and a note on their shift."""
+    """Return the positions of a log in the network's frame, and a note on their shift."""
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)

@@ -98,7 +98,7 @@ def service(
 
 
 class SurveyFiles(Settings):
-    """Files given with the runs, and how they are read."""
+    """Files given with the runs, and options for reading them."""
 
     nav: tuple[Path, ...] = option(
         "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS

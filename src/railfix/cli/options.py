@@ -75,7 +75,7 @@ class _Option:
 
     @property
     def name(self) -> str:
-        """As written by the user."""
+        """The option as written by the user."""
         info = get_args(self.parameter.annotation)[1]
         return str(info.default)
 
@@ -302,7 +302,7 @@ def check_set_once(settings: tuple[str, ...]) -> None:
 
 
 def set_value(values: dict[str, Any], text: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
+    """Insert one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SettingsError(f"--set {text}: expected KEY=VALUE, for example elevation.mask_deg=15")

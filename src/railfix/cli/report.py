@@ -101,7 +101,7 @@ def report(
 
 
 def _free_arrays_at_once() -> None:
-    """Have the GNU C library return an array's memory as soon as it is freed; other libraries are unchanged.
+    """Let the GNU C library return an array's memory as soon as it is freed; other libraries are unaffected.
 
     By default malloc keeps freed arrays of up to 32 MB for reuse, which costs 50 MB in a long run.
     """

@@ -25,7 +25,7 @@ from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
 
-#: Time that a thread of a run has the interpreter for while others wait [s]: changes cost more than waiting.
+#: Time for which a thread of a run keeps the interpreter while others wait [s]: switches cost more than waiting.
 _TURN_S: Final = 0.05
 
 

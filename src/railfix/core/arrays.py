@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Instance = TypeVar("Instance")
 Rows = TypeVar("Rows", bound="DataclassInstance")
-Floats = NDArray[np.float64]  #: Real numbers in the unit that the name of the array ends with; NaN where absent.
+Floats = NDArray[np.float64]  #: Real numbers in the unit at the end of the array's name; NaN where absent.
 Complexes = NDArray[np.complex128]  #: Complex numbers.
 Integers = NDArray[np.int64]  #: Counts and identifiers.
 Indices = NDArray[np.intp]  #: Positions in another array.
@@ -94,7 +94,7 @@ def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
 
 
 def join_rows(parts: Sequence[Rows]) -> Rows:
-    """Return a dataclass with the rows of several concatenated, and the other fields of the first.
+    """Return a dataclass with the rows of several dataclasses concatenated, and the other fields of the first.
 
     ValueError: they do not have the same arrays.
     """
@@ -152,7 +152,7 @@ def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]
 def channel_sums(values: Floats) -> Floats:
     """Return sums over the channels, axis 1, added one after the other: channels of zeros do not change a bit.
 
-    So the sums of a log as a whole, with the channels of all its epochs, are those of its single epochs.
+    So the sums of a whole log, with the channels of all its epochs, equal the sums of its single epochs.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
 

@@ -1,7 +1,7 @@
 """State per channel across chunks, stored by channel key and age, independent of the channels of a chunk.
 
-A chunk has the channels that were observed in it: a live epoch may lack a satellite that the previous epoch had and the
-next one has again. A stage with a state per channel operates on the channels of the chunk and of its state.
+A chunk has the channels that were observed in it: a live epoch may lack a satellite that the previous and the next
+epoch have. A stage with a state per channel operates on the channels of the chunk and of its state.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedChannels:
-    """Channels of the chunk, then channels of the states that the chunk lacks; U in all."""
+    """Channels of the chunk, then channels of the states that the chunk lacks; U in total."""
 
     channel: Strings  #: Shape (U,).
-    present: int  #: Number of channels of the chunk, the first ones.
+    present: int  #: Number of channels of the chunk, which come first.
     #: Index of each channel in each state, -1 where the state does not have it; shape (U,) each.
     places: tuple[Indices, ...]
 

@@ -1,4 +1,4 @@
-"""Physical constants and signal frequencies, each with its unit and source; nothing is tuned."""
+"""Physical constants and signal frequencies, each with its unit and source; none is tuned."""
 
 from __future__ import annotations
 

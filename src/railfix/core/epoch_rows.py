@@ -12,7 +12,7 @@ import numpy as np
 from railfix.core.arrays import Indices
 
 Value = TypeVar("Value")
-#: Members that are the same for all rows: of the channels alone.
+#: Members that are the same for all rows, because they depend on the channels alone.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
 EVERY: Final = slice(None)  #: All rows.
 
@@ -80,7 +80,7 @@ def _take_epochs(value: Any, rows: slice | Indices) -> Any:
     own, members = value.__dict__, dict[str, Any]()
     if isinstance(value, OnDemand):
         members = {n: item[rows] for n, item in own.items() if item.__class__ is np.ndarray and has_rows[n]}
-        for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field is to be taken
+        for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field has not been taken yet
             members[name] = _take_epochs(own[name], rows)
         members["_later"] = lambda n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)
         return _make(type(value), members)

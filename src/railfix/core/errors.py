@@ -1,6 +1,6 @@
 """The errors that railfix raises, and the exit code of the command line for each.
 
-Every message is one sentence: the file (and line or field), what was expected, and what to do.
+Every message is one sentence: the file (and line or field), the expected content, and the remedy.
 Array functions raise `ValueError` when their contract is violated.
 
 ==== =====================================================================
@@ -82,7 +82,7 @@ _MAKERS: Final = {
 
 
 def check_type(value: object, expected: type, what: str) -> None:
-    """Raise SettingsError where an argument is not of the expected type; it names the function that returns one."""
+    """Raise SettingsError where an argument is not of the expected type; it names the function for that type."""
     if not isinstance(value, expected):
         maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")

@@ -1,6 +1,6 @@
 """Files from receivers and archives: plain, gzip, compress (.Z), bzip2, xz, zstd, zip; Hatanaka; commit of the source.
 
-The first bytes of a file decide how it is read, never its name. Memory is bounded: plain and gzip are streamed,
+The first bytes of a file determine how it is read, never its name. Memory is bounded: plain and gzip are streamed,
 compress is unpacked to a temporary file by `ncompress`, Hatanaka is piped through ``crx2rnx`` (a packed CRX file by a
 temporary file).
 """
@@ -163,7 +163,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             raise InputFileError(path, "is empty")
         if content == "text" and head.startswith(_UTF16):
             source = _as_utf8(path, source, held)
-        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # at the end a power cut leaves them
+        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # a power cut leaves them at the end
             raise InputFileError(path, "is binary, a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)

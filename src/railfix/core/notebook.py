@@ -58,7 +58,7 @@ def median_text(values: Floats) -> str:
 
 
 def value_text(value: Any) -> str:
-    """Return one line about a value: arrays by shape, type and range, containers by length.
+    """Return a value in one line: arrays by shape, type and range, containers by length.
 
     >>> value_text(np.array([1.0, np.nan, 3.0]))
     'float64 (3), 1 to 3, 33 % NaN'

@@ -1,4 +1,4 @@
-"""Forms in which files are packed, by their first bytes: gzip, bzip2, xz, zstd, compress, zip."""
+"""Compression formats, detected by the first bytes of a file: gzip, bzip2, xz, zstd, compress, zip."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FilePath = str | PathLike[str]
 
 
 def _zstd() -> Any:
-    """Return the zstd module: that of the standard library (3.14), or its backport."""
+    """Return the zstd module of the standard library (3.14), or its backport."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 

@@ -15,7 +15,7 @@ from railfix.core.notebook import html_table
 
 
 def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
-    """Return names that are close to a known one but not it, with that one.
+    """Return unknown names that are close to a known name, each with that name.
 
     Examples
     --------
@@ -55,7 +55,7 @@ class Settings(BaseModel):
             raise SettingsError(f"{type(self).__name__} cannot be changed; Config().replaced() keeps all settings")
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Yield the settings that differ from their defaults, of which some are computed from the settings before."""
+        """Yield the settings that differ from their defaults; some defaults are computed from earlier settings."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         for name, field in type(self).model_fields.items():
             value = values[name]
@@ -70,7 +70,7 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _as_written(cls, value: Any, info: ValidationInfo) -> Any:
-        """Reject true and false for a number, which pydantic takes for 1 and 0; take words or a path for a list.
+        """Reject true and false for a number, which pydantic accepts as 1 and 0; accept words or a path for a list.
 
         Words have commas between them: ``systems=G,E``.
         """
@@ -122,7 +122,7 @@ def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> M
 
 
 def first_fault(model: type[BaseModel], error: ValidationError) -> str:
-    """Return the sentence for the first fault: the setting, the expected value, the known or intended name."""
+    """Return the message for the first fault: the setting, the expected value, the known or intended name."""
     # a misspelt name is reported before the name that is missing because of it
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"] if part != "[key]")

@@ -1,4 +1,4 @@
-"""Paths, and files that are written whole or not at all."""
+"""Paths, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
         raise write_error(target, error, what=f"the {what} ") from error
 
 
-#: Errors of a file system without space, and what to do.
+#: Errors of a full file system, and the remedy.
 _FULL: Final = {
     errno.ENOSPC: "free some space on the disk, or name a folder on another",
     errno.EDQUOT: "free some of your quota, or name a folder elsewhere",
@@ -48,7 +48,7 @@ _FULL: Final = {
 
 
 def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
-    """Return the error of a file that cannot be written: the system's reason, and what to do."""
+    """Return the error of a file that cannot be written: the system's reason, and the remedy."""
     hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
     return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 

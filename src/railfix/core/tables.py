@@ -45,7 +45,7 @@ def share(part: float | None, digits: int = 2) -> str:
 
 
 def percent(part: float | None) -> str:
-    """Return a fraction in per cent, for a column whose head has the sign."""
+    """Return a fraction in per cent, for a column whose header has the sign."""
     return share(part).removesuffix(" %")
 
 
@@ -66,9 +66,9 @@ class Table:
     #: Columns of numbers, of code.
     numeric: Sequence[int] = ()
     code: Sequence[int] = ()
-    marked: Sequence[int] = ()  #: Rows that are highlighted.
+    marked: Sequence[int] = ()  #: Highlighted rows.
     links: Sequence[str] = ()  #: Address of the page on each row, blank without one; empty where no row has one.
-    boxed: bool = False  #: A terminal draws a frame around it.
+    boxed: bool = False  #: Whether a terminal draws a frame around it.
 
 
 def plain_table(
@@ -78,7 +78,7 @@ def plain_table(
     return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 
-Column = tuple[str, str, Callable[[Any], str]]  #: Head, column and format of a column of a table.
+Column = tuple[str, str, Callable[[Any], str]]  #: Header, source column and format of a table column.
 
 
 def listing(

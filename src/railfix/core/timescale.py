@@ -107,7 +107,7 @@ def gpst_to_utc(time: ArrayLike) -> Datetimes:
 
 
 def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
-    """Return the row of rising times nearest to each requested one, the earlier of two; -1 where none is near."""
+    """Return the row of rising times nearest to each requested time, the earlier of two; -1 where none is near."""
     have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
     if not len(have):
         return np.full(len(want), -1, dtype=np.intp)
@@ -118,7 +118,7 @@ def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indic
 
 
 def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Resolve the day of seconds of day, in any scale: the time nearest to another one of that scale."""
+    """Resolve the day of seconds of day, in any scale: the time nearest to another time of that scale."""
     other = np.asarray(near, dtype="datetime64[ns]")
     same_day = other.astype("datetime64[D]").astype("datetime64[ns]") + timedelta(second_of_day)
     days = np.rint(seconds(other - same_day) / SECONDS_PER_DAY).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Effect of each screen and of each source of the filter: the logs are read once, processed with every choice."""
+"""Effect of each screen and of each source of the filter: the logs are read once and processed with every choice."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from railfix.tracking import TrackStatus
 
 #: Names of the choices with all screens and with none, and of the filter along the track.
 ALL, NONE, FILTER = "all", "none", "filter"
-#: Sensors with the inputs that they need.
+#: Sensors with their required inputs.
 _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
     "wheel": ("tachometer",),
     "radar": ("radar",),
@@ -51,7 +51,7 @@ _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Rates and errors of one antenna with one choice of screens, or of sources of the filter along the track."""
+    """Rates and errors of one antenna with one choice of screens, or of filter sources."""
 
     choice: str  #: "all", "none", "only raim", "without raim"; "filter", "filter without phase".
     #: Active screens; sources of the filter along the track, empty for single epochs.
@@ -65,12 +65,12 @@ class Effect:
     ok_rate: float
     n_used: float  #: Satellites used, mean over the epochs.
     sigma_p50_m: float  #: Median of the standard deviation along the line, of the epochs with coordinates.
-    #: Errors of all positions, of those with status ok, and of the conventional position from the same ranges; None
+    #: Errors of all positions, of positions with status ok, and of the conventional position from the same ranges; None
     #: without a reference.
     coordinates: Score | None = None
     ok: Score | None = None
     conventional: Score | None = None
-    #: Errors at the epochs without observations, such as those in tunnels; None where no epoch has them.
+    #: Errors at epochs without observations, such as in tunnels; None where there are no such epochs.
     outage: Score | None = None
     #: 95th percentile of the error size over the standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
@@ -112,7 +112,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of the filter's sources by name: all that are there, all but each; codes are always used."""
+    """Return the choices of the filter's sources by name: all available, all but each; codes are always used."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {
@@ -246,7 +246,7 @@ def _columns(
 
 
 def _effect(choice: str, config: Config, antenna: str, parts: Sequence[Mapping[str, Floats]]) -> Effect:
-    """Return the effect of one choice on one antenna; MismatchError where reference and log have no time in common."""
+    """Return the effect of one choice on one antenna; MismatchError where reference and log do not overlap in time."""
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     counts = columns["counted"] > 0
     if not counts.any():

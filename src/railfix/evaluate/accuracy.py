@@ -19,7 +19,7 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.reasons import Status
 from railfix.evaluate.evaluation_inputs import EvaluationOptions, floats
 
-#: Distance on the map from which on a position counts as wrong [m].
+#: Distance on the map beyond which a position counts as wrong [m].
 WRONG_PLACE_M = 50.0
 #: Error sizes; the fraction of errors above each is counted [m].
 OVER_M: Final = (5, 10, 20, 50)
@@ -30,7 +30,7 @@ class Score:
     """Figures of merit of a run."""
 
     epochs: int  #: Epochs with observations inside the time of the reference.
-    positions: int  #: Those with coordinates.
+    positions: int  #: Epochs with coordinates.
     rate: float  #: positions / epochs.
     #: Statistics of the signed error.
     mean_m: float
@@ -158,7 +158,7 @@ POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Names while they are grouped by: many rows, few words.
+#: Type of the name columns while grouping: many rows, few distinct names.
 WORDS: Final = pl.Categorical()
 #: Value in place of a name for all groups together.
 ALL: Final = "all"
@@ -209,7 +209,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
 }
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
-#: Columns of the epochs from which the figures are computed, besides the keys.
+#: Columns of the epochs from which the figures are computed, in addition to the keys.
 USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
@@ -247,7 +247,7 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
 
 
 def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
-    """Return how many of the edges a value has reached."""
+    """Return the number of edges that a value has reached."""
     return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
 
 
@@ -324,7 +324,7 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
-    """Return the value of a column where another is largest, the first of equals; null where all of that are null."""
+    """Return the value of a column where another is largest, the first of equals; null where the other is all null."""
     return pl.col(column).get(pl.col(by).arg_max())
 
 

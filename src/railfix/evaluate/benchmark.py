@@ -66,7 +66,7 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:
-    """Return positions of another program as a table of a run, moved to the nearest point of the line."""
+    """Return another program's positions as a table of a run, moved to the nearest point of the line."""
     time = epochs["time_gpst"].to_numpy()
     row = rows_at_epochs(time, log.time)
     has = row >= 0
@@ -93,7 +93,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 
 
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
-    """Write positions of another program as the folder of a run; `run` is railfix's on the same log."""
+    """Write another program's positions as the folder of a run; `run` is railfix's run on the same log."""
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
@@ -144,7 +144,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
 
 
 def _unpack(paths: Sequence[Path], folder: Path, kind: str) -> list[Path]:
-    """Write files uncompressed, as RTKLIB reads them; return where."""
+    """Write files uncompressed, as RTKLIB reads them; return their paths."""
     unpacked = {folder / f"{number}.{kind}": path for number, path in enumerate(paths)}
     for target, path in unpacked.items():
         target.write_bytes(read_bytes(path))
@@ -209,8 +209,7 @@ def run_benchmark(
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Run the cases of a folder with one configuration, and evaluate them with other programs; return
-    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out
-    cases.
+    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings derived from held-out cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)
@@ -302,7 +301,7 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
 
 
 def heads() -> tuple[list[str], list[str]]:
-    """Return the heads of the table for readers, and the performance feature of EN 16803-1 of each column."""
+    """Return the headers of the table for readers, and each column's performance feature of EN 16803-1."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
 
 
@@ -322,7 +321,7 @@ def shown_rows(table: pl.DataFrame) -> list[list[str]]:
 
 
 def markdown_table(table: pl.DataFrame) -> str:
-    """Return the table in Markdown; the second line of the heads has the features of EN 16803-1."""
+    """Return the table in Markdown; the second header line has the features of EN 16803-1."""
     names, features = heads()
     lines = [names, ["---", "---", *["---:"] * len(_SHOWN)], ["EN 16803-1", "", *features[2:]], *shown_rows(table)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -17,14 +17,14 @@ from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
-#: File that makes a folder a case.
+#: File that marks a folder as a case.
 CASE_FILE: Final = "case.toml"
 #: Files of a run that are settings: all cases share one configuration.
 _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
 
 class OtherPositions(Settings):
-    """Positions of another program: RTKLIB, NMEA, CSV or another kind of `railfix.io.positions.read_positions`."""
+    """Another program's positions: RTKLIB, NMEA, CSV or another kind of `railfix.io.positions.read_positions`."""
 
     file: Path
     antenna: Antenna = "front"
@@ -51,10 +51,10 @@ class RecordedScenario(Settings):
 class CaseFile(Settings):
     """Content of ``case.toml``; files are relative to its folder."""
 
-    #: Licence of the data; how to get them.
+    #: Licence of the data; how to obtain them.
     licence: str = Field(min_length=1)
     fetch: str = Field(min_length=1)
-    held_out: bool  #: The case is for the benchmark alone: no test reads it and no setting was chosen with it.
+    held_out: bool  #: The case is for the benchmark alone: no test uses it and no setting was chosen with it.
     files: RunInputs  #: Options of `railfix run`, with the ground truth as `truth`.
     sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its name there.
     positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
@@ -79,7 +79,7 @@ class Case:
     truth: Path
 
     def check_hashes(self) -> None:
-        """Raise InputFileError where a file differs from that of the case, SettingsError where it has no hash."""
+        """Raise InputFileError where a file differs from the case's file, SettingsError where it has no hash."""
         for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
@@ -119,7 +119,7 @@ def write_case(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases in the subfolders of a folder, or the one in the folder itself, by name (`read_case`)."""
+    """Read the cases in the subfolders of a folder, or the case in the folder itself, by name (`read_case`)."""
     if not folder.is_dir():
         raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
     folders = (

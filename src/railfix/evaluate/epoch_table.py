@@ -55,13 +55,13 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "block": "block of time within the run, for confidence limits",
 }
 
-#: Rows of filter tables, which state a probability for every position.
+#: Condition for rows of filter tables, which state a probability for every position.
 OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaEpochs:
-    """Epochs of one antenna, with facts on their evaluation."""
+    """Epochs of one antenna, with information on their evaluation."""
 
     #: `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
     table: pl.DataFrame
@@ -69,7 +69,7 @@ class AntennaEpochs:
     errors: PlaceErrors
     speed_from: str
     outside: int  #: Epochs of the log outside the reference.
-    step_s: float  #: Step of the log.
+    step_s: float  #: Interval of the log.
     from_sections: int  #: Epochs with a reference whose environment comes from the sections.
 
 
@@ -86,7 +86,7 @@ def protection_columns(table: pl.DataFrame) -> list[str]:
 
 
 def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Concatenate tables; levels are null where a table has none. The tables are taken apart column by column."""
+    """Concatenate tables; levels are null where a table has none. The tables are consumed column by column."""
     schema = {name: kind for table in tables for name, kind in table.schema.items()}
     lengths = [len(table) for table in tables]
     columns = []
@@ -100,7 +100,7 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Return the epochs of a log with those missing in gaps over 1.5 steps, which are of it, and its step [s]."""
+    """Return the epochs of a log and those missing in gaps over 1.5 intervals, which are logged, the interval [s]."""
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
     gap = seconds(np.diff(time))
@@ -148,7 +148,7 @@ def antenna_epochs(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> AntennaEpochs:
-    """Return the epochs of one antenna of a run with their errors; MismatchError: no time in common, no errors."""
+    """Return the epochs of one antenna of a run with their errors; MismatchError: no overlap in time, no errors."""
     mine = run.positions.filter(pl.col("antenna") == antenna)
     time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())
     own = _OwnColumns(mine, np.where(logged, np.cumsum(logged) - 1, len(mine)))
@@ -209,10 +209,10 @@ def antenna_epochs(
 
 
 class _OwnColumns(NamedTuple):
-    """Columns of the positions of one antenna, on the epochs of its log and the missing ones between them."""
+    """Columns of one antenna's positions, on the epochs of its log and the missing epochs between them."""
 
     table: pl.DataFrame
-    rows: Indices  #: Row of the table for each epoch; its length for a missing one.
+    rows: Indices  #: Row of the table for each epoch; the length of the table for a missing epoch.
 
     def floats(self, name: str) -> Floats:
         """Return a column of numbers, NaN for missing epochs."""
@@ -224,7 +224,7 @@ class _OwnColumns(NamedTuple):
         return pl.concat([texts, pl.Series([None], dtype=pl.String)])[self.rows]
 
     def answers(self, reference_chainage_m: Floats, reference_ecef_m: Floats) -> Answers:
-        """Return the positions of the run with those of a reference, NaN for missing epochs."""
+        """Return the positions of the run with the reference positions, NaN for missing epochs."""
         return Answers(
             chainage_m=self.floats("chainage_m"),
             conventional_chainage_m=self.floats("conventional_chainage_m"),
@@ -256,7 +256,7 @@ def _levels(run: RunFolder, own: _OwnColumns) -> dict[str, Any]:
 
 
 def _steps(values: Floats, known: Masks) -> Floats:
-    """Return the lengths of the steps between known positions: differences of chainage, or straight distances."""
+    """Return the distances between successive known positions: differences of chainage, or straight distances."""
     step = np.diff(values[known], axis=0)
     return np.abs(step) if step.ndim == 1 else np.asarray(np.linalg.norm(step, axis=1))
 

@@ -31,7 +31,7 @@ from railfix.evaluate.intervals import branch_table, interval_table, level_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
 
-#: Names of a reference that is searched for in the folder of a run's log.
+#: File names of a reference that are looked for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
 #: Columns of the positions that are evaluated in addition to the error columns of every table.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
@@ -48,16 +48,16 @@ class RunAndReference:
 
     run: Path
     reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` in the folder of the run's log.
-    configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
+    configuration: str | None = None  #: Name of its settings; None: the settings that differ between the runs.
     table: str = POSITIONS_TABLE  #: See `railfix.evaluate.evaluation_inputs.list_position_tables`.
     #: Another run on the same log, whose conventional positions replace the run's own: a run with the elevation and
-    #: C/N0 screens alone has those that P1 compares with.
+    #: C/N0 screens alone has the conventional positions that P1 compares with.
     conventional: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """Facts on the evaluation of one run: name, configuration and line as in the tables."""
+    """Information on the evaluation of one run: name, configuration and line as in the tables."""
 
     name: str
     configuration: str
@@ -69,7 +69,7 @@ class EvaluatedRun:
     method: Mapping[str, str]
     speed_from: Mapping[str, str]
     outside: Mapping[str, int]  #: Epochs of the log outside the reference, by antenna.
-    step_s: Mapping[str, float]  #: Step of the log, by antenna.
+    step_s: Mapping[str, float]  #: Interval of the log, by antenna.
     protection: Mapping[str, Any]  #: Basis of its protection levels, from ``run.json``.
     settings: Mapping[str, Any]
     inputs: tuple[Mapping[str, Any], ...]  #: Files that were read, with size and hash.
@@ -81,7 +81,7 @@ class Evaluation(NotebookTable):
     """Evaluation of runs against reference trajectories."""
 
     runs: tuple[EvaluatedRun, ...]
-    epochs: pl.DataFrame  #: One row an epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
+    epochs: pl.DataFrame  #: One row per epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
     figures: pl.DataFrame  #: Figures of every grouping: `FIGURE_COLUMNS`.
     intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
     levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None where no run has a protection level.
@@ -131,8 +131,8 @@ def evaluate_runs(
     `sections`: the environment by chainage (``from_m,to_m,environment``) where a reference does not state it. `files`:
     replacements of the track and the vehicle that ``run.json`` names.
 
-    InputFileError: a file is missing, or has other content than expected. MismatchError: a run and its reference have
-    no time in common, or the errors cannot be computed as requested. SettingsError: the same run twice, or none.
+    InputFileError: a file is missing, or its content is not as expected. MismatchError: a run and its reference do not
+    overlap in time, or the errors cannot be computed as requested. SettingsError: the same run twice, or none.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
@@ -183,7 +183,7 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Return one run, not yet named, the epochs of its antennas, and its level; a reference is kept in `read`."""
+    """Return one run, not yet named, its antennas' epochs, and its level; a reference is kept in `read`."""
     folder = read_run(item.run, table=item.table, conventional=item.conventional, columns=_COLUMNS)
     kind = folder.level_kind if "protection_level_m" in folder.positions.columns else None
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
@@ -308,7 +308,7 @@ def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """Return the names of folders, with as many parent folders as distinguish different ones."""
+    """Return the names of folders, with as many parent folders as needed to distinguish them."""
     parts = [path.resolve().parts for path in paths]
     depth = 1
     while len({part[-depth:] for part in parts}) < len(set(parts)):
@@ -329,7 +329,7 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Yield rows of each value of a column, then the same with both antennas as one; columns `as_one` have `ALL`."""
+    """Yield the rows of each value of a column, then with both antennas combined; columns `as_one` have `ALL`."""
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):
             yield epochs.filter(pl.col(by) == value).with_columns(pl.lit(ALL).alias(key) for key in keys)

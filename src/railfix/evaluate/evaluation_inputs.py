@@ -24,9 +24,9 @@ from railfix.pipeline.level_stage import KINDS
 from railfix.run.inputs import ColumnNames
 from railfix.run.record import RunRecord, read_parquet, read_record
 
-#: Columns that every table of positions has.
+#: Common columns of all tables of positions.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
-#: No columns beyond those that every table has.
+#: No columns beyond the common columns of all tables.
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
@@ -72,12 +72,12 @@ class RunFolder(RunRecord):
 
     @property
     def track_facts(self) -> Mapping[str, Any]:
-        """Facts on the track that the run used."""
+        """Information on the track used by the run."""
         return dict(self._line.get("track") or {})
 
     @property
     def tracks(self) -> list[Path]:
-        """Files of the track: those in the folder if the run moved, joined or raised it, otherwise its inputs."""
+        """Files of the track: in the folder if the run moved, joined or raised the track, otherwise its input files."""
         name = self.track_facts.get("file")
         return [self.path / str(name)] if name else self.input_paths("track")
 
@@ -245,8 +245,7 @@ Method = Literal["chainage", "trajectory"]
 
 #: Longest gap of a reference that is interpolated over [s].
 LARGEST_GAP_S: Final = 2.5
-#: Windows of continuity [s]: 15 s is the window of an approach in aviation, a minute the run from one station to the
-#: next.
+#: Windows of continuity [s]: 15 s as for an approach in aviation, a minute as for the run between two stations.
 WINDOWS_S: Final = (15.0, 60.0)
 
 
@@ -338,10 +337,10 @@ class EvaluationOptions(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Sections:
-    """S stretches of the line, rising, none over another."""
+    """S stretches of the line, in rising order, without overlap."""
 
     path: Path
-    #: Chainage; the end belongs to the next one; shape (S,).
+    #: Chainages; the end belongs to the next stretch; shape (S,).
     from_m: Floats
     to_m: Floats
 

@@ -22,13 +22,13 @@ LevelsOf = Literal["usable", "all"]
 
 #: Choices of levels, see above.
 LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
-#: Parts of a level, and its cause and status, by their names without "protection_".
+#: Parts of a level, its cause and its status, by their names without "protection_".
 PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
 STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
 #: Columns of the epochs for a Stanford diagram, besides the level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
-#: Statuses whose level is a bound: a coasting filter states one and raises no alarm.
+#: Statuses whose level is a bound: a coasting filter has a level and raises no alarm.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -40,7 +40,7 @@ _REGIONS: Final = {
     Region.NO_POSITION: "no_position",
 }
 
-#: Columns of the table of counts besides its keys, with their meaning.
+#: Columns of the table of counts in addition to its keys, with their meaning.
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
@@ -168,7 +168,7 @@ def _sort(
 
 
 def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
-    """Judge levels against errors by kind, of all runs at all alarm limits; empty where no run has levels."""
+    """Compare levels with errors by kind, for all runs at all alarm limits; empty where no run has levels."""
     own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})
     by_kind = {}

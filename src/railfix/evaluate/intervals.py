@@ -24,7 +24,7 @@ from railfix.evaluate.accuracy import (
 from railfix.evaluate.epoch_table import OF_FILTER, level_columns
 from railfix.evaluate.evaluation_inputs import RunFolder, list_position_tables, read_run
 
-#: Columns of the table of intervals besides its keys, with their unit and meaning.
+#: Columns of the table of intervals in addition to its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "position": "`constrained`, `constrained_ok` or `conventional`",
     "intervals": "pairs of consecutive positions between which the train moved",
@@ -102,7 +102,7 @@ def _seconds(duration: pl.Expr) -> pl.Expr:
 #: Shorter losses of all satellites are not listed [s].
 LEAST_S: Final = 2.0
 
-#: Columns of the table of stretches without satellites besides its keys, with their unit and meaning.
+#: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "begin_gpst": "first epoch without a satellite used, GPS time",
     "duration_s": "from the last epoch with a satellite to the last without",
@@ -163,7 +163,7 @@ _EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 
 _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
 
-#: Columns of the table of probabilities besides its keys, with their unit and meaning.
+#: Columns of the table of probabilities in addition to its keys, with their unit and meaning.
 BRANCH_COLUMNS: Final[dict[str, str]] = {
     "probability": "class of the stated probability of the branch; `all` for every epoch",
     "judged": "positions of the class with an error",
@@ -176,7 +176,7 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
 
 
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Return the stated probability and the fraction of right positions, by class; None without the filter."""
+    """Return the stated probability and the fraction of correct positions, by class; None without the filter."""
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -198,7 +198,7 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     return table.sort(*KEYS, "rank", maintain_order=True).select(*KEYS, *BRANCH_COLUMNS)
 
 
-#: Columns of the table of levels besides its keys, with their unit and meaning.
+#: Columns of the table of levels in addition to its keys, with their unit and meaning.
 LEVEL_COLUMNS: Final[dict[str, str]] = {
     "level": "column of the level",
     "position": "`constrained` or `constrained_ok`",
@@ -273,7 +273,7 @@ COLUMNS: Final = (
 
 
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
-    """Compute `COLUMNS`, the service of satellites by stretches of the line, over all antennas of runs on one map (else
+    """Compute `COLUMNS`, the satellite service by stretches of the line, over all antennas of runs on one map (else
     MismatchError); epochs without a position are located by the filter.
     """
     runs = [read_run(folder) for folder in folders]

@@ -1,6 +1,6 @@
 """Errors along the line of one antenna, by chainage or along the trajectory.
 
-The error is the distance along the map between the answer and the reference's own point on it,
+The error is the distance along the map between the position and the reference's own point on it,
 positive toward the end of the line (P1 3.3).
 """
 
@@ -82,14 +82,14 @@ def interpolate_reference(
 def along_track_error(
     arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory, *, same_place_m: float = 30.0
 ) -> Floats:
-    """Signed distance on the map from the reference's point to the answer, + toward the end of the line (P1 3.3).
+    """Signed distance on the map from the reference's point to the position, + toward the end of the line (P1 3.3).
 
     The distance along the line. Where the map passes the reference point more than once (laps, a road's two
     carriageways) the pass nearest to the position counts, as the ranges of one epoch cannot distinguish them. Where the
     line comes back near itself (a crossing), the straight distance between the two points counts if it is shorter. On a
-    line that passes every point once neither has an effect, except for the chord of a curve.
+    line that passes every point once neither rule has an effect, except for the chord of a curve.
 
-    `arc_m` are the answers along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
+    `arc_m` are the positions along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
     missing. Passes of the map up to `same_place_m` from the reference count as its position.
     """
     error = np.full(len(arc_m), np.nan)
@@ -100,7 +100,7 @@ def along_track_error(
     nearest_arc, offset = trajectory.nearest(reference)
     passes = find_segments_near(reference, trajectory, np.maximum(same_place_m, offset))
     passing = passes.lowest & (np.linalg.norm(passes.offset_m, axis=1) <= same_place_m)
-    if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no separate passes: the line continues there
+    if np.isfinite(trajectory.turn_m):  # the ends of a closed line are not separate passes: the line continues there
         passing &= ~((passes.segment == 0) & (passes.along_m <= 0.0))
         passing &= ~((passes.segment == len(length) - 1) & (passes.along_m >= length[-1]))
     ways = arc_m[at][passes.position] - trajectory.arc_m[passes.segment] - passes.foot_m
@@ -135,7 +135,7 @@ SAME_MAP_M: Final = 1.0
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: Excess of the distance along the line over twice the error, above which it belongs to another pass of the line [m].
+#: Excess of the distance along the line over twice the error, above which the error is to another pass of the line [m].
 _ANOTHER_PASS_M: Final = 50.0
 #: Rounding of chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
@@ -194,7 +194,7 @@ def compute_errors(
             if files.track or files.vehicle is not None:
                 find_trajectory(
                     run, antenna, answers.chainage_m, answers.ecef_m, files
-                )  # the given file is that of the run
+                )  # the given file is the run's file
             return PlaceErrors(
                 method="chainage",
                 error_m=short_distance_m(answers.chainage_m - answers.reference_chainage_m, turn),
@@ -241,7 +241,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
 def _note_of_passes(
     antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
 ) -> tuple[str, ...]:
-    """Say how many errors are those to another pass of the line than the reference's own nearest point."""
+    """Note the number of errors to another pass of the line than that of the reference's own nearest point."""
     known = np.isfinite(error_m)
     nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
     others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())

@@ -1,7 +1,8 @@
 """Recordings of the package index: the wheel `gnss-benchmark` (MIT), kept unpacked in the user's cache.
 
-It has a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz, November
-2020), and logs of antennas at rest. The drive is a held-out case: neither settings nor constants were chosen with it.
+It contains a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz,
+November 2020), and logs of antennas at rest. The drive is a held-out case: neither settings nor constants were chosen
+with it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from railfix.track.map_from_positions import from_position_log
 
 WHEEL: Final = "gnss-benchmark==2.3.0"
 WHEEL_SHA256: Final = "75a0a69642e5d5f863ac8e7d9bd2fc9c9d2444eb70b539a9da3ec93128054e0f"
-#: Command that brings the recordings.
+#: Command that downloads the recordings.
 COMMAND: Final = "railfix demo --real"
 _DATASETS: Final = "gnss_benchmark/datasets/"
 DRIVE: Final = "mosaicx5_multi_dynamic"
@@ -48,7 +49,7 @@ _RTK: Final = (
     "pos1-posmode=kinematic\npos1-frequency=l1+2\npos1-soltype=combined\npos1-elmask=15\npos1-navsys=45\n"
     "pos2-armode=continuous\npos2-gloarmode=off\nout-solformat=llh\nout-height=ellipsoidal\nant2-postype=rinexhead\n"
 )
-#: Positions with a larger standard deviation along an axis are no ground truth [m].
+#: Positions with a larger standard deviation along an axis are not used as ground truth [m].
 _LARGEST_SIGMA_M: Final = 1.5
 _LONGEST_S: Final = 900.0
 
@@ -93,7 +94,7 @@ def unpack_wheel(wheel: Path, folder: Path) -> None:
 
 
 def write_drive(recordings: Path, folder: Path) -> str:
-    """Write the drive as a held-out case of `railfix benchmark` into a folder; return how good its ground truth is.
+    """Write the drive as a held-out case of `railfix benchmark` into a folder; return the accuracy of its ground truth.
 
     The ground truth is RTKLIB's kinematic solution with the station, forward and backward, where `rnx2rtkp` is
     installed; otherwise the publisher's trajectory. The map is made of the ground truth. OutputError: RTKLIB fails.
@@ -152,7 +153,7 @@ def _compute_rtk(program: str, folder: Path) -> PositionLog:
 
 
 def _write_truth(log: PositionLog, path: Path) -> None:
-    """Write the positions of a log that are good enough as ground truth."""
+    """Write the positions of a log that are accurate enough as ground truth."""
     good = np.asarray((log.sigma_m < _LARGEST_SIGMA_M).all(axis=1))
     latitude, longitude, height = log.geodetic
     columns = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
@@ -163,7 +164,7 @@ def _write_truth(log: PositionLog, path: Path) -> None:
 
 
 def _distance_p95_m(log: PositionLog, other: PositionLog) -> float:
-    """Return the horizontal distance of the positions of two logs at common times, 95 % [m]."""
+    """Return the horizontal distance between the positions of two logs at common times, 95 % [m]."""
     row = nearest_rows(log.time, other.time, within_ns=1_000_000)
     apart = log.ecef_m[row[row >= 0]] - other.ecef_m[row >= 0]
     return float(np.percentile(np.linalg.norm(apart @ axes_at(other.ecef_m[0])[:2].T, axis=1), 95.0))

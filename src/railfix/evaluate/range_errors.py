@@ -1,6 +1,6 @@
 """Errors of single pseudoranges against a reference position, clock and common errors subtracted (P1 7, fig. 14).
 
-Common errors are those that a nearby reference station has measured; of the errors of runs an error model is made.
+Common errors are measured by a nearby reference station; an error model is fitted to the errors of runs.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class StationErrors:
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
-        """Return errors at other times, interpolated linearly, shape (T, K) [m]; NaN where the station sees nothing."""
+        """Return errors at other times, interpolated linearly, shape (T, K) [m]; NaN without observation there."""
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
         known = [k for k, name in enumerate(satellite.tolist()) if name in column]
         result = np.full((len(time), len(satellite)), np.nan)
@@ -147,7 +147,7 @@ def base_station_from_files(
 
 @dataclass(frozen=True, kw_only=True)
 class RangeErrors:
-    """Errors of n pseudoranges with time and satellite."""
+    """Errors of n pseudoranges, with time and satellite."""
 
     samples: ErrorSamples
     time: Datetimes  #: Shape (n,).
@@ -188,7 +188,7 @@ def range_errors(
     if base is not None:
         residual = residual - base.at(result.time, satellite, largest_gap_s=_LARGEST_BASE_GAP_S)
     used = (reason == Reason.USED) & np.isfinite(residual)
-    # A suspected range has an increased sigma; the model is fitted to the errors of the others.
+    # A suspected range has an increased sigma; the model is fitted to the errors of the other ranges.
     for name in ("doppler", "antenna_pair"):
         if name in result.screens:
             used &= ~result.screens[name].reject
@@ -248,7 +248,7 @@ class ModelInputs:
     base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
     #: Position of the station, where its header is not accurate enough; shape (3,).
     base_position_ecef_m: Floats | None = None
-    columns: ColumnNames = field(default_factory=ColumnNames)  #: How to read the reference.
+    columns: ColumnNames = field(default_factory=ColumnNames)  #: Options for reading the reference.
 
 
 @dataclass(frozen=True, kw_only=True)

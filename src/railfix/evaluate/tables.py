@@ -23,7 +23,7 @@ from railfix.run.output import OutputFolder
 
 _NAMES: Final = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
 _POSITION: Final = pl.col("position").replace(_NAMES)
-#: The run, or the configuration whose runs are together.
+#: The run, or the configuration whose runs are combined.
 _OF: Final = pl.when(pl.col("run") != "all").then("run").otherwise("configuration").alias("of")
 #: Groupings in the order shown, with their captions.
 _GROUPINGS: Final = {
@@ -47,7 +47,7 @@ _AVAILABLE: Final = (
 
 
 def _text(value: str) -> str:
-    """Return a text of numbers, in a column of numbers."""
+    """Return a text of numbers for a numeric column."""
     return value
 
 
@@ -132,7 +132,7 @@ _STANFORD: Final[Sequence[Column]] = (
 
 
 def select_evaluation(evaluation: Evaluation, name: str) -> Evaluation:
-    """Return the part of an evaluation that is on one of its runs."""
+    """Return the part of an evaluation that concerns one of its runs."""
 
     def own(rows: Any) -> Any:
         return rows if rows is None or "run" not in rows.columns else rows.filter(run=name)
@@ -246,7 +246,7 @@ def _together(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of each run and antenna, those on common epochs only where they are not every one's own."""
+    """Return the rows of each run and antenna, those on common epochs only where they differ from each one's own."""
     order = {name: number for number, name in enumerate(_NAMES)}
     parts: Iterator[pl.DataFrame] = (
         mine.filter(epochs_of="own")
@@ -278,9 +278,9 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
     keys = ["run", "configuration", "line", "antenna", "group"]
     left, right = (rows.filter(position=position) for position in ("constrained", "conventional"))
     both = left.join(right, on=keys, how="left", suffix="_conventional", maintain_order="left")
-    # one antenna besides both together adds nothing to the groups
+    # groups show both antennas together, not each antenna
     both = both.filter(antenna="all") if "all" in both["antenna"] else both
-    # without satellites nothing is observed: every epoch counts
+    # without satellites there are no observations: every epoch counts
     counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")
     columns: list[Column] = [*_where(both), ("group", "group", str), ("epochs", counted, count)]
     for conv, suffix in (("", ""), ("conv.\n", "_conventional")):
@@ -301,7 +301,7 @@ def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Ta
 
 
 def _beyond(found: Integrity, kind: str, worst: int) -> Table:
-    """Return the epochs whose error exceeds the level most."""
+    """Return the epochs whose error exceeds the level by most."""
     beyond, usable = found.beyond, int(found.beyond["usable"].sum())
     parts = [pl.col(f"{kind}_{part}").map_elements(partial(number, digits=1), return_dtype=pl.String, skip_nulls=False)
              for part in ("fault_free_m", "one_fault_m", "two_faults_m")]  # fmt: skip
@@ -337,10 +337,10 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
     tables.csv           figures of every grouping, long form
     intervals.csv        distances and times between positions
     levels.csv           protection levels, where a run has any
-    stanford_KIND.csv    levels against errors, counted; KIND is what the levels rest on (sbas, separation)
+    stanford_KIND.csv    levels against errors, counted; KIND is the basis of the levels (sbas, separation)
     beyond_KIND.csv      epochs whose error is over the level
     outages.csv          stretches without satellites, where a table of the filter is evaluated
-    branches.csv         stated probabilities of the place against its correctness, the same
+    branches.csv         stated probabilities of the position against its correctness, likewise
     ==================== ================================================================
     """
     folder.append_parquet("errors.parquet", evaluation.epochs)

@@ -25,7 +25,7 @@ def _records_text(satellite: Strings, toe: Datetimes) -> str:
 
 
 class _NavigationRecords(FrozenArrays, NotebookTable):
-    """Length, text and freezing of broadcast records."""
+    """Base of broadcast records: length, `repr`, read-only arrays."""
 
     satellite: Strings
     toe: Datetimes
@@ -124,7 +124,7 @@ class PreciseEphemeris(NotebookTable):
     position_ecef_m: Floats  #: NaN where the file has none (0.000000), shape (E, N, 3).
     clock_s: Floats  #: NaN where the file has none (999999.999999), shape (E, N).
     source: str = ""  #: The files it was read from.
-    notes: tuple[str, ...] = ()  #: What was left out, and why.
+    notes: tuple[str, ...] = ()  #: Omitted records, with reasons.
 
     def __post_init__(self) -> None:
         expected = (len(self.time), len(self.satellite))

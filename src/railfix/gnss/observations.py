@@ -56,7 +56,7 @@ def frequency_by_name_hz(name: Strings, glonass_channel: Floats) -> Floats:
     return frequency
 
 
-MAX_PROBLEMS: Final = 50  #: Largest number of messages about single faults; further faults are only counted.
+MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; further faults are only counted.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class ObservationHeader:
     #: Antenna height, east and north eccentricity; shape (3,).
     antenna_delta_hen_m: Floats = field(default_factory=lambda: np.zeros(3))
     interval_s: float = float("nan")  #: INTERVAL [s], NaN when absent.
-    #: Frequency channel of GLONASS satellites ("R05" -> 1).
+    #: Frequency channels of GLONASS satellites ("R05" -> 1).
     glonass_channel: Mapping[str, int] = field(default_factory=dict)
 
     leap_seconds: int | None = None
@@ -103,11 +103,11 @@ class Observations(NotebookTable):
     #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 without one, or the log has no such
     #: message; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
-    #: Gain of the front end, in the receiver's unit; NaN where the log does not have it; shape (T,).
+    #: Front-end gain, in the receiver's unit; NaN where the log does not have it; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
-    #: Messages about faults that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then one with the number of
-    #: the others. A slice of epochs has none.
+    #: Messages about skipped faults (file, line, fault); at most `MAX_PROBLEMS`, then a message with the number of
+    #: further faults. A slice of epochs has none.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of faults.
     #: Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs, external events,
@@ -207,7 +207,7 @@ def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
     """Return which channels have an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
-        used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch shows it of nearly all
+        used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch shows it for nearly all channels
         rest = np.flatnonzero(~used)
         used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
     rest = np.flatnonzero(~used)
@@ -226,8 +226,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Returns
     -------
     Observations
-        Channels sorted by satellite, then signal. The header is that of the first part, with the signals and GLONASS
-        channels of the others added; problems are concatenated, counters added.
+        Channels sorted by satellite, then signal. The header is the first part's, with the signals and GLONASS channels
+        of the other parts added; problems are concatenated, counters added.
 
     Raises
     ------
@@ -307,6 +307,6 @@ def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[st
 
 
 def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """Return the first `MAX_PROBLEMS` messages, and a message with the number of the others, `count` in all."""
+    """Return the first `MAX_PROBLEMS` messages, and a message with the number of further faults, `count` in total."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

@@ -16,11 +16,11 @@ from railfix.gnss.observations import Observations, first_problems, stack_parts
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"
-#: An epoch that at most this many epochs with other tags have passed is sorted in; one passed by more has a wrong time
-#: tag.
+#: An epoch that comes after at most this many later epochs is sorted in; an epoch that comes after more of them has a
+#: wrong time tag.
 MOST_PASSED: Final = 20
-_HELD: Final = 2 * MOST_PASSED  #: Epochs that wait for later ones.
-#: A single tag that is farther than this from both neighbours, which follow each other, is wrong.
+_HELD: Final = 2 * MOST_PASSED  #: Number of epochs that wait for later epochs.
+#: A single tag farther than this from both neighbours, which are consecutive, is wrong.
 _LONE: Final = np.timedelta64(3600, "s")
 _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
 
@@ -40,7 +40,7 @@ class EpochOrder:
     def __init__(self, broken_lines: BrokenLines) -> None:
         self._broken_lines = broken_lines
         self._held: list[Run] = []
-        self._times: list[Datetimes] = []  # of all epochs that were handed on
+        self._times: list[Datetimes] = []  # of all epochs returned so far
         self._counts = {DUPLICATES: 0, "sorted": 0}
         self._first: dict[str, tuple[str, int]] = {}
         self._found: list[str] = []
@@ -144,7 +144,7 @@ class EpochOrder:
         self._break |= len(rows) > 0
 
     def _summary(self) -> Observations:
-        """Return no epochs, with the notes on all."""
+        """Return no epochs, with the notes on all epochs."""
         notes = []
         if number := self._counts["sorted"]:
             notes.append(f"{_where(*self._first['sorted'])}: {plural(number, 'epoch')} out of order, sorted by time")
@@ -180,7 +180,7 @@ def _where(path: str, line: int) -> str:
 
 
 def _passed(time: Datetimes) -> tuple[Integers, Integers]:
-    """Return how many of the epochs before each one have later tags, and how many after it earlier ones."""
+    """Return the numbers of preceding epochs with later tags and of following epochs with earlier tags."""
     reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
     passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
     for step in range(1, reach + 1):
@@ -206,7 +206,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return epochs in an order; repeated ones are merged into the first of the same tag."""
+    """Return epochs in a given order; repeated epochs are merged into the first epoch with the same tag."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered
@@ -223,6 +223,6 @@ def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observation
 
 
 def _rise(times: Sequence[Datetimes]) -> bool:
-    """Return whether epochs follow each other, those of one part after those of another."""
+    """Return whether the epochs of one part follow the epochs of another."""
     time = np.concatenate([*times, np.empty(0, "datetime64[ns]")])
     return bool((np.diff(time) > np.timedelta64(0, "ns")).all())

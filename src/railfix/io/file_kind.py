@@ -37,7 +37,7 @@ KIND_WORDS: Final[dict[FileKind, str]] = {
 _BINARY: Final[dict[FileKind, bytes]] = {
     "gpkg": b"SQLite format 3\0", "shp": b"\0\0\x27\n", "fgb": b"fgb\x03", "dxf": b"AutoCAD Binary DXF",
 }  # fmt: skip
-#: What the beginning of a text shows, in the order in which kinds are tried.
+#: Patterns of the beginning of a text by kind, in the order in which the kinds are tried.
 _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
     "sp3": re.compile(rb"\A#[a-d][PV]\d"),
     "ifc": re.compile(rb"\A\s*ISO-10303-21;"),
@@ -60,7 +60,7 @@ _ROOTS: Final[dict[str, FileKind]] = {
     "kml": "kml", "gpx": "gpx", "osm": "osm", "rdf": "rdf", "featurecollection": "gml",
 }  # fmt: skip
 _RINEX: Final[dict[str, FileKind]] = {"O": "observations", "B": "sbas", "M": "rinex", "C": "rinex"}
-#: Kinds by the ending of the name, where the content leaves the kind open.
+#: Kinds by the ending of the name, where the content is ambiguous.
 _ENDINGS: Final[dict[str, FileKind]] = {
     ".csv": "table", ".pos": "rtklib", ".nmea": "nmea", ".gpx": "gpx", ".kml": "kml", ".osm": "osm", ".pbf": "pbf",
     ".geojson": "geojson", ".json": "geojson", ".xml": "xml", ".landxml": "xml", ".railml": "xml", ".ifc": "ifc",
@@ -70,7 +70,7 @@ _ENDINGS: Final[dict[str, FileKind]] = {
 
 
 def find_kind(path: FilePath) -> FileKind:
-    """Return the kind of a file by its first bytes, unpacked; by its ending where they leave it open."""
+    """Return the kind of a file by its first bytes, unpacked; by its ending where these are ambiguous."""
     if mate_table(path):
         return "mate"
     if ending(path) == ".toml":
@@ -98,12 +98,12 @@ def find_kind(path: FilePath) -> FileKind:
     return _ENDINGS.get(ending(path), "unknown")
 
 
-#: Words in the header of a table of positions that one of a track map has not.
+#: Words in the header of a table of positions that a track map does not have.
 _OF_POSITIONS: Final = ("time", "unix", "tow", "quality", "sigma_north", "antenna")
 
 
 def wrong_kind(path: FilePath, expected: str) -> InputFileError:
-    """Return the error of a file of another kind than is expected."""
+    """Return the error of a file of another kind than expected."""
     return InputFileError(path, f"is {KIND_WORDS[find_kind(path)]}; {expected} was expected")
 
 

@@ -76,7 +76,7 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
     Parameters
     ----------
     data : xarray.Dataset
-        As ``georinex.load`` gives it, best with ``useindicators=True``: without indicators no loss of
+        As returned by ``georinex.load``, preferably with ``useindicators=True``: without indicators no loss of
         lock is known.
 
     Returns

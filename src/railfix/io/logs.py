@@ -49,14 +49,14 @@ def read_observations(
     Parameters
     ----------
     path : path or sequence of path
-        RINEX observation files, or logs in UBX, SBF or RTCM 3 (other protocols between them are passed over),
-        plain or packed. Several files are put in order of time; they are all of one of these two kinds.
+        RINEX observation files, or logs in UBX, SBF or RTCM 3 (other protocols in between are skipped), plain or
+        packed. Several files are put in order of time; they are all of one of these two kinds.
     broken_lines : {"stop", "count"}
-        A broken line of RINEX is an error, or what it breaks is skipped and counted; in a receiver log it is always so.
+        A broken RINEX line is an error, or the part that it breaks is skipped and counted, as always in a receiver log.
     systems : iterable of str, optional
         Letters of constellations, all by default.
     start, end : datetime64 or str, optional
-        GPS time; the end is no part of the span.
+        GPS time; the end is excluded.
     date : datetime64 or str, optional
         Some time within half a week of the log: needed for RTCM 3, whose observations carry no week.
     reader : {"railfix", "georinex"}
@@ -106,7 +106,7 @@ def _by_georinex(
 
 
 class _Selection(TypedDict, total=False):
-    """Arguments that `read_observations` and `scan_observations` share."""
+    """Common arguments of `read_observations` and `scan_observations`."""
 
     broken_lines: BrokenLines
     systems: Iterable[str] | None
@@ -123,7 +123,7 @@ def scan_observations(
     reader: Reader = "railfix",
     **selection: Unpack[_Selection],
 ) -> Iterator[Observations]:
-    """Observations of one receiver in pieces of `epochs` epochs at most, the first short.
+    """Observations of one receiver in pieces of at most `epochs` epochs, the first piece short.
 
     `selection` are `broken_lines`, `systems`, `start`, `end` and `date` of `read_observations`; errors as there.
     `progress` is called with the fraction of the files that has been read. georinex reads all files before the first
@@ -219,12 +219,12 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
 
 
 def _of_systems(run: Observations, letters: list[str] | None) -> Observations:
-    """Return the observations of some constellations, of all for None."""
+    """Return the observations of some constellations, or of all for None."""
     return run if letters is None else without_empty_channels(of_channels(run, np.isin(run.system, letters)))
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
-    """Return the navigation records from RINEX navigation files and receiver logs, mixed at will.
+    """Return the navigation records from RINEX navigation files and receiver logs, in any combination.
 
     Parameters
     ----------

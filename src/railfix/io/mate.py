@@ -29,7 +29,7 @@ _RESULT: Final = (
     "ALGORITHM_ID", "SENSOR_SET", "PARAMETER_SET", "OPERATING_DATE", "TRAIN_NUMBER", "TIMESTAMP_LOCAL", "TIMESTAMP_UTC",
     "STATUS",
 )  # fmt: skip
-#: Columns of the tables that are read, in the order of the schema.
+#: Columns of the input tables, in the order of the schema.
 READ: Final[Mapping[str, tuple[str, ...]]] = {
     "S_GNSS_SAT": (
         "DEVICE_ID", *_STAMPS, "GPS_WEEK", "GPS_TOW", "SAT_ID", "SIGNAL_TYPE", "LOCK_TIME", "CN0", "PSEUDORANGE",
@@ -56,7 +56,7 @@ READ: Final[Mapping[str, tuple[str, ...]]] = {
         "CROSS_DISTANCE", "NORTH_LV95", "EAST_LV95", "LATITUDE_ETRS89", "LONGITUDE_ETRS89", *_VALID,
     ),
 }  # fmt: skip
-#: Columns of the tables that are written.
+#: Columns of the output tables.
 WRITTEN: Final[Mapping[str, tuple[str, ...]]] = {
     "R_TRACK": (
         *_RESULT, "TRACK_ID", "MOVEMENT_DIRECTION", "ORIENTATION", "TRAVELLED_DISTANCE", "RELATIVE_DISTANCE", "SPEED",
@@ -82,7 +82,7 @@ def mate_table(path: FilePath) -> str:
 def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> pl.DataFrame:
     """Read a table, CSV (also .gz) or Parquet, with upper-case names; columns not in the file are empty.
 
-    Without `table_name` the name of the file says which table it is.
+    Without `table_name` the name of the file determines the table.
     """
     name, file = table_name or mate_table(path), Path(path)
     with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
@@ -181,7 +181,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Return the arrays of epochs by channels; of two rows of one signal at one epoch the last counts."""
+    """Return the arrays of epochs by channels; of two rows of one signal at one epoch the last is used."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)

@@ -14,8 +14,8 @@ from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, read_text
 
-_BLOCK: Final = 4096  #: Rows that are read before they become compact.
-_SEPARATORS: Final = (";", "\t", "|")  #: Separators of columns other than the comma.
+_BLOCK: Final = 4096  #: Number of rows read before they are compacted.
+_SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
 #: Usual names of columns of positions and maps, without case, blanks and underscores, by railfix name. A height
 #: without its unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
@@ -26,7 +26,7 @@ _USUAL: Final[dict[str, tuple[str, ...]]] = {
         "elevation", "ellipsoidalheight", "ellipsoidalheightm", "hae",
     ),
 }  # fmt: skip
-#: Endings of names in another unit than that of railfix, and the unit.
+#: Endings of names in a unit other than railfix's, and the unit.
 _OTHER_UNITS: Final = {
     "ft": "feet", "feet": "feet", "foot": "feet", "usft": "feet", "mm": "millimetres", "cm": "centimetres",
     "km": "kilometres", "rad": "radians", "gon": "gon", "yd": "yards",
@@ -44,7 +44,7 @@ class NamedColumns:
     header_line: int
     line: Integers  #: Shape (n,).
     cells: dict[str, pl.Series]  #: Cells of each column, stripped.
-    separator: str = ","  #: Between the columns; numbers may have decimal commas where it is another.
+    separator: str = ","  #: Column separator; if it is not a comma, numbers may have decimal commas.
     #: Original names of columns that were renamed to those of railfix (`with_usual_names`).
     usual: dict[str, str] = field(default_factory=dict)
 
@@ -182,7 +182,7 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
 
 
 def _compact(rows: list[list[str]], width: int) -> pl.DataFrame:
-    """Return the rows of cells as columns of text."""
+    """Return rows of cells as columns of text."""
     return pl.DataFrame([pl.Series(str(i), [row[i] for row in rows], dtype=pl.String) for i in range(width)])
 
 

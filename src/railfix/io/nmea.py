@@ -25,7 +25,7 @@ _OTHER_LINES, _UNCHECKED = (
     "lines skipped that are no sentence of NMEA 0183",
     "sentences without checksum",
 )
-#: A separation of 0 is doubted where the geoid is farther from the ellipsoid [m].
+#: A separation of 0 is reported as doubtful where the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 2.0
 #: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.PositionLog`); others are 0, no position.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
@@ -208,7 +208,7 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix by the nearest date sentence; with one date (`chained`) count midnights."""
+    """Compute the GPS time of each fix by the nearest date sentence; with a single date (`chained`) count midnights."""
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])
     if chained:

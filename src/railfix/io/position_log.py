@@ -49,7 +49,7 @@ class PositionLog(NotebookTable):
     ratio: Floats | None = None  #: Ratio of the ambiguity test, where the log has it; shape (n,).
     #: Latitude and longitude of all rows, where some have no height; shape (n, 2).
     plan_deg: Floats | None = None
-    antennas: tuple[str, ...] = ()  #: Names of antennas in a table that has them.
+    antennas: tuple[str, ...] = ()  #: Names of the antennas, where the table has them.
     table: NamedColumns | None = None  #: All columns, where the log is a table with named columns.
 
     @property
@@ -69,7 +69,7 @@ class PositionLog(NotebookTable):
         return bool((self.quality >= 0).any())
 
 
-#: Number of broken lines after which a file is not accepted as a log.
+#: Number of broken lines beyond which a file is not accepted as a log.
 _MOST_BROKEN: Final = 200
 Parsed = TypeVar("Parsed")
 
@@ -162,7 +162,7 @@ def qualities_in_words(log: PositionLog) -> str:
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the names of columns in railfix and in the file, of ``NAME=COLUMN`` texts; otherwise SettingsError."""
+    """Return the names of columns in railfix and in the file from ``NAME=COLUMN`` texts; otherwise SettingsError."""
     columns: dict[str, str] = {}
     for pair in pairs:
         ours, equals, theirs = pair.partition("=")
@@ -173,7 +173,7 @@ def column_names(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
-    """Give columns of a table the names that railfix has for them; see `read_positions`."""
+    """Rename the columns of a table to railfix's names; see `read_positions`."""
     if unknown := sorted(set(columns) - set(known)):
         raise SettingsError(f"{table.path}: column {unknown[0]!r} is unknown; expected one of {', '.join(known)}")
     cells = dict(table.cells)

@@ -1,4 +1,4 @@
-"""Logs of positions of any kind: one reader, which finds the kind by the content."""
+"""Logs of positions of any kind: one reader, which detects the kind from the content."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def read_positions(
     heights: Literal["needed", "optional"] = "needed",
     antennas: Literal["one", "several"] = "one",
 ) -> PositionLog:
-    """Read a log of positions of any kind; its content decides which.
+    """Read a log of positions of any kind, detected from its content.
 
     RTKLIB's solutions, tables with named columns (CSV), NMEA, GPX, NovAtel ASCII, and receiver logs with positions
     (UBX, SBF); plain or packed.

@@ -29,7 +29,7 @@ ATTRIBUTES: Final = (
     "protection_level_ground_m", "protection_status", "speed_mps", "track", "track_chainage_m", "track_probability",
 )  # fmt: skip
 COORDINATES: Final = ("longitude_deg", "latitude_deg", "height_m")
-#: Colour of each status with coordinates, by its reliability; "other" is that of any further status.
+#: Colour of each status with coordinates, by its reliability; "other" is the colour of any further status.
 STATUS_COLOURS: Final[Mapping[str, str]] = {
     "ok": "#00805e",
     "tracking": "#00805e",
@@ -54,7 +54,7 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return where the QGIS style of a file goes; None where it needs none or has it already."""
+    """Return the path of the QGIS style of a file; None where it needs none or already has it."""
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
         return None
@@ -104,7 +104,7 @@ def _content(points: pl.DataFrame, path: Path, description: str) -> bytes:
 
 
 def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) -> bytes:
-    """Return a file that GDAL writes."""
+    """Return the content of a file written by GDAL."""
     with needs_extra():
         import pyogrio
 
@@ -128,7 +128,7 @@ def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) 
 
 
 def _geoparquet(points: pl.DataFrame, description: str) -> bytes:
-    """Return a file by the specification of GeoParquet 1.1."""
+    """Return the content of a file by the specification of GeoParquet 1.1."""
     place = points.select(COORDINATES).to_numpy()
     column = {
         "encoding": "WKB",

@@ -30,7 +30,7 @@ COLUMNS: Final = (
     "time_gpst", "antenna", "chainage_m", "x_m", "y_m", "z_m", "speed_mps", "sigma_m", "source", "environment",
 )  # fmt: skip
 SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Source of a reference position; blank where the file has none.
-#: A CSV with these columns and no source is ground truth of the simulator.
+#: A CSV with these columns and no source is ground truth from the simulator.
 _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
 _FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 
@@ -120,7 +120,7 @@ def read_reference(
 
 
 def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:
-    """Collect all columns of all rows, blank where the file has none."""
+    """Collect all columns of all rows, blank where the file lacks them."""
     source = table.texts("source", absent="truth" if all(name in table for name in _OF_TRUTH) else "rtk")
     unknown = ~np.isin(source, SOURCES)
     if unknown.any():
@@ -153,7 +153,7 @@ def _of_antenna(
 
 
 def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
-    """Return the rows of such a file, by time and then antenna; null where blank."""
+    """Return the rows of a reference file, by time and then antenna; null where blank."""
     tables = [
         pl.DataFrame(
             {

@@ -17,7 +17,7 @@ from railfix.core.tables import reading_table
 from railfix.core.timescale import utc_to_gpst
 from railfix.io.mate import mate_table, only_device, read_mate
 
-#: Columns of each table besides ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
+#: Columns of each table besides ``time_gpst``, as `railfix simulate` writes them; columns in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "tachometer": ("pulse", "[direction]"),
     "inertial": (
@@ -32,10 +32,10 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "pulses": ("[count]", "[pulse]", "[distance_m]", "[direction]"),
     "acceleration": ("[specific_force_mps2]", "[force_forward_mps2]", "[acceleration_mps2]"),
 }  # fmt: skip
-#: Sensors that may be silent for some time, which rows with the time alone report; tables without a time.
+#: Sensors without output for some time, which rows with the time alone report; tables without a time.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 _TIMELESS: Final = ("ranging_units", "list of balises")
-#: Tables without empty values, whose times rise from row to row, two rows at least.
+#: Tables without empty values, with strictly rising times and at least two rows.
 _COMPLETE: Final = ("pulses", "acceleration")
 _NAMES: Final = ("unit", "balise", "track")  #: Columns of names.
 _WHOLE: Final = ("pulse", "direction")  #: Columns of whole numbers.
@@ -44,7 +44,8 @@ _WHOLE: Final = ("pulse", "direction")  #: Columns of whole numbers.
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     """Read a table with `COLUMNS` of a kind, numbers as numbers, names as text, times as GPS time that does not fall.
 
-    InputFileError: the file is no such table, has no rows, or a value is missing or wrong; the message names its row.
+    InputFileError: the file is not such a table, has no rows, or a value is missing or wrong; the message names its
+    row.
     """
     with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
         if mate_table(path):
@@ -73,7 +74,7 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     )
     if stamp:
         _check_times(path, table["time_gpst"], kind)
-    if silent is not None:  # a stream that was recorded has rows with the time alone (`railfix.live.stream`)
+    if silent is not None:  # a recorded stream has rows with the time alone (`railfix.live.stream`)
         table = table.filter(~silent)
         if not len(table):
             raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")

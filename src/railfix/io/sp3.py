@@ -54,7 +54,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]
     position, clock = grid[..., :3], grid[..., 3]
     known = (position != 0.0).any(axis=-1) & np.isfinite(position).all(axis=-1)
-    wrong = ~plausible_radius(satellites, position * 1e3)  # including zeros, which stand for missing values
+    wrong = ~plausible_radius(satellites, position * 1e3)  # including zeros, which represent missing values
     if known.any() and wrong[known].all():
         radius = float(np.median(np.linalg.norm(position[known], axis=-1)))
         what = f"its satellites are {radius:,.0f} km from the Earth's centre; are the positions in metres? SP3 has km"

@@ -1,7 +1,7 @@
 """The position message of a train: one schema for live positions, supervision and control.
 
-CBOR with integer keys (RFC 8949, canonical order): about 100 bytes, and an older receiver skips keys that it does not
-know; a JSON view; and the position report of ETCS (SUBSET-026 v4, 7.4.2, packet 0). Needs ``railfix[live]``.
+CBOR with integer keys (RFC 8949, canonical order): about 100 bytes, and an older receiver skips unknown keys; a JSON
+view; and the position report of ETCS (SUBSET-026 v4, 7.4.2, packet 0). Needs ``railfix[live]``.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class MessageStatus(IntEnum):
     """Reliability of a message's position."""
 
     POSITION = 0  #: Position with every check passed.
-    COASTING = 1  #: Position carried by sensors alone.
+    COASTING = 1  #: Position from sensors alone.
     DOUBTFUL = 2  #: Position with a failed check, or several possible tracks or positions.
     NO_POSITION = 3  #: Observations, but no position.
-    NO_INPUT = 4  #: Nothing received in this period.
+    NO_INPUT = 4  #: No input received in this period.
     #: Satellite positioning is suspended by order of the ground side; railfix itself sends no such message.
     SUSPENDED = 5
 
@@ -51,7 +51,7 @@ class Source(IntFlag):
 
 
 class SuspectedInterference(IntEnum):
-    """Interference with the signals of satellites that the train suspects."""
+    """Suspected interference with satellite signals."""
 
     NONE = 0
     JAMMING = 1
@@ -61,8 +61,8 @@ class SuspectedInterference(IntEnum):
 class Unknown(IntFlag):
     """Unknown properties of the train."""
 
-    FACING = 1  #: The direction in which the front end looks: `over_cm` and `under_cm` cover both.
-    FRONT_END = 2  #: Where the front end is: `chainage_cm` refers to the reference point, an antenna or its vehicle.
+    FACING = 1  #: The orientation of the front end: `over_cm` and `under_cm` cover both directions.
+    FRONT_END = 2  #: The front end: `chainage_cm` refers to the reference point, an antenna or its vehicle.
     LENGTH = 4  #: The train's length.
 
 
@@ -82,7 +82,7 @@ class TrainMessage(Settings):
     speed_cmps: Signed | None = None
     speed_bound_cmps: Unsigned | None = None
     direction: Annotated[int, Field(ge=-1, le=1)] = 0  #: Running direction against chainage, 0 where unknown.
-    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Direction in which the front end looks.
+    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Orientation of the front end.
     standstill: bool = False
     status: MessageStatus = MessageStatus.NO_POSITION
     sources: Source = Source(0)
@@ -92,16 +92,16 @@ class TrainMessage(Settings):
     length_cm: Unsigned = 0  #: Train length.
     complete: bool = False  #: Train integrity confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
-    #: Number of the newest authority that the train has taken: its acknowledgement to the ground side.
+    #: Number of the newest authority accepted by the train: its acknowledgement to the ground side.
     authority: Unsigned | None = None
-    authority_end_cm: Signed | None = None  #: End of the authority that the train has, rounded away from it.
-    interference: SuspectedInterference | None = None  #: None from trains that do not look for it.
+    authority_end_cm: Signed | None = None  #: End of the train's authority, rounded away from the train.
+    interference: SuspectedInterference | None = None  #: None from trains without this check.
     #: Safe front and rear end: no part of the train is ahead of the first or behind the second, in the direction of
     #: `facing`. None without bounds, or where the end or the direction is unknown.
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
     unknown: Unknown = Unknown(0)  #: Properties of the train unknown to the sender.
-    #: Start of the train's unit, a number drawn at random: `sequence` begins again with each.
+    #: Random number of a start of the train's unit: `sequence` begins again with each start.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] | None = None
     brake_order: Unsigned | None = None  #: Number of the order to brake that the train obeys, None without one.
 
@@ -115,7 +115,7 @@ class TrainMessage(Settings):
         return self
 
 
-#: Integer key of each field; keys are never used again for another meaning.
+#: Integer key of each field; keys are never reused with another meaning.
 KEYS: Final[dict[str, int]] = {name: k for k, name in enumerate(TrainMessage.model_fields, start=1)}
 _NAMES: Final = {key: name for name, key in KEYS.items()}
 _VERSION_KEY: Final = 0
@@ -192,7 +192,7 @@ def to_json(message: TrainMessage) -> str:
 
 
 def from_json(line: str) -> TrainMessage:
-    """Return a message from its line of JSON; MessageError as `decode`."""
+    """Return a message from its line of JSON; MessageError as in `decode`."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):
@@ -229,8 +229,8 @@ def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> 
         raise ValueError("a message without the place of the front end has no packet 0")
     distance = message.chainage_cm - reference_cm
     metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
-    # Whole metres (Q_SCALE 1), tens of metres where these do not reach (Q_SCALE 2); doubts are rounded up, with the
-    # rounding of the distance, so that they stay bounds.
+    # Whole metres (Q_SCALE 1), tens of metres where these do not reach (Q_SCALE 2); confidence bounds are rounded up,
+    # including the rounding of the distance, so that they remain bounds.
     largest = max(metres.values())
     scale, unit = (1, 100) if largest <= 100 * _LARGEST_LENGTH - 200 else (2, 1000)
     rounded = {"D_LRBG": round(metres["D_LRBG"] / unit)}

@@ -63,7 +63,7 @@ def kernel(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """Compile a function that only kernels call; it is inlined into them."""
+    """Compile a function that only kernels call; its machine code becomes part of theirs."""
     if is_plain():
         return function
     return cast(Function, numba.njit(**OPTIONS)(function))

@@ -220,7 +220,7 @@ def _write_base(
         rows = work.rows
     more = of_ranges(rows[n], ranges) if ranges.any else (0.0, 0.0, 0.0)
     _write_one(t, first[0], work.removed, more, undetectable, system.common, tails)
-    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # two-sided false alarm
+    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # noise exceeds the level on either side
     if order > 0:
         _write_singles(t, first[1], System(rows, system.common), ranges, undetectable, work, tails)
         for i in range(n):

@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 _CLOSE = 5e-4
 #: Largest number of steps; if they do not converge, the lowest level found within the risk is used.
 _STEPS = 60
-#: From this step on every second step bisects the bracket, as secant steps could cycle for ever.
+#: From this step on every second step bisects the bracket: steps could alternate between two points for ever.
 _HALVING = 8
 #: Fraction of the risk that remains unused.
 _AIM = 0.002
@@ -168,7 +168,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return the unused risk of a kind, its k, the largest required level, and the hypothesis that requires it."""
+    """Return a kind's risk left for checked faults, its k, the largest required level, and the hypothesis behind it."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]

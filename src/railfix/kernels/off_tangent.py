@@ -371,7 +371,7 @@ def forms_of_hypotheses(
     residuals = _work_space(channels)
     for t in range(epochs):
         n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
-        prior[t, 0], at = 2.0, 1  # two-sided false alarm
+        prior[t, 0], at = 2.0, 1  # noise exceeds the level on either side
         _without(-1, -1, residuals, every, form[t, 0])
         for i in range(n):
             for j in range(-1, i):

@@ -197,7 +197,7 @@ def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
     """Compute clocks and residuals of one epoch after a step, to first order.
 
-    A step of 5 m leaves an error of 0.03 mm, because the design neglects the Earth's rotation.
+    A step of 5 m leaves an error of 0.03 mm: the design neglects the gradient of the Earth's rotation correction.
     """
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])

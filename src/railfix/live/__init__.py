@@ -1,7 +1,7 @@
-"""Positions from receiver streams as they arrive: sources, pairing of antennas, one message a period, sinks.
+"""Positions from receiver streams as they arrive: sources, pairing of antennas, one message per period, sinks.
 
-`LiveEngine` is the whole of it without files, clocks or sockets: epochs in, messages out. `run_session` adds sources
-and sinks, `run_live` all that ``railfix live`` does::
+`LiveEngine` computes messages from epochs without files, clocks or sockets. `run_session` adds sources
+and sinks, `run_live` everything else of ``railfix live``::
 
     engine = LiveEngine(processor, LiveSettings(train=7))
     engine.add_navigation(navigation)

@@ -26,7 +26,7 @@ P = ParamSpec("P")
 
 #: First word of the second channel.
 _READY: Final = "ready"
-#: Stages in the order of processing, with their distinguishing arrays.
+#: Stages in the order of processing, with the arrays that are compared.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -65,7 +65,7 @@ def _digest(arrays: list[Any]) -> str:
 def _second_channel(
     connection: Connection, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str]
 ) -> None:
-    """The second process: carries out calls, in lists, until the connection closes."""
+    """Run the second process: execute lists of calls until the connection closes."""
     engine = LiveEngine(processor, settings, sensors)
     kernels.load()
     connection.send(_READY)
@@ -82,7 +82,7 @@ def _second_channel(
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
-    """Return the method of the engine, carried out in this channel and then in the second."""
+    """Return the method of the engine, executed in this channel and then in the second."""
 
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
@@ -93,17 +93,17 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 
 
 class TwoChannels(LiveEngine):
-    """A `LiveEngine` with a second one in another process, which gets every call as well."""
+    """A `LiveEngine` with a second one in another process, which receives every call as well."""
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
-        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []  # go with the next poll
+        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []  # sent with the next poll
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # before there is data to process: a later wait would delay data, and the end by a signal
+        # Before any data: a later wait would delay the data, and the end by a signal.
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
@@ -116,7 +116,7 @@ class TwoChannels(LiveEngine):
     push = _in_both(LiveEngine.push)
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """As `LiveEngine.poll`, after both channels have agreed.
+        """Return the messages due as `LiveEngine.poll`, after both channels have agreed.
 
         ChannelsDisagreeError: when a message or a stage differs, or the second channel has ended.
         """

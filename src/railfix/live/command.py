@@ -40,7 +40,7 @@ from railfix.run.processor_setup import check_base_place, make_processor, parse_
 from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
 
-#: Results that are kept in memory before they are written.
+#: Number of results kept in memory before they are written.
 _BLOCK = 600
 
 
@@ -82,7 +82,8 @@ class ResultTables:
         self._folder.__exit__(kind, error, trace)
 
 
-#: Longest distance from the reference location that an ETCS position report can state, without the doubts [m].
+#: Longest distance from the reference location that an ETCS position report can state, without the position uncertainty
+#: [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
@@ -107,7 +108,7 @@ def _check_outputs(inputs: LiveInputs) -> None:
 
 
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
-    """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each, and whether by SIGTERM.
+    """Run a session until its sources end, or SIGINT or SIGTERM; return summary lines, and whether SIGTERM ended it.
 
     SIGHUP reloads nothing: it is logged and counted. RailfixError: a source, sink, file or setting is invalid, or two
     channels disagree.
@@ -194,7 +195,7 @@ def _hooks(
     *,
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
-    """Tables of results, state file, status line and watch of sensors; and streams' states where the file is used."""
+    """Return hooks for result tables, state file, status line and sensor checks, and stored stream states if used."""
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
 
     def say_balises(output: LiveOutput) -> None:

@@ -1,7 +1,7 @@
 """Display of a session: a log, and a status line if the terminal supports it.
 
-Counts and times of a session, as Prometheus text over HTTP. Checks that write into the log: sensors on board against
-the satellites, the track against the positions.
+Counts and times of a session are served as Prometheus text over HTTP. Checks of on-board sensors against the
+satellites, and of the track against the positions, are logged.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from railfix.run.sensor_checks import SensorChecks
 from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import Kind
 
-#: Lines that may wait for a terminal or a full disk.
+#: Number of lines that may wait for a terminal or a full disk.
 _WAITING: Final = 1000
 
 
 class _Terminal:
-    """The standard error output: lines of the log, and below them the status line, which is a `Text`."""
+    """Standard error output: lines of the log, and below them the status line, a `Text`."""
 
     def __init__(self, *, status: bool) -> None:
         self._console = Console(stderr=True, highlight=False)
@@ -69,14 +69,14 @@ class _Terminal:
 
 
 class _Behind(logging.Handler):
-    """Hands formatted lines, or whole records, to an outlet, so that logging never waits."""
+    """Logging handler that passes formatted lines, or records, to an outlet, so that logging never waits."""
 
     def __init__(self, outlet: Outlet[Any], *, line: logging.Formatter | None = None) -> None:
         super().__init__()
         self._outlet, self._line = outlet, line
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand over one line or record."""
+        """Pass on one line or record."""
         if self._line is None:  # arguments may change before they are written
             record = copy.copy(record)
             record.msg, record.args = record.getMessage(), None
@@ -144,7 +144,7 @@ class SessionLog:
         self._logger.info(sentence)
 
     def show(self, status: str) -> None:
-        """Renew the status line; nothing where the terminal has none."""
+        """Renew the status line, if the terminal has one."""
         if self.shows_status:
             self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
@@ -162,7 +162,7 @@ class SessionLog:
         self._terminal.close()
 
 
-#: Number of messages over which times are averaged.
+#: Number of messages over which time statistics are computed.
 _LAST: Final = 1000
 
 
@@ -184,7 +184,7 @@ class Metrics:
     _sent: float | None = None
 
     def took(self, seconds: float, outputs: Sequence[LiveOutput]) -> None:
-        """Count messages that are sent now, and their total processing time."""
+        """Count messages sent now, and their total processing time."""
         now = time.monotonic()
         for output in outputs:
             self.processing_s.append(seconds / len(outputs))
@@ -266,11 +266,12 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
         raise SettingsError(f"--metrics {address}: cannot be listened at ({error})") from None
 
 
-#: The sensors are checked after this time, at positions at least this far apart; the radar at this interval [ns].
+#: The sensors are checked after this time, at positions at least this far apart; the radar is checked at this interval
+#: [ns].
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
-#: Pieces of samples that are joined to one.
+#: Number of pieces of samples that are joined to one.
 _PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
 
@@ -323,7 +324,7 @@ class SensorWatch:
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
-            if len(self._samples) == _PIECES:  # a stream gives row by row, and each takes the room of a hundred
+            if len(self._samples) == _PIECES:  # a stream gives single rows, each with the memory of a hundred
                 self._blocks.append(_join(self._samples))
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
@@ -338,7 +339,7 @@ class SensorWatch:
                 self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_RADAR_NS, "ns"), FOREVER)
 
     def _look_at_radar(self) -> None:
-        """Compare the radar with the speeds by satellites since the last look."""
+        """Compare the radar with the satellite speeds since the last comparison."""
         time, speeds = _times(self._speed_ns[self._shown :]), np.array(self._speeds[self._shown :])
         now, self._radar = self._radar.between(_NEVER, time[-1]), self._radar.between(time[-1], FOREVER)
         for alarm in self._watch.take_samples(now.radar, time, speeds) if self._has_radar else ():
@@ -353,7 +354,7 @@ class SensorWatch:
         self._speed_ns, self._speeds, self._shown = self._speed_ns[kept], self._speeds[kept], min(self._shown, 1)
 
     def judge(self) -> None:
-        """Compare the sensors with the satellites so far, once."""
+        """Compare the sensors with the satellite data so far, once."""
         if self._judged:
             return
         self._judged = True
@@ -377,7 +378,7 @@ def _times(time_ns: list[int]) -> Datetimes:
 
 
 def _join(parts: list[SensorSamples]) -> SensorSamples:
-    """Return all parts as one, neighbours first: each sample is copied a few times, not once a part."""
+    """Return all parts as one, joining neighbours first: each sample is copied a few times, not once per part."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [early.merge(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
@@ -396,7 +397,7 @@ class PlaceWatch:
         self._done = False
 
     def take(self, output: LiveOutput) -> None:
-        """Take an output of the engine."""
+        """Process an output of the engine."""
         if self._done or output.result is None:
             return
         for name, antenna in output.result.antennas.items():

@@ -1,7 +1,7 @@
-"""Live positioning: epochs of one or two antennas in, one result and one message per period out.
+"""Live positioning: one result and one message per period from the epochs of one or two antennas.
 
-It uses the same `EpochProcessor` as for logs, one epoch at a time, and carries its state. Nothing is read from files
-and nothing grows: at most a few epochs wait for their pair, and expired records and SBAS messages are dropped.
+It applies the `EpochProcessor` of logs to one epoch at a time, and stores its state. It reads no files, and its memory
+is bounded: at most a few epochs wait for their pair, and expired records and SBAS messages are dropped.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].
 END_NS: Final = 1 << 62
-#: Number of epochs of one antenna that may wait; more than that means that the other antenna's clock differs.
+#: Number of an antenna's epochs that may wait; with more, the clocks of the two antennas differ.
 _LONGEST_QUEUE = 100
-#: Distance after which the order of the antennas is examined again [m].
+#: Distance after which the order of the antennas is checked again [m].
 _ORDER_STEP_M = 10.0
 
 
@@ -45,8 +45,8 @@ class LiveOutput:
     message: TrainMessage
     result: Result | None
     place: TrainPlace | None = None  #: Position of the message; None without input.
-    #: Parts that are sent: both; the rows of the result alone, because the message of its period has been sent before;
-    #: or such a message later, alone.
+    #: Parts that are sent: both; the rows of the result alone, because the message of the period has been sent already;
+    #: or a delayed message alone.
     part: Literal["both", "rows", "message"] = "both"
 
 
@@ -57,14 +57,15 @@ class EngineState:
     state: State
     done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
     last_tag: Mapping[str, int]  #: Last time tag of each antenna.
-    sequence: int  #: Number of the last message, or one that no message has reached when the next state is saved.
-    #: Direction in which the train's front end looks.
+    #: Number of the last message, or a higher one that no message reaches before the next state is saved.
+    sequence: int
+    #: Direction of the train's front end along the chainage.
     running: RunningEnd = field(default_factory=lambda: RunningEnd(direction=0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _FromSatellites:
-    """Records, SBAS messages and epochs of a base station; `heard` counts such arrivals."""
+    """Records, SBAS messages and epochs of a base station; `heard` counts these arrivals."""
 
     heard: int
     navigation: Navigation | None = None
@@ -72,7 +73,7 @@ class _FromSatellites:
     base: Observations | None = None
 
     def with_later(self, later: _FromSatellites) -> _FromSatellites:
-        """Return both together."""
+        """Return this data merged with later data."""
         navigation, messages = self.navigation, self.messages
         if later.navigation is not None:
             navigation = later.navigation if navigation is None else merge_navigation(navigation, later.navigation)
@@ -86,7 +87,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """An epoch that waits for its pair; `heard` counts the data from satellites received before it."""
+    """An epoch that waits for its pair; `heard` counts the satellite data received before it."""
 
     epoch: Observations
     arrived_ns: int
@@ -99,15 +100,15 @@ class _Waiting:
 
 
 class LiveEngine:
-    """Positions of epochs as they arrive; compiled kernels are loaded when it is made.
+    """Positions of epochs as they arrive; compiled kernels are loaded at construction.
 
     Attributes
     ----------
     counts : Counter of str
-        Epochs by what became of them: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
-        "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
-        "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and the like (not heard up to
-        the epoch in time).
+        Epochs by outcome: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
+        "tag step", "restart", "no input", "superseded" (processed, but the message of the period was of a newer epoch),
+        "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and other sensors (no samples
+        up to the epoch in time).
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
@@ -145,15 +146,15 @@ class LiveEngine:
         self._tolerance_ns = round(processor.config.antenna_pair.tag_tolerance_s * 1e9)
 
     def add_navigation(self, navigation: Navigation) -> None:
-        """Take navigation records; they are used from the next epoch on."""
+        """Add navigation records; they are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, navigation=navigation))
 
     def add_sbas(self, messages: SbasMessages) -> None:
-        """Take SBAS messages; they are used from the next epoch on."""
+        """Add SBAS messages; they are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
 
     def add_base(self, epoch: Observations) -> None:
-        """Take an epoch of the base station; it is used from the next epoch on."""
+        """Add an epoch of the base station; it is used from the next epoch on."""
         if self._based_to is not None and epoch.time[0] <= self._based_to:
             self.counts["base station out of order"] += 1
             return
@@ -161,13 +162,13 @@ class LiveEngine:
         self._hear(_FromSatellites(heard=self._heard + 1, base=epoch))
 
     def add_samples(self, sensed: Sensed) -> None:
-        """Take samples of a sensor on board that was named when the engine was made."""
+        """Add samples of an on-board sensor that was named at construction."""
         self._heard_to[sensed.sensor] = np.fmax(self._heard_to[sensed.sensor], sensed.until)
         if sensed.samples:
             self._samples = self._samples.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
-        """Return the sensors that have not been received up to an epoch."""
+        """Return the sensors without samples up to an epoch."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
@@ -184,7 +185,7 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session; `reserved` message numbers are skipped for a crash."""
+        """Return the state for a restarted session; `reserved` message numbers are skipped, in case of a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch to continue from has been received
             return replace(self._saved, sequence=sequence)
@@ -196,13 +197,13 @@ class LiveEngine:
     def resume(self, saved: EngineState) -> None:
         """Continue from a saved state, if the first epoch comes within `LiveSettings.state_age_s` of its last one.
 
-        Otherwise its navigation records, SBAS messages and sequence number alone are used; `reports` say which.
+        Otherwise only its navigation records, SBAS messages and sequence number are used; `reports` states which case.
         """
         self._sequence = max(self._sequence, saved.sequence)
         self._saved = saved if saved.done_ns else None
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
-        """Take one epoch of an antenna, at the clock of the computer on which `poll` is called."""
+        """Process an antenna's epoch, received at a time of the clock that is used for `poll`."""
         if antenna not in self._waiting:
             raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)
@@ -226,7 +227,7 @@ class LiveEngine:
         queue.append(waiting)
 
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
-        """Take over a saved state where an epoch with this tag may follow it."""
+        """Use a saved state if an epoch with this tag may follow it."""
         self._saved = None
         age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
@@ -271,7 +272,7 @@ class LiveEngine:
         return True
 
     def _restart(self) -> None:
-        """Restart after a receiver's restart: only data received from satellites are kept."""
+        """Restart after a receiver's restart, keeping only data received from satellites."""
         self.counts["restart"] += 1
         self.lag.reset()
         self.reports.append("a receiver came back with older time tags: positioning restarts")
@@ -282,11 +283,11 @@ class LiveEngine:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return the messages due: of complete pairs, of epochs that waited long enough, of periods without input.
+        """Return the messages due, for complete pairs, epochs that waited long enough, and periods without input.
 
         `now_ns` is on the clock that `push` was given, `sent_ns` the GPS time of sending for the message; one message
-        is then sent per period, for the newest epoch. Without it (recorded epochs, the clock is that of their tags)
-        every epoch has its message; at `END_NS` all waiting epochs are due, and no period without input follows.
+        is then sent per period, for the newest epoch. Without it (recorded epochs, whose tags are the clock) every
+        epoch has its message; at `END_NS` all waiting epochs are due, and no period without input follows.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -307,13 +308,13 @@ class LiveEngine:
         return numbered
 
     def _patience_ns(self) -> int:
-        """Return the longest time without a message: half a period more than one after per epoch, then one period."""
+        """Return the longest time without a message: one and a half periods after an epoch, then one period."""
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
-        """Outputs of which at most one carries the message: the newest, half a period after the last one at least.
+        """Return outputs, at most the newest with a message, half a period after the last message at least.
 
-        The newest message of epochs that came too early waits until a period after the last one, unless a newer one
+        The newest message of too early epochs waits until one period after the last message, unless a newer message
         replaces it.
         """
         if self._due_ns is None:
@@ -422,7 +423,7 @@ class LiveEngine:
             self._notes = notes
 
     def _check_order(self, result: Result) -> None:
-        """Tell once where the positions have the antennas in the wrong order."""
+        """Report once if the positions have the antennas in the wrong order."""
         if self._order is None or len(result.antennas) < 2:
             return
         front, rear = (result.antennas[name] for name in ("front", "rear"))

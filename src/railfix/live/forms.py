@@ -1,9 +1,9 @@
-"""Forms of a message: bytes of one output.
+"""Forms of a message: encode one output as bytes.
 
-``json`` (a line a message), ``cbor`` (`railfix.io.train_message`; in files and streams each message comes after its
-length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (TPV of gpsd), ``etcs`` (position
-report of SUBSET-026, packet 0, a line of JSON), ``positions``, ``train`` and ``passings`` (rows of the tables of
-results, a line of JSON each).
+``json`` (one line per message), ``cbor`` (`railfix.io.train_message`; in files and streams each message is preceded by
+its length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (gpsd TPV report), ``etcs``
+(position report of SUBSET-026, packet 0, one JSON line), ``positions``, ``train`` and ``passings`` (rows of the result
+tables, one JSON line per row).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from railfix.pipeline.result_tables import passing_table, positions_table, train
 from railfix.pipeline.results import Result
 
 Form = Callable[[LiveOutput], bytes]
-#: Longest doubt of a position report, with room for the rounding of the distance [cm].
+#: Largest uncertainty in a position report, less a margin for the rounding of the distance [cm].
 _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
@@ -74,7 +74,7 @@ def gga_sentence(output: LiveOutput) -> bytes:
 
 
 def tpv_bytes(output: LiveOutput) -> bytes:
-    """Return a report of gpsd's class TPV as a line of JSON; heights are above the ellipsoid (altHAE)."""
+    """Return a gpsd TPV report as a JSON line; heights are above the ellipsoid (altHAE)."""
     place = _geodetic(output)
     report: dict[str, Any] = {"class": "TPV", "device": "railfix", "mode": 1, "time": _utc(output.message)[:23] + "Z"}
     if place is not None:
@@ -87,9 +87,9 @@ def tpv_bytes(output: LiveOutput) -> bytes:
 
 
 def etcs_form(settings: LiveSettings) -> Form:
-    """Position reports of SUBSET-026, packet 0, against the reference location of the settings, a line of JSON each.
+    """Return the form of SUBSET-026 position reports, packet 0, from the settings' reference location, as JSON lines.
 
-    Nothing without a position of the front end, and where a doubt exceeds the range of the packet (327 km).
+    There is no report without a position of the front end, or if the uncertainty exceeds the packet's range (327 km).
     """
 
     def etcs_bytes(output: LiveOutput) -> bytes:
@@ -104,7 +104,7 @@ def etcs_form(settings: LiveSettings) -> Form:
     return etcs_bytes
 
 
-#: Tables of results, each None where an epoch has no rows of it.
+#: Result tables, each None if an epoch has no rows for it.
 TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
     "positions": positions_table,
     "train": lambda result: train_table(result) if result.fusion else None,
@@ -113,7 +113,7 @@ TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
 
 
 def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
-    """Return the rows of a table, a line of JSON each; nothing without input or rows."""
+    """Return the form of a table's rows, one JSON line per row; empty without input or rows."""
 
     def rows_bytes(output: LiveOutput) -> bytes:
         table = None if output.result is None else table_of(output.result)
@@ -122,12 +122,12 @@ def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
     return rows_bytes
 
 
-#: Forms that are rows of `TABLES`.
+#: Forms with rows of `TABLES`.
 ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.items()}
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
-    """Return the rows as lines of JSON, all digits; null for missing numbers, infinities as words."""
+    """Return the rows as JSON lines with all digits; null for missing numbers, words for infinities."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
     lines = []
     for row in texts.iter_rows(named=True):
@@ -160,13 +160,13 @@ def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
 
 
 def _utc(message: TrainMessage) -> str:
-    """Return UTC of a message, ISO 8601 to the microsecond."""
+    """Return the UTC time of a message, ISO 8601 to the microsecond."""
     gpst = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
     return str((gpst - gpst_minus_utc(gpst).astype("timedelta64[s]")).astype("datetime64[us]"))
 
 
 def _angle(value: float, digits: int) -> str:
-    """Return degrees and minutes as NMEA writes them, ddmm.mmmmmmm."""
+    """Return degrees and minutes in NMEA format, ddmm.mmmmmmm."""
     minutes = round(abs(value) * 60.0, 7)
     return f"{int(minutes // 60):0{digits}d}{minutes % 60:010.7f}"
 
@@ -179,11 +179,11 @@ def _sentence(body: str) -> bytes:
 
 
 def wants(form: Form, output: LiveOutput) -> bool:
-    """Return whether a form takes an output: rows of tables those with rows, all others those with a message."""
+    """Return whether a form applies to an output: table forms if it has rows, all others if it has a message."""
     return output.part != ("message" if form in ROW_FORMS.values() else "rows")
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:
-    """Return a message for a target that keeps messages apart: without the length that streams need."""
+    """Return a message for a target that separates messages: without the length that streams need."""
     data = form(output)
     return data[2:] if form is cbor_bytes else data

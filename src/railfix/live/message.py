@@ -22,7 +22,7 @@ from railfix.tracking import Kind, TrackStatus
 
 #: Sigmas of the speed's bound: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
 _SPEED_K = 5.33
-#: Bounds are wider by this, so that they hold for chainages that are rounded to centimetres [m].
+#: Widening of bounds for chainages rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
@@ -49,26 +49,27 @@ def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, ti
 class TrainPlace:
     """Position of the train's reference point at the last epoch of a result."""
 
-    antenna: str  #: Antenna that it is from.
+    antenna: str  #: Antenna that determines the position.
     #: Chainage of the reference point; NaN without a position.
     chainage_m: float
     sigma_m: float
-    #: Bound of its error, and the protection level under it; infinite where no bound exists.
+    #: Bound of its error, and the protection level included in it; infinite where no bound exists.
     bound_m: float
     level_m: float
     status: MessageStatus
     moving: int  #: Direction of the speed against chainage, 0 where the speed is too small.
-    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna there; None without a position.
+    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna at this position; None without a
+    #: position.
     geodetic: tuple[float, float, float] | None
 
 
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the position of the train: of the antennas, each reduced to the reference point, the one with the best
-    bound.
+    """Return the position of the train by the antenna with the best bound, reduced to the reference point.
 
-    The position is that of the filter along the track where it runs, otherwise that of the single epoch. The bound is
-    the filter's over- and under-reading amount where it has a level (`tracking.level`); otherwise the protection level
-    of the single epoch, widened by the distance of the filter's position from it, so that it is valid for both.
+    The position is computed by the filter along the track where it runs, otherwise by the single epoch. The bound is
+    the filter's over- and under-reading amount where it has a protection level (`tracking.level`); otherwise the
+    protection level of the single epoch, widened by the distance of the filter's position from it, so that it is valid
+    for both.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
     return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
@@ -98,7 +99,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     # The bound of a position that failed a check does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
-    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # without a bound none is sent
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # without a bound no position is sent
         bound = math.inf
     moving = int(track.direction[-1]) if track is not None and len(track) else 0
     return TrainPlace(
@@ -121,9 +122,9 @@ def create_message(
 ) -> TrainMessage:
     """Return the message of one processed epoch; the sender numbers it.
 
-    `running` is the direction in which the train's front end looks. The chainage is that of the front end; its bounds
-    are those of the position, wider where either end of the train may be ahead. Where the front end is unknown they are
-    those of the reference point. A doubtful position has no bounds.
+    `running` is the direction of the train's front end. The message has the front end's chainage and the bounds of the
+    position, wider where either end of the train may be ahead. Where the front end is unknown, it has the reference
+    point's chainage and bounds. A doubtful position has no bounds.
     """
     antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
@@ -192,13 +193,13 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the worst interference of the antennas at the last epoch; None without this check."""
+    """Return the antennas' worst suspected interference at the last epoch; None without this check."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
-    """Return the measurements of the filter at the last epoch, besides codes."""
+    """Return the measurements used by the filter at the last epoch, besides codes."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
@@ -213,7 +214,7 @@ def _has_place(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
 
 
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
-    """Position [m], NaN without one, and its accuracy."""
+    """Return the position [m], NaN without one, and its status."""
     place = float(antenna.chainage_m[-1])
     if not _has_place(track):
         if not math.isfinite(place):

@@ -1,4 +1,4 @@
-"""A live session: sources to engine to sinks, until the sources end or the program is stopped."""
+"""Live session from sources through the engine to sinks, until the sources end or the program is stopped."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from railfix.ranges.sbas import from_receiver
 
 #: Number of items that may wait for the processor before a source is paused.
 _LONGEST_QUEUE: Final = 64
-#: How often the status is shown [s].
+#: Period of the status line [s].
 _STATUS_S: Final = 0.5
 
 #: Name of the source that is a base station.
@@ -53,7 +53,7 @@ class Hooks:
     #: Called every `LiveSettings.state_every_s`, in idle time, with the state for a restart.
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None  #: Called with a text for the status line, twice a second.
-    metrics: Metrics = field(default_factory=Metrics)  #: Counted in, and returned.
+    metrics: Metrics = field(default_factory=Metrics)  #: Metrics of the session, which are returned.
 
 
 async def run_session(
@@ -72,15 +72,15 @@ async def run_session(
     Parameters
     ----------
     sources : mapping of str to str
-        By antenna, and of a base station (`BASE`); see `railfix.live.sources.read_source`.
+        Source of each antenna, and of a base station (`BASE`); see `railfix.live.sources.read_source`.
         RINEX observation files are replayed as well.
     speed : float or None
-        For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
-        tags (set `LiveSettings.no_input` to "skip" for one message per epoch and no more).
+        Replay speed of recorded files relative to real time. None: as fast as possible; the time tags are then the
+        clock (set `LiveSettings.no_input` to "skip" for exactly one message per epoch).
     sensors : mapping of str to str, optional
-        Streams of sensors on board (`railfix.live.stream`) by name; the engine has tables of files before.
+        Streams of on-board sensors (`railfix.live.stream`) by name; tables from files are given to the engine before.
     date : datetime64, optional
-        Some time within half a week of RTCM 3 streams, whose observations carry no week: now where they are live.
+        Time within half a week of RTCM 3 streams, whose observations have no week number; now for live streams.
     streams : mapping of str to ReceiverState, optional
         State of the receivers' streams to continue from.
 
@@ -89,7 +89,7 @@ async def run_session(
     InputFileError
         A source cannot be opened, or breaks and is not opened again; a sensor's stream begins with another table.
     OutputError
-        A sink of a replay cannot be written: raised at the end, when the others are complete, or when none is left.
+        A sink of a replay cannot be written; raised at the end, when the other sinks are complete, or if none is left.
     ChannelsDisagreeError
         Two channels differ.
     """
@@ -129,7 +129,7 @@ async def run_session(
 
 @dataclass(kw_only=True)
 class _Session:
-    """A running session: its parts, the states of its streams, and times of the last actions (monotonic).
+    """Running session, with its parts, the states of its streams, and monotonic times of the last actions.
 
     `read_to_ns` has the latest tag received from each source that has not ended, -1 before the first; `place` is the
     last position as a GGA sentence, for a virtual base station.
@@ -142,7 +142,7 @@ class _Session:
     streams: dict[str, ReceiverState] = field(default_factory=dict)
     read_to_ns: dict[str, int] = field(default_factory=dict)
     place: bytes = b""
-    #: Time of sending, GPS time since 1980 [ns]: of the computer, or of files that are replayed at their own pace.
+    #: Time of sending, GPS time since 1980 [ns], by the computer, or by files that are replayed at their own pace.
     clock: Callable[[], int] = field(default_factory=lambda: gps_now_ns)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
@@ -177,10 +177,9 @@ class _Session:
                         tag_ns = self.take(name, received, None if replay else now)
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
                 if self.engine.lag.skipped and not queue.empty() and now < due:
-                    continue  # epochs that are skipped cost no answer of a second channel
+                    continue  # skipped epochs need no answer of a second channel
                 due = now + round(5e8 * self.engine.settings.period_s)
-                # In a replay the clock is the tag up to which all files have been read: no pair is torn, whatever file
-                # is ahead.
+                # In a replay the clock is the tag up to which all files have been read, so that no pair is separated.
                 clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, self.clock())
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
@@ -290,7 +289,7 @@ class _Session:
                 raise
 
     def in_idle_time(self, outputs: Sequence[LiveOutput]) -> None:
-        """Status and state, while no data wait."""
+        """Show the status and save the state while no data wait."""
         now = time.monotonic()
         if self.hooks.show is not None and outputs and now - self.shown >= _STATUS_S:
             self.shown = now
@@ -302,19 +301,19 @@ class _Session:
 
     @property
     def reserved(self) -> int:
-        """Numbers of messages for ten times between two states: none is sent twice after a crash."""
+        """Return the number of messages in ten state periods, so that no number is sent twice after a crash."""
         settings = self.engine.settings
         return math.ceil(10.0 * settings.state_every_s / settings.period_s)
 
     def save(self, *, reserved: int = 0) -> None:
-        """Pass the state for a restart, where requested."""
+        """Pass on the state for a restart, where requested."""
         if self.hooks.save is not None:
             streams = {name: state.after_break() for name, state in self.streams.items()}
             self.hooks.save(SavedSession(engine=self.engine.export_state(reserved=reserved), streams=streams))
 
 
 class _Pace:
-    """Waits until a recorded time tag is due: one for all files, counted from the earliest of their first tags."""
+    """Common pace of all files: waits until a time tag is due, counted from the earliest first tag."""
 
     def __init__(self, speed: float, files: Sequence[str]) -> None:
         self._speed = speed
@@ -333,7 +332,7 @@ class _Pace:
         await asyncio.sleep(max(0.0, due - asyncio.get_running_loop().time()))
 
     def now_ns(self) -> int:
-        """Return the time of the recording, GPS time since 1980 [ns]; of the computer before the first tag."""
+        """Return the time of the recording, GPS time since 1980 [ns]; before the first tag the computer's time."""
         if not self._first or not self._all_known.is_set():
             return gps_now_ns()
         elapsed_s = (asyncio.get_running_loop().time() - self._began) * self._speed
@@ -348,13 +347,13 @@ class _Pace:
 
 
 class _InTurn:
-    """Holds back a file that has been read farther than another one, so that none of its epochs pile up unpaired."""
+    """Order of reading: delays a file that is ahead of another one, so that its epochs do not accumulate unpaired."""
 
     def __init__(self, read_to_ns: Mapping[str, int]) -> None:
         self._read_to_ns = read_to_ns
 
     async def wait(self, name: str, tag: np.datetime64) -> None:
-        """Wait until no other file is behind this one, and that of a base station has been read up to the tag."""
+        """Wait until no other file is behind this one, and a base station's file has been read up to the tag."""
         tag_ns = int((tag - GPS_EPOCH).astype(np.int64))
         while self._read_to_ns[name] > min(self._read_to_ns.values()) or (
             name != BASE and self._read_to_ns.get(BASE, tag_ns) < tag_ns
@@ -362,7 +361,7 @@ class _InTurn:
             await asyncio.sleep(0)
 
     def ended(self, name: str) -> None:
-        """No wait: ended sources are not in the table."""
+        """Do nothing: ended sources are not in the table."""
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:

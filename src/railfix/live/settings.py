@@ -16,15 +16,15 @@ from railfix.run.output import Overwrite
 class LiveSettings(Settings):
     """Settings of live operation."""
 
-    #: A message is due every period, also without input (P1 2.1: 0.1 s).
+    #: Period of messages, also without input (P1 2.1: 0.1 s).
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
     #: Longest wait for the other antenna's epoch after the first one of a pair has arrived.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    #: Longest wait for samples of the sensors on board up to an epoch; missing samples since the previous epoch are
-    #: then left out.
+    #: Longest wait for on-board sensor samples up to an epoch; samples still missing since the previous epoch are then
+    #: not used.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"  #: Whether a period without input has a message.
-    #: Epochs in a row with tags before the last one after which the receiver counts as restarted.
+    #: Consecutive epochs with tags before the last one after which the receiver is considered restarted.
     restart_epochs: int = Field(default=3, ge=1)
     #: Whether a connection that broke is opened again, with waits that double from `reconnect_first_s` to
     #: `reconnect_longest_s`; off, the session ends with its sources. The first connection must succeed in any case.
@@ -32,36 +32,36 @@ class LiveSettings(Settings):
 
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: A connection without a byte for this time counts as broken.
+    #: A connection without a byte for this time is considered broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: How often the caster of the base station is sent the train's position (GGA), for a virtual station; 0: never.
+    #: Period at which the train's position (GGA) is sent to the base station's caster, for a virtual station; 0: never.
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    #: Additional certificates (PEM) of casters over TLS, besides those of the system.
+    #: Certificates (PEM) of casters over TLS, in addition to the system's certificates.
     ntrip_certificates: Path | None = None
     #: Messages that may wait for a slow target; further ones are dropped for it and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Delay above the shortest one seen at which epochs are skipped up to the present, with a log line; not for
+    #: Delay above the shortest observed delay at which epochs are skipped up to the present, with a log line; not for
     #: recorded epochs.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
-    state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: How often the state file is written.
-    #: Longest time from the last epoch of a state file to the first new one; after it only ephemerides and the sequence
-    #: number are used.
+    state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Period at which the state file is written.
+    #: Longest time from the last epoch of a state file to the first new one; after a longer time only ephemerides and
+    #: the sequence number are used.
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
-    #: Size at which a log file is put aside, and how many of these are kept.
+    #: Size at which a log file is rotated, and number of rotated files.
     log_bytes: int = Field(default=1_000_000, ge=1000)
     log_files: int = Field(default=5, ge=1, le=1000)
     #: Identities for the message.
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
-    #: Direction in which the end of the train looks that runs ahead at the start, against rising chainage; 0 where
-    #: unknown. None: from the vehicle file. A train that runs the other way for 50 m has changed ends.
+    #: Direction along the chainage of the train's leading end at the start; 0 where unknown. None: from the vehicle
+    #: file. A train that runs the other way for 50 m has changed ends.
     facing: Literal[-1, 0, 1] | None = None
-    #: Front end of the train ahead of the front antenna. None: from the vehicle file, by its length.
+    #: Distance of the train's front end ahead of the front antenna. None: from the vehicle file, by its length.
     front_offset_m: float | None = Field(default=None, ge=0.0)
-    length_m: float | None = Field(default=None, gt=0.0)  #: Train length. None: that of the vehicle file.
+    length_m: float | None = Field(default=None, gt=0.0)  #: Train length. None: from the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
     reference: int = Field(default=0, ge=0, lt=1 << 24)
-    reference_m: float = 0.0  #: Its chainage.
+    reference_m: float = 0.0  #: Chainage of this reference location.
 
 
 #: Sensors on board.

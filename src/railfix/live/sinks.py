@@ -1,7 +1,7 @@
-"""Where messages go: ``FORM@TARGET``, with queues before slow targets.
+"""Sinks of messages, ``FORM@TARGET``, with queues before slow targets.
 
-Forms: see `railfix.live.forms`. Targets: ``-`` (standard output), a file, ``udp://HOST:PORT`` (a datagram a message),
-``tcp-server://HOST:PORT`` (everybody who connects), ``mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC``.
+Forms: see `railfix.live.forms`. Targets: ``-`` (standard output), a file, ``udp://HOST:PORT`` (one datagram per
+message), ``tcp-server://HOST:PORT`` (all clients that connect), ``mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC``.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _CLOSE_S = 5.0
 
 
 class Outlet(Generic[Item]):
-    """A target behind a queue and a thread of its own, in which `send` takes one item.
+    """Target with its own queue and thread, in which `send` processes one item.
 
-    `full` selects the treatment of an item when the queue is full: dropped and counted ("drop", live), or waited for
-    ("wait", replay of recorded files). `dropped` counts those, `failed` the items that the target refused; `failure` is
-    why the last one was, blank after one that was taken.
+    `full` selects the action when the queue is full: drop and count the item ("drop", live), or wait ("wait", replay of
+    recorded files). `dropped` counts dropped items, `failed` items that the target refused; `failure` is the reason for
+    the last refusal, blank after an accepted item.
     """
 
     def __init__(self, name: str, send: Callable[[Item], None], *, waiting: int, full: str = "drop") -> None:
@@ -50,7 +50,7 @@ class Outlet(Generic[Item]):
         self._thread.start()
 
     def send(self, item: Item) -> None:
-        """Hand over one item; OutputError when the target refuses items, and none may be lost."""
+        """Pass on one item; OutputError if the target refuses items and none may be lost."""
         if self._defect is not None:
             raise self._defect
         if self._full == "wait":
@@ -71,7 +71,7 @@ class Outlet(Generic[Item]):
             except (OSError, OutputError) as error:
                 self.failed += 1
                 self.failure = f"cannot be written ({getattr(error, 'strerror', None) or error})"
-            except Exception as error:  # noqa: BLE001 (a defect: raised where the next item is handed over)
+            except Exception as error:  # noqa: BLE001 (a defect: raised when the next item is passed on)
                 self._defect = error
                 self.failure = f"has ended by a defect ({error!r})"
                 self.failed += 1
@@ -90,7 +90,7 @@ class Outlet(Generic[Item]):
             raise OutputError(f"{self.name}: {self.failure}")
 
 
-#: Bytes that may wait for a slow reader of a TCP sink; more and the reader is disconnected.
+#: Bytes that may wait for a slow reader of a TCP sink; with more, the reader is disconnected.
 _LARGEST_BACKLOG: Final = 1 << 20
 #: Longest wait for the answer of an MQTT broker [s].
 _ANSWER_S: Final = 10.0
@@ -103,15 +103,15 @@ _HELP: Final = (
 
 
 class Sink(Protocol):
-    """A receiver of outputs that never waits, and counts the outputs that its reader has missed."""
+    """Receiver of outputs that never waits, and counts the outputs that its reader has missed."""
 
     name: str  #: For counts and messages.
-    dropped: int  #: Messages that the reader was too slow for.
-    failed: int  #: Messages that the target refused.
-    failure: str  #: Why the last message was refused; blank where it was not.
+    dropped: int  #: Number of messages dropped for a slow reader.
+    failed: int  #: Number of messages that the target refused.
+    failure: str  #: Reason for refusing the last message; blank if it was accepted.
 
     def send(self, item: LiveOutput, /) -> None:
-        """Take one output."""
+        """Process one output."""
 
     def close(self) -> None:
         """Send the remaining items, and release resources."""
@@ -141,7 +141,7 @@ class ByteTarget:
 
 @dataclass
 class UdpTarget:
-    """A datagram a message."""
+    """UDP target, one datagram per message."""
 
     form: Form
     address: tuple[str, int]
@@ -158,7 +158,7 @@ class UdpTarget:
 
 
 class MqttTarget:
-    """Messages published under a topic of an MQTT broker, at most once; a broken connection is opened again."""
+    """Target that publishes messages under an MQTT topic, at most once; a broken connection is opened again."""
 
     def __init__(self, form: Form, url: str, *, waiting: int) -> None:
         with needs_extra("mqtt://"):
@@ -239,7 +239,7 @@ class OutletSink(Outlet[LiveOutput]):
 
 
 class TcpServerSink:
-    """Every connected client gets the messages from then on; a client that is too slow is disconnected."""
+    """TCP server whose clients receive the messages from their connection on; too slow clients are disconnected."""
 
     def __init__(self, form: Form, name: str) -> None:
         self.form, self.name = form, name
@@ -264,7 +264,7 @@ class TcpServerSink:
             writer.close()
 
     def send(self, output: LiveOutput) -> None:
-        """Send to everybody."""
+        """Send to all clients."""
         data = self.form(output) if wants(self.form, output) else b""
         for writer in list(self._readers):
             if writer.transport.get_write_buffer_size() > _LARGEST_BACKLOG:

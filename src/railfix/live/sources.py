@@ -42,20 +42,20 @@ _ONCE_MORE_S = 0.02
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
-_TELLING_BYTES: Final = 16  #: First bytes of a content that identify wrong kinds.
+_TELLING_BYTES: Final = 16  #: Number of first content bytes that identify wrong kinds.
 _OK: Final = 200  #: HTTP status of a successful answer.
 
 
 @dataclass(frozen=True)
 class Connected:
-    """A connection was opened; `broken` is how many times it had been lost before."""
+    """Event of an opened connection; `broken` is the number of earlier losses."""
 
     broken: int
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A connection broke; the next attempt follows after `wait_s`."""
+    """Event of a broken connection; the next attempt follows after `wait_s`."""
 
     reason: str
     wait_s: float
@@ -83,7 +83,7 @@ def is_file(source: str) -> bool:
 
 
 def hidden(source: str) -> str:
-    """Return a source as it may be shown: without the password."""
+    """Return a source without its password, to be shown."""
     parts = urlsplit(source)
     return source if parts.password is None else source.replace(f":{parts.password}@", ":***@", 1)
 
@@ -151,8 +151,8 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
     """Return the result of a call, or raise TimeoutError.
 
-    The result is checked once more at the end: data that arrived while this program was busy count. (`asyncio.wait_for`
-    may lose a cancellation that comes at the same moment.)
+    The result is checked once more at the end: data that arrived while this program was busy are used.
+    (`asyncio.wait_for` may lose a cancellation that comes at the same moment.)
     """
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
@@ -198,10 +198,10 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """Yield the bytes of a mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
+    """Yield the bytes of a mount point of an NTRIP caster, version 2, or version 1 if the caster answers with it.
 
-    With `LiveSettings.gga_s` it gets the train's position: in the request where it is known (NTRIP 2), and as lines
-    from then on, for the virtual station at that position.
+    With `LiveSettings.gga_s` the caster receives the train's position for a virtual station: in the request where it is
+    known (NTRIP 2), and then as lines.
     """
     if settings.gga_s == 0.0:
         place = None
@@ -244,7 +244,7 @@ class _Answer:
             import h11
         self._h11, self._source = h11, source
         self._client: Any = h11.Connection(our_role=h11.CLIENT, max_incomplete_event_size=_HEADER_BYTES)
-        self._first: bytes | None = b""  # up to the end of the first line; None once that is known
+        self._first: bytes | None = b""  # up to the end of the first line; None once the line is known
         self._content = b""  # the first bytes of the content
         self._broken: InputFileError | None = None
         self._plain = self.begun = self.ended = False
@@ -268,7 +268,7 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be asked for ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content of some more bytes; InputFileError where the mount point has no stream."""
+        """Return the content of further bytes; InputFileError if the mount point has no stream."""
         if self._first is not None:
             self._first += data
             if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:
@@ -287,7 +287,7 @@ class _Answer:
         return content
 
     def _decode(self, data: bytes) -> bytes:
-        """Return the content of some bytes of HTTP."""
+        """Return the content decoded from HTTP bytes."""
         content = bytearray()
         try:
             self._client.receive_data(data)
@@ -300,17 +300,17 @@ class _Answer:
                 elif isinstance(event, self._h11.EndOfMessage):
                     self.ended = True
                     break
-        except self._h11.RemoteProtocolError as error:  # bytes received before it count
+        except self._h11.RemoteProtocolError as error:  # bytes received before the error are used
             self._broken = InputFileError(hidden(self._source), f"the caster's answer is no HTTP ({error})")
         return bytes(content)
 
     def check(self) -> None:
-        """Raise InputFileError where the last bytes taken were no HTTP."""
+        """Raise InputFileError if the last bytes were not HTTP."""
         if self._broken is not None:
             raise self._broken
 
     def _check_head(self, response: Any) -> None:
-        """Raise InputFileError where an answer is no stream: refused, a source table, a page, or compressed."""
+        """Raise InputFileError if an answer is not a stream: refused, a source table, a page, or compressed."""
         if response.status_code != _OK:
             raise _refuse(self._source, f"{response.status_code} {response.reason.decode('latin-1')}".encode())
         head = {bytes(name).lower(): bytes(value).lower().strip() for name, value in response.headers}
@@ -323,7 +323,7 @@ class _Answer:
             raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not asked for")
 
     def _check_content(self, content: bytes) -> None:
-        """Raise InputFileError where the first bytes are not those of a receiver."""
+        """Raise InputFileError if the first bytes are not a receiver's."""
         if content.startswith(b"\x1f\x8b"):
             raise self._no_stream("compressed content (gzip), which was not asked for")
         if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
@@ -339,7 +339,7 @@ class _Answer:
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """Return TLS with the certificates of the system, and those of a file."""
+    """Return a TLS context with the system's certificates, and the certificates of a file."""
     context = ssl.create_default_context()
     if certificates is not None:
         try:
@@ -378,7 +378,7 @@ async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
         item: bytes | OSError = b""
         while not ended.is_set() and isinstance(item, bytes):
             try:
-                # The first byte, waited for, and all bytes that have arrived with it.
+                # Wait for the first byte, and read all bytes that have arrived with it.
                 item = bytes(port.read(1))
                 item += bytes(port.read(port.in_waiting)) if item else b""
             except OSError as error:

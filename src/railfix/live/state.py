@@ -1,8 +1,8 @@
 """State file: the state from which a restarted session continues, written regularly, checked before use.
 
-A line of JSON identifies the state: versions, hashes of map, vehicle and settings, length and SHA-256 of the rest; the
+A JSON line identifies the state: versions, hashes of map, vehicle and settings, length and SHA-256 of the rest; the
 state itself follows. It is read back only if all of these are equal, and contains only plain values, arrays and data
-classes of this package (`railfix.live.state_values`): nothing in it is executed.
+classes of this package (`railfix.live.state_values`): no content is executed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FORM: Final = "railfix live state 5"
 
 @dataclass(frozen=True, kw_only=True)
 class SavedSession:
-    """State of a session: of the engine, and of each receiver's stream."""
+    """State of a session: the states of the engine and of each receiver's stream."""
 
     engine: EngineState
     streams: Mapping[str, ReceiverState]
@@ -39,7 +39,7 @@ class SavedSession:
 
 @dataclass(frozen=True, kw_only=True)
 class Loaded:
-    """A state file as it was found."""
+    """Outcome of reading a state file."""
 
     session: SavedSession | None  #: None where the file is not used.
     outcome: str  #: One sentence for the log.
@@ -48,7 +48,7 @@ class Loaded:
 def belongs_to(
     files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Inputs that a state depends on (files by their role, settings, antennas); a state of other inputs is not used."""
+    """Return the inputs that a state must agree with to be used: files by role, settings, and antennas."""
     own = f"{railfix.__version__} ({source_commit()})"
     return {
         "version": f"railfix {own}, numpy {np.__version__}, Python {platform.python_version()}",
@@ -79,7 +79,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     """Read a state file, if there is one that belongs to this session (`belongs_to`).
 
-    OutputError: the file is something else, which the session would overwrite.
+    OutputError: the file is not a state file, and the session would overwrite it.
     """
     try:
         data = path.read_bytes()

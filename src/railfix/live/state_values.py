@@ -20,7 +20,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-#: Containers by the name under which they are written.
+#: Containers by their names in the file.
 _MAPPINGS: Final[dict[str, Any]] = {
     "dict": dict, "proxy": MappingProxyType, "counter": Counter, "ordered": OrderedDict,
 }  # fmt: skip
@@ -32,7 +32,7 @@ class StateFormatError(ValueError):
 
 
 def encode(value: Any) -> bytes:
-    """Return a value of a state as the bytes of a NumPy archive; StateFormatError: it contains something else."""
+    """Return a value of a state as the bytes of a NumPy archive; StateFormatError: it contains an unsupported value."""
     arrays: list[np.ndarray[Any, Any]] = []
     tree = json.dumps(_encode(value, arrays))
     file = io.BytesIO()
@@ -41,7 +41,7 @@ def encode(value: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """Return the value that `encode` has written; StateFormatError: the bytes are something else."""
+    """Return the value that `encode` has written; StateFormatError: the bytes are not a state."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return _decode(json.loads(stored["tree"].tobytes()), stored)

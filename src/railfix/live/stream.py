@@ -1,9 +1,9 @@
-"""Epochs, navigation records, SBAS messages and sensor samples that the data of a source complete as they arrive.
+"""Epochs, navigation records, SBAS messages and sensor samples decoded from a source's data as they arrive.
 
-Samples arrive as lines: the rows of a CSV table as they are measured. The first line names the columns, as in the
-tables of ``railfix run``; it may come again after a break. A row with the time alone reports that nothing was measured
-until then: a tachometer at standstill sends no pulses, but such rows. `Lag` is the delay of a session behind its
-receivers, and selects the epochs to skip to return to the present.
+Samples arrive as lines, the rows of a CSV table. The first line names the columns, as in the tables of ``railfix run``;
+it may be repeated after a break. A row with the time alone reports that nothing was measured up to this time: a
+tachometer at standstill sends such rows instead of pulses. `Lag` is the delay of a session behind its receivers, and
+selects the epochs to skip to return to the present.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from railfix.run.sensors import make_samples
 
 @dataclass(frozen=True, kw_only=True)
 class ReceiverState:
-    """State of a receiver's stream after some bytes."""
+    """State of a receiver's stream after the bytes received so far."""
 
     stream: StreamState = field(default_factory=StreamState)
     tracking: Tracking = field(default_factory=Tracking)
@@ -60,11 +60,10 @@ class ReceivedData:
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
-    """Yield the items completed by a chunk of a receiver's bytes, in the order of the stream, independent of the
-    chunks.
+    """Yield the items completed by a chunk of a receiver's bytes, in stream order, independent of the chunk boundaries.
 
     Each item ends with the message that completes an epoch, so that its navigation records precede its epoch.
-    The state for the next chunk is that of the last item, `ReceivedData.after`; there is always one. Epochs with
+    The state for the next chunk is `ReceivedData.after` of the last item; there is always an item. Epochs with
     repeated or older time tags are kept: `LiveEngine.push` judges them.
     """
     kept = len(state.stream.rest)
@@ -127,7 +126,7 @@ Item = TypeVar("Item")
 def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState:
     """Return the state of a stream before its first byte; `date` as for `railfix.live.run_session`."""
     if date is None and not is_file(source):
-        date = np.datetime64(time.time_ns(), "ns")  # leap seconds do not matter here
+        date = np.datetime64(time.time_ns(), "ns")  # leap seconds are irrelevant here
     return ReceiverState() if date is None else ReceiverState(stream=StreamState(time=date.astype("datetime64[ns]")))
 
 
@@ -158,7 +157,7 @@ async def next_arrival(
 ) -> Item | None:
     """Return the next item that the pumps have put; None after `wait_s`, or when one has ended by an error."""
     if not queue.empty():
-        await asyncio.sleep(0)  # signals act also where data come faster than they are processed
+        await asyncio.sleep(0)  # signals are handled even if data arrive faster than they are processed
         return queue.get_nowait()
     getting = asyncio.ensure_future(queue.get())
     running = [pump for pump in pumps if not pump.done()]
@@ -169,11 +168,11 @@ async def next_arrival(
     return None
 
 
-#: After every epoch.
+#: Time after every epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
 #: Columns without which a row contains only its time.
 _NEEDED: Final = ("pulse", "range_m")
-#: Columns of names.
+#: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
 #: Longest line; a longer one is not a row.
 _LINE_BYTES: Final = 4096
@@ -185,12 +184,12 @@ class Sensed:
 
     sensor: str
     samples: SensorSamples = field(default_factory=SensorSamples)
-    #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` of a whole table.
+    #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a complete table.
     until: np.datetime64
     skipped: int = 0  #: Lines that are not rows, or whose time is before that of the previous row.
 
     def count_unsurveyed(self, units: GroundUnits | None) -> int:
-        """Count the ranges to ground units that are not among these, which are not used."""
+        """Count the unused ranges to ground units without surveyed positions."""
         return int(np.count_nonzero(~np.isin(self.samples.ranging.station, () if units is None else units.name)))
 
 
@@ -198,19 +197,19 @@ class Sensed:
 class SensorLines:
     """Rows of one sensor's stream."""
 
-    #: Which of `railfix.motion.samples.SENSORS`, and its source for the messages.
+    #: Sensor of `railfix.motion.samples.SENSORS`, and its source for the messages.
     sensor: str
     source: str
     columns: tuple[str, ...] = ()  #: Names of the columns; empty before the header line.
     until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last row.
-    rest: bytes = b""  #: Line that has no end yet.
+    rest: bytes = b""  #: Incomplete last line.
 
     def after_break(self) -> None:
         """Begin a new line where the connection broke."""
         self.rest = b""
 
     def take(self, data: bytes) -> Sensed:
-        """Take some bytes, cut anywhere.
+        """Process a chunk of bytes with arbitrary boundaries.
 
         InputFileError: the first line is not the header of this sensor's table.
         """
@@ -248,7 +247,7 @@ class SensorLines:
         return tuple(cells)
 
     def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
-        """Return the time and values of a row, no values if it has the time alone; None for another line."""
+        """Return the time and values of a row, without values if it has the time alone; None for another line."""
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))
@@ -276,10 +275,10 @@ class SensorLines:
         return SensorSamples(**samples)
 
 
-#: Largest drift of the computer's clock against the receivers' time; the shortest delay is forgotten at this rate.
+#: Largest drift of the computer's clock against the receivers' time; the stored shortest delay grows at this rate.
 DRIFT: Final = 1e-4
-#: A delay that is constant within `STEADY_S` for this time and number of skipped epochs is one of the tags, not of the
-#: session: a session's delay becomes shorter, or longer where the computer is too busy even to skip [s].
+#: A delay that is constant within `STEADY_S` for this time [s] and number of skipped epochs is in the tags, not in the
+#: session: a session's delay decreases, or increases if the computer is too busy even to skip.
 ADMITTED_S: Final = 2.0
 STEADY_S: Final = 0.2
 STEADY_EPOCHS: Final = 5
@@ -289,7 +288,7 @@ STEADY_EPOCHS: Final = 5
 class Lag:
     """Delay of epochs above the shortest observed one, so that the clocks need not agree."""
 
-    behind_s: float  #: With a larger delay epochs are skipped until it is a quarter of that; infinite: never.
+    behind_s: float  #: With a larger delay epochs are skipped until it is a quarter of this limit; infinite: never.
     skipped: int = 0  #: Epochs skipped since the session fell behind.
     reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
     _shortest_ns: float | None = None
@@ -299,11 +298,11 @@ class Lag:
     _steady: int = 0
 
     def reset(self) -> None:
-        """Forget the shortest delay: the tags have another origin."""
+        """Reset the shortest delay, as the tags have a new origin."""
         self._shortest_ns, self.skipped = None, 0
 
     def skips(self, tag_ns: int, now_ns: int) -> bool:
-        """Return whether an epoch that is taken now is too old to be processed."""
+        """Return whether an epoch is too old to be processed now."""
         delay_ns = now_ns - tag_ns
         shortest = float(delay_ns) if self._shortest_ns is None else self._shortest_ns
         shortest = min(float(delay_ns), shortest + DRIFT * (now_ns - self._at_ns))

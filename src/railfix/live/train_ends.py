@@ -1,4 +1,4 @@
-"""One reference point of a train: reduction of its antennas to it, its two ends, and the end that runs ahead."""
+"""Reference point of a train, reduction of its antennas to this point, its two ends, and its leading end."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: Distance against the end that runs ahead after which the train has changed ends: farther than it rolls back [m].
+#: Distance run against the leading end after which the train has changed ends; longer than any rolling back [m].
 CHANGED_ENDS_M: Final = 50.0
 
 
 class Ends(NamedTuple):
     """Ends of a train along the line, from its reference point in the running direction [m]; NaN where unknown.
 
-    Without a running direction they are on either side.
+    Without a running direction the ends may be on either side.
     """
 
     front_m: float  #: Middle of the possible positions of the front end.
-    spread_m: float  #: Largest distance of the front end from it.
+    spread_m: float  #: Largest distance of the front end from this middle.
     foremost_m: float  #: No part of the train is farther ahead.
     rearmost_m: float  #: No part of the train is further behind.
 
@@ -41,8 +41,8 @@ class TrainFrame:
     trajectories: Mapping[str, Trajectory]
     facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
     running: int  #: Direction of the leading end at the start, 0 where unknown.
-    #: Front end of the train ahead of the reference point, its rear end behind it, and its length [m]; NaN where
-    #: unknown.
+    #: Distances of the train's front end ahead of the reference point and of its rear end behind it, and its length
+    #: [m]; NaN where unknown.
     front_m: float
     rear_m: float
     length_m: float
@@ -80,7 +80,7 @@ class TrainFrame:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on unknown properties of the train, and the settings that give them."""
+        """Sentences on unknown properties of the train, and the settings that provide them."""
         notes = []
         if not self.running:
             notes.append("the direction in which the train's front end looks is unknown until it has run 50 m: give a "
@@ -98,7 +98,7 @@ class TrainFrame:
         return tuple(notes)
 
     def reference_m(self, name: str, arc_m: float) -> float:
-        """Return the chainage of the reference point for a position of an antenna [m]; NaN where it is not known."""
+        """Return the chainage of the reference point for an antenna's position [m]; NaN where unknown."""
         trajectory = self.trajectories[name]
         if trajectory.body_chainage_m is not None:
             return float(trajectory.body_at(arc_m))
@@ -117,7 +117,7 @@ class TrainFrame:
         return first.at_arc(np.float64(arc_m))
 
     def ends(self, running: int) -> Ends:
-        """Return the ends where the train runs in a direction, 0 where unknown: then each end may be on either side."""
+        """Return the ends of a train running in a direction; with 0, unknown, each end may be on either side."""
         front, rear = self.front_m, self.rear_m
         if running and self.facing:
             front, rear = (front, rear) if running == self.facing else (rear, front)
@@ -125,22 +125,22 @@ class TrainFrame:
         longest, shortest = max(front, rear), min(front, rear)
         if not math.isfinite(front + rear):
             longest = shortest = math.nan
-        if running:  # which end of the vehicle is ahead is not known
+        if running:  # it is unknown which end of the vehicle is ahead
             return Ends((longest + shortest) / 2.0, (longest - shortest) / 2.0, longest, longest)
         return Ends(0.0 if math.isfinite(longest) else math.nan, longest, longest, longest)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunningEnd:
-    """Direction in which the end of the train that runs ahead looks, from the vehicle file and from motion.
+    """Direction of the train's leading end along the chainage, from the vehicle file and from motion.
 
-    The train has changed ends, or runs with an end ahead that was unknown before, once its reference point lies
+    The train has changed ends, or a previously unknown leading end is determined, once its reference point lies
     `CHANGED_ENDS_M` and both bounds beyond the farthest position in the other direction, while it moves that way.
     """
 
     direction: int  #: 1 toward rising chainage, -1 toward falling, 0 where unknown.
-    #: Chainage of the reference point since the last change: the lowest at most, the highest at least, by the bounds;
-    #: infinite before the first position.
+    #: Bounds of the reference point's chainage since the last change: upper bound of the lowest, lower bound of the
+    #: highest; infinite before the first position.
     low_m: float = math.inf
     high_m: float = -math.inf
     last_m: float = math.inf  #: Last chainage; infinite before the first.
@@ -150,7 +150,7 @@ class RunningEnd:
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # a gap, or once round a closed line
+        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # a gap, or one turn of a closed line
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction
         if moving > 0 and direction != 1 and reference_m - bound_m - low > CHANGED_ENDS_M:
@@ -162,7 +162,7 @@ class RunningEnd:
         return replace(self, direction=direction, low_m=low, high_m=high, last_m=reference_m)
 
     def sentence(self, before: RunningEnd) -> str | None:
-        """Return a sentence for the log where the direction is another one than before."""
+        """Return a sentence for the log if the direction has changed."""
         if self.direction == before.direction:
             return None
         side = "rising" if self.direction > 0 else "falling"

@@ -1,6 +1,6 @@
-"""Compilation of all kernels at the first command on a machine: later ones load them from disk.
+"""Compilation of all kernels at the first command on a machine; later commands load them from disk.
 
-During a live session it would delay epochs by seconds, and a run would pause without a message.
+Compilation during a live session would delay epochs by seconds, and a run would pause without a message.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ _WITH_FILTER: Final[tuple[dict[str, Any], int]] = ({"filter": "track", "protecti
 def prepare_kernels() -> bool:
     """Compile the kernels without cached machine code, with a message on a terminal; return whether there were any.
 
-    Epochs of the demonstration are processed in one call and one by one: kernels are compiled for the arrays of both.
-    InputFileError: neither the package nor the clone has the files of the demonstration.
+    Epochs of the demonstration are processed in one call and one by one: kernels are compiled for the arrays of both
+    cases. InputFileError: neither the package nor the clone has the files of the demonstration.
     """
     if kernels.is_compiled():
         return False
@@ -85,11 +85,11 @@ def compile_filter() -> None:
     state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
-    recursion.run(state, len(epochs), found=None, trace=None)  # of no epoch: the call compiles it
+    recursion.run(state, len(epochs), found=None, trace=None)  # a call without epochs compiles it
 
 
 def _read_logs() -> dict[str, Observations]:
-    """Read the first epochs of the demonstration, with a fault that RAIM looks for."""
+    """Read the first epochs of the demonstration, with a fault for RAIM to detect."""
     inputs, longest = demo_inputs(), max(epochs for _, epochs in (*_SINGLE_EPOCHS, _WITH_FILTER))
     logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
     strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
@@ -121,7 +121,7 @@ def _look_beyond() -> None:
 
 
 def _first_epochs(log: Path, count: int) -> Observations:
-    """Read the first epochs of a compact RINEX 3 log: plain Python would read the whole of it for long."""
+    """Read the first epochs of a compact RINEX 3 log: plain Python would need a long time for the whole file."""
     lines = hatanaka.decompress(log).decode("ascii").splitlines(keepends=True)
     begins = [number for number, line in enumerate(lines) if line.startswith(">")]
     with TemporaryDirectory() as folder:
@@ -131,5 +131,5 @@ def _first_epochs(log: Path, count: int) -> Observations:
 
 
 def _faulty(log: Observations, satellite: str) -> Observations:
-    """Return the log with the codes of a satellite 300 m too long: RAIM looks for it."""
+    """Return the log with a satellite's codes 300 m too long, for RAIM to detect."""
     return replace(log, code_m=log.code_m + np.where(log.satellite == satellite, 300.0, 0.0))

@@ -1,7 +1,8 @@
 """Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of a measured feature.
 
-P2 takes the points of change, not the values: slow biases do not matter then. A position is accepted where its distance
-to the earlier features agrees, the other quantity fits, and no other position explains the measurement nearly as well.
+P2 uses the points of change, not the values, so that slow biases have no effect. A position is accepted where its
+distance to the earlier features agrees, the other quantity fits, and no other position explains the measurement nearly
+as well.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _GAP_SIGMAS: Final = 3.0  #: Disagreement with the distance to the last accepted
 _FIT_LIMIT: Final = 3.0  #: Mean square of the other quantity's residual over its variance.
 SCALE_SIGMA: Final = 2e-3  #: Error of a distance by wheel, as a fraction.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
-HALF_LENGTH_M: Final = 60.0  #: Line before and behind a feature that is compared.
+HALF_LENGTH_M: Final = 60.0  #: Length of line before and behind a feature that is compared.
 #: A change of less than this fraction of another within `HALF_LENGTH_M` is the ripple of a curve through sparse points.
 _RIPPLE: Final = 0.2
 #: Length over which a change is computed: about the distance of a vehicle's bogies, which smooths shorter changes.
@@ -57,7 +58,7 @@ class Feature:
 
 
 def line_series(trajectory: Trajectory) -> LineSeries:
-    """Return gradient and curvature of a trajectory over chords of `BASE_M`, as a vehicle on two bogies has them."""
+    """Return gradient and curvature of a trajectory over chords of `BASE_M`, as for a vehicle on two bogies."""
     half = 0.5 * BASE_M
     arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)
@@ -70,7 +71,7 @@ def line_series(trajectory: Trajectory) -> LineSeries:
     ahead = flat[1:] / np.linalg.norm(flat[1:], axis=1, keepdims=True)
     behind = flat[:-1] / np.linalg.norm(flat[:-1], axis=1, keepdims=True)
     turn = -(np.cross(behind, ahead) * up[1:]).sum(axis=1) / STEP_M
-    # each turn belongs to the middle of its step
+    # each change of direction belongs to the middle of its step
     curvature = np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])
     return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=curvature)
 
@@ -110,7 +111,7 @@ class LocatedFeature:
     verdict: Literal["accepted", "ambiguous", "none"]
     arc_m: float  #: Position of the middle of the series; NaN unless accepted.
     sigma_m: float  #: ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity.
-    reason: str = ""  #: Why it is not accepted.
+    reason: str = ""  #: Reason for rejection.
 
 
 def locate(
@@ -130,16 +131,16 @@ def locate(
     Parameters
     ----------
     measured : LineSeries
-        Over travelled distance in rising arc length, `arc_m` about the predicted place (0 in its middle).
+        Over travelled distance in rising arc length, `arc_m` about the predicted position (0 in its middle).
     line : LineSeries
     predicted_m, sigma_m : float [m]
         A-priori arc length of the middle of the stretch.
     quantity : {"gradient", "curvature"}
-        By which it is placed; the other one must fit there.
+        Quantity that is matched; the other quantity must fit there.
     noise : tuple of float
         Standard deviations of the two quantities in one step.
     last : tuple of float, optional
-        Place of the last accepted feature, its sigma, and the distance by wheel since [m].
+        Position of the last accepted feature, its sigma, and the distance by wheel since then [m].
     """
     offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + STEP_M, 0.25 * STEP_M)
     at = predicted_m + offsets[:, None] + measured.arc_m

@@ -1,4 +1,4 @@
-"""Alarms of a radar whose scale has stepped, or that is silent, by comparison with speeds by satellites."""
+"""Alarms for a radar with a scale step or without output, by comparison with satellite (Doppler) speeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.motion.samples import RadarSpeeds
 #: The ratio is computed over windows of this length [ns] with this many speeds, of a train faster than this [m/s].
 _WINDOW_NS: Final = 30_000_000_000
 _LEAST_SPEEDS: Final = 10
-_NEAR_NS: Final = 150_000_000  #: A speed of the radar belongs to one by satellites that is so near [ns].
+_NEAR_NS: Final = 150_000_000  #: Largest time between the speeds that are compared [ns].
 _MOVING_MPS: Final = 3.0
 #: Windows before a step that are compared, at least and at most, and windows after it.
 _LEAST_BEFORE: Final = 5
@@ -30,10 +30,10 @@ _LEAST_SCATTER: Final = 0.001
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """Comparison of the radar's speeds with those by satellites."""
+    """Comparison of the radar's speeds with satellite speeds."""
 
     kind: Literal["mounting", "silent"]  #: A step of the ratio of the speeds; no speed while the train moves.
-    time: np.datetime64  #: From when on.
+    time: np.datetime64  #: Start of the alarm.
     #: Ratio less 1 before a step and after it.
     before: float = float("nan")
     after: float = float("nan")
@@ -64,7 +64,7 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Take speeds of both at the same later instants (NaN: not measured); return the alarms that they raise."""
+        """Add speeds of both at the same later instants (NaN: not measured); return the alarms that they raise."""
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])
         radar, right = np.abs(np.nan_to_num(radar_mps[moving])), np.abs(right_mps[moving])
@@ -80,12 +80,12 @@ class RadarWatch:
         return found
 
     def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
-        """Take speeds by satellites with the radar's own that are nearest to each; see `take`."""
+        """Add satellite speeds, each with the nearest radar speed; see `take`."""
         row = nearest_rows(radar.time, time, within_ns=_NEAR_NS)
         return self.take(time, np.append(radar.speed_mps, np.nan)[row], right_mps)
 
     def _close(self) -> list[RadarAlarm]:
-        """End a window; the alarm that it completes."""
+        """End a window; return the alarm that it completes, if any."""
         moving, count, product, square = self._sums.tolist()
         if moving >= _LEAST_SPEEDS:
             self.silent = self.silent + 1 if count == 0 else 0

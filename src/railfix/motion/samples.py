@@ -1,7 +1,7 @@
 """Samples of the sensors on board, as frozen arrays; GPS time, not falling; NaN where not measured.
 
-Formulas of the Doppler radar and two-way ranges (P2 3). The speed of a radar that looks down
-at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle.
+Formulas of the Doppler radar and two-way ranges (P2 3). The relative speed error of a radar that looks down at the
+angle alpha is ``tan(alpha)`` times the angle's error.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """Balises that the train's reader has passed, at `time`; of a group, the reading that matches the list."""
+    """Balises passed by the train's reader, at `time`; for a group, the reading that matches the list."""
 
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity, shape (N,).
     #: Standard deviation along the line that the reader reports; NaN where it reports none; shape (N,).
@@ -104,7 +104,7 @@ class ListedBalises:
         return len(self.name)
 
     def find_index(self, names: Strings) -> Indices:
-        """Return the rows of the balises of these names, -1 for one that is not listed."""
+        """Return the rows of the balises with these names, -1 for a balise that is not listed."""
         rows = {str(self.name[k]): k for k in np.flatnonzero(~self.virtual)}
         return np.array([rows.get(str(name), -1) for name in names], dtype=np.intp)
 
@@ -119,7 +119,7 @@ class SensorSamples:
     ranging: StationRanges = field(default_factory=StationRanges)
     #: Each has no rows where the sensor is absent or has sent nothing.
     balises: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Sensors not received up to the epoch of the samples (live): their values since the epoch before are unknown.
+    #: Sensors without samples up to the epoch (live): their values since the previous epoch are unknown.
     #: Their samples may arrive with the next epoch.
     silent: frozenset[str] = frozenset()
 
@@ -129,7 +129,7 @@ class SensorSamples:
         return {name: getattr(self, name) for name in SENSORS}
 
     def between(self, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
-        """Return the samples after one instant (all where it is NaT) up to another."""
+        """Return the samples after a first instant (all where it is NaT) up to a second one."""
         parts: dict[str, Any] = {}
         for name, rows in self.tables.items():
             first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))

@@ -1,12 +1,12 @@
-r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
+r"""Slip, slide, low speed and rolling away, detected by the vehicle's pitch (P2 2.1) and bridged by inertia.
 
 ``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch while the wheel rolls; with slip it
-takes values that no line has. Two rules:
+has values that no line has. Two rules:
 
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
-  slip, not its speed. It is silent at constant slip speed, so that most of a long slide stays in the distance.
+  slip, not its speed. It detects nothing at constant slip speed, so that most of a long slide remains in the distance.
 * ``"map"``: against the gradient of the line at the present position, with a latch: a slip ends only when the wheel has
-  returned to the speed carried by inertia and the pitch fits, or when wheel and train stand.
+  returned to the speed carried by inertia and the pitch fits, or when wheel and train are at rest.
 
 During a slip, speed and distance come from the accelerometer less the pitch and its offset, estimated while the wheel
 rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the position is known; with a gyro
@@ -34,17 +34,17 @@ from railfix.core.settings import Settings
 class MotionState(IntEnum):
     """Source of the speed of a sample."""
 
-    INIT = 0  #: Nothing known yet.
+    INIT = 0  #: Not yet initialised.
     STANDING = 1  #: No pulse for a second and the body at rest.
-    LOW_SPEED = 2  #: Moving too slowly for the tachometer; carried by inertia.
+    LOW_SPEED = 2  #: Moving too slowly for the tachometer; speed by inertia.
     NORMAL = 3  #: The wheel rolls.
-    INERTIAL_SPIN = 4  #: The wheel is faster than the train; carried by inertia.
-    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; carried by inertia.
-    ROLLING = 6  #: Freed and rolling away below the tachometer's least speed; carried by inertia.
-    EXPIRED = 7  #: Carried for too long: no speed.
+    INERTIAL_SPIN = 4  #: The wheel is faster than the train; speed by inertia.
+    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; speed by inertia.
+    ROLLING = 6  #: Rolling away below the tachometer's least speed; speed by inertia.
+    EXPIRED = 7  #: By inertia for too long: no speed.
 
 
-#: Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
+#: Limit of the sine of the pitch minus the line's: a difference of 0.1 m/s2 between wheel and train.
 _MAP_LIMIT: Final = 0.015
 #: The limit is at least this many standard deviations while the wheel rolls, over this time: a pitching body shakes its
 #: accelerometer too, more so the higher it is mounted.
@@ -54,15 +54,15 @@ _NOISE_S: Final = 30.0
 _LATCH_MPS: Final = 0.15
 _LATCH_SHARE: Final = 0.01
 _LATCH_S: Final = 0.5
-LOOK_BACK_S: Final = 0.3  #: How long before the detection the carry begins.
+LOOK_BACK_S: Final = 0.3  #: Time before the detection at which the inertial speed begins.
 #: After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
 SMOOTHING_S: Final = 0.2
-_STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle counts as standing.
-_STANDING_MPS: Final = 0.5  #: A carried speed below this agrees with a wheel that stands.
+_STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
+_STANDING_MPS: Final = 0.5  #: A carried speed below this agrees with a stationary wheel.
 _PITCH_S: Final = 20.0
-_STEEPEST: Final = 0.1  #: Sine beyond which a pitch is none of a train: 35 permille of line, body and mounting [1].
+_STEEPEST: Final = 0.1  #: Sine beyond which a pitch is implausible: 35 permille of line, body and mounting [1].
 _FASTEST_MPS: Final = 100.0  #: A carried speed beyond this has expired.
 #: Time for which the body swings after a stop; its pitch afterwards is that of standstill.
 _SETTLING_S: Final = 2.0
@@ -79,7 +79,7 @@ class SlipLimits(Settings):
     rule: Literal["map", "p2"] = "map"
     #: Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
-    confirm_s: float = Field(default=0.1, ge=0)  #: Time over the limit after which a slip is one.
+    confirm_s: float = Field(default=0.1, ge=0)  #: Time over the limit after which a slip is declared.
     #: The limit grows by this much per second of carrying: 1e-3 of gravity, the offset of the accelerometer and the
     #: error of the pitch together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
@@ -155,7 +155,7 @@ class MotionSamples(NamedTuple):
 def find_slips(
     samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
 ) -> tuple[SlipResult, SlipState | None]:
-    """Return the state of the motion, its speed and distance, each sample from itself and earlier ones.
+    """Return the state of motion, speed and distance, each from its own and earlier samples.
 
     `state` is the state after the samples before, None at the start; the returned state is for the next samples.
     """
@@ -230,7 +230,7 @@ class _Automaton:
         if self.metric == self.metric:
             share = min(dt / SMOOTHING_S, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
-        # A constant pitch is that of an earlier position.
+        # A constant pitch belongs to an earlier position.
         least = _MAP_LIMIT if sine == sine or rate == rate else limits.p2_limit
         self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
@@ -254,7 +254,7 @@ class _Automaton:
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float, *, rests: bool) -> None:
         """Reference pitch: from the line, with a gyro its fast part; without a line from the wheel, slowly.
 
-        The rate of a body at rest is the bias of the gyro: its mean over `bias_s` is taken.
+        The rate of a body at rest is the bias of the gyro: its mean over `bias_s` is used.
         """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
@@ -308,7 +308,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """The wheel turns: its distance is used unless the pitch contradicts."""
+        """The wheel turns: its distance is used unless the pitch contradicts it."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")
@@ -331,7 +331,7 @@ class _Automaton:
                 self._look_back(inertial, dt)
 
     def _look_back(self, inertial: float, dt: float) -> None:
-        """Put speed and distance on the carry from a little before the detection."""
+        """Replace speed and distance by the inertial solution from shortly before the detection."""
         begin = self._age - LOOK_BACK_S - self.limits.confirm_s - SMOOTHING_S
         past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
         if not past:
@@ -375,7 +375,8 @@ class _Automaton:
                 self._rest += min(dt / limits.offset_s, 1.0) * change
                 self.speed = 0.0
                 return
-            # Rolling freely the accelerometer shows nothing; the acceleration is gravity's, which it showed at rest.
+            # While the train rolls freely the accelerometer reads zero; the acceleration is the gravity component read
+            # at rest.
             self.speed += change * dt
             if self._apart >= _ROLLING_S and abs(self.speed) > _ROLLING_MPS:
                 self.state = MotionState.ROLLING

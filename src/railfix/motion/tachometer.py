@@ -70,7 +70,7 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
     valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
-    # A pulse that has not come yet bounds the speed too.
+    # The absence of a pulse bounds the speed, too.
     valid &= limits.pulse_m / np.maximum(since, 1e-9) >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
     middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
@@ -144,10 +144,10 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedCheck:
-    """A log of speeds against speeds known to be right."""
+    """Comparison of logged speeds with correct speeds."""
 
     ratio: float  #: Logged over right, without the unit.
-    unit: str  #: "m/s", or the unit that the log is really in.
+    unit: str  #: "m/s", or the actual unit of the log.
     lag_s: float  #: Delay of its time tags.
 
 

@@ -23,10 +23,10 @@ State = TypeVar("State")
 
 @dataclass(frozen=True)
 class AntennaRows:
-    """Which rows are of which antenna."""
+    """Assignment of rows to antennas."""
 
     indices: tuple[SearchIndex, ...]  #: Trajectory of each antenna; their maps have the same sigmas.
-    parts: tuple[slice, ...]  #: Rows of each antenna, concatenated; `EVERY` of a single one.
+    parts: tuple[slice, ...]  #: Rows of each antenna, concatenated; `EVERY` for a single antenna.
 
     @classmethod
     def on(cls, line: Trajectory | SearchIndex | AntennaRows) -> AntennaRows:
@@ -66,7 +66,7 @@ class AntennaRows:
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
-        """Yield the search index and the rows of each antenna that has any of some rising ones."""
+        """Yield the search index and the rows of each antenna that has any of some rising rows."""
         if len(self.parts) == 1:
             if len(rows):
                 yield self.indices[0], rows

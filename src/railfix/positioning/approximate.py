@@ -1,4 +1,4 @@
-"""Approximate positions of an antenna from raw ranges: where directions to satellites and delays are computed."""
+"""Approximate positions of an antenna from raw ranges: points at which directions and delays are computed."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from railfix.positioning.section_search import SectionLimits, find_section
 
 #: Standard deviation of raw ranges for the approximate position of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: A last step of this length leaves 25 m of a range, which turns no satellite by more than 2e-6 rad [m].
+#: A last step of this length leaves a range error of 25 m, which changes no direction by over 2e-6 rad [m].
 _TOLERANCE_M: Final = 1000.0
 #: A raw 3-D position farther from the line than this is not on the line, however bad the ranges [m].
 MAX_FROM_LINE_M: Final = 1e5
 
 
 class ApproximatePosition(NamedTuple):
-    """Positions of an antenna good to some hundred metres, and raw codes that are wrong, T epochs by K channels."""
+    """Antenna positions good to some hundred metres, and grossly wrong raw codes, T epochs by K channels."""
 
     ecef_m: Floats  #: Shape (T, 3).
     arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).

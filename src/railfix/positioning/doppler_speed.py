@@ -41,25 +41,25 @@ class DopplerSpeedLimits(Settings):
 
     mask_deg: float = 10.0  #: Elevation mask.
     #: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2`` of a Doppler. Only ratios matter to the speed:
-    #: the receiver's own size is found from the residuals of the log.
+    #: the receiver's own scale is estimated from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
-    #: A Doppler is left out when its residual is over this many of its own standard deviations (the w-test of W.
-    #: Baarda, 1968); the largest goes first.
+    #: A Doppler is rejected if its residual exceeds this many of its own standard deviations (the w-test of W. Baarda,
+    #: 1968), the largest first.
     outlier: float = Field(default=3.5, gt=0)
-    most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers left out per epoch.
-    min_satellites: int = Field(default=4, ge=3)  #: Satellites that must be left; 2 are solved for.
+    most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
+    min_satellites: int = Field(default=4, ge=3)  #: Fewest satellites that must remain; 2 unknowns are solved for.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dopplers(FrozenArrays):
-    """Dopplers of one receiver with their satellites, T epochs by K satellites."""
+    """Dopplers of one receiver with their satellites, T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
     #: A satellite with several signals has several channels, of which one an epoch has a number; shape (K,).
     satellite: Strings
     rate_mps: Floats  #: ``-lambda D``: positive when the satellite recedes; NaN where absent; shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
-    #: At the instant of transmission, and a second earlier; shape (T, K, 3).
+    #: At the time of transmission, and a second earlier; shape (T, K, 3).
     sat_ecef_m: Floats
     earlier_ecef_m: Floats
     sat_velocity_mps: Floats  #: Shape (T, K, 3).
@@ -182,7 +182,7 @@ def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Flo
 
 @dataclass(frozen=True, kw_only=True)
 class _SpeedFit:
-    """Speed, drift and variance of the speed (unscaled), residuals, and those over their standard deviation."""
+    """Speed, drift and variance of the speed (unscaled), residuals, and normalised residuals."""
 
     speed: Floats
     drift: Floats
@@ -198,7 +198,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
         channel_sums(values)
         for values in (weight, weight * slope, weight * slope**2, weight * measured, weight * slope * measured)
     )
-    # Three satellites in one direction leave the speed open; so does a single one.
+    # Neither several satellites in one direction nor a single satellite determine the speed.
     determinant = one * hh - h * h
     determinant = np.where((used.sum(axis=1) >= 2) & (determinant > 1e-9 * one * hh), determinant, np.nan)
     speed, drift = (one * hy - h * y) / determinant, (hh * y - h * hy) / determinant
@@ -220,7 +220,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
 def _reject_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
 ) -> tuple[Masks, _SpeedFit]:
-    """Leave out the worst Doppler of every epoch that has one, until none does."""
+    """Reject the worst Doppler of every epoch with an outlier, until no outlier remains."""
     used = offered.copy()
     fit = _fit(measured, slope, sigma, used)
     for _ in range(limits.most_rejected):

@@ -1,9 +1,9 @@
-"""Detect grossly wrong codes before anything is fitted to all of them.
+"""Detect grossly wrong codes before any fit to all codes.
 
 A least-squares position absorbs part of every error: one code that is 10 km off moves it by kilometres, where no
 atmospheric model and no map is valid, and its residuals point to other satellites. The position with the least sum of
-absolute residuals does not move further when an error grows: the sum is convex, and each outlying range pulls with the
-same force.
+absolute residuals does not move further when an error grows: the sum is convex, and each outlying range has the same
+influence.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from railfix.positioning.normal_equations import SinglePoint, normal_equations
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
+#: Raw codes, without atmospheric corrections, are wrong by this much only because of gross errors [m].
 GROSS_M: Final = 100.0
 #: Largest median residual of the remaining codes: they agree with each other [m].
 AGREEING_M: Final = 30.0
-#: Redundant ranges that remain after an exclusion in space, so that the rest is still checked.
+#: Redundant ranges that must remain after an exclusion in space, so that the rest is still checked.
 _LEFT_IN_SPACE: Final = 3
 #: Where only one or two ranges remain, the other exclusions must fit worse by this factor.
 _CLEARER: Final = 5.0
@@ -105,7 +105,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return the range without which the others agree within `AGREEING_M`, shape (T, M); none where two do."""
+    """Return the range without which the others agree within `AGREEING_M`, shape (T, M); none if ambiguous."""
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -157,14 +157,14 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     return np.asarray(found & enough[:, None])
 
 
-#: Distance between the points of a line that are tried, and between those around the best one [m].
+#: Spacing of the points of a line that are tried, and of the points tried around the best one [m].
 _COARSE_M: Final = 100.0
 _FINE_M: Final = 12.5
 #: Points times epochs times channels that are computed at once.
 _BLOCK: Final = 2_000_000
-#: Other exclusions must cost this much more: a fraction of one gross error.
+#: Other exclusions must cost this much more, as a fraction of one gross error.
 _CLEAR: Final = 0.7
-#: Redundant ranges that agree with a point of the line.
+#: Redundant ranges that must agree with a point of the line.
 _LEFT_ON_LINE: Final = 2
 
 
@@ -174,7 +174,7 @@ class LineScan(NamedTuple):
     arc_m: Floats  #: Point with the least cost, shape (T,).
     gross: Masks  #: Ranges that are off there by more than `GROSS_M`, shape (T, M).
     agreed: Masks  #: Redundant ranges agree with the point, shape (T,).
-    clear: Masks  #: Points that accuse other ranges cost clearly more, shape (T,).
+    clear: Masks  #: Points that imply other faulty ranges cost clearly more, shape (T,).
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
@@ -241,7 +241,7 @@ class GrossErrors(NamedTuple):
     unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
 
 
-#: Ellipsoidal heights of trains with a margin [m]: a position outside is not used.
+#: Plausible ellipsoidal heights of trains, with a margin [m]: a position outside is not used.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Root of the sum of squared raw residuals up to which an epoch is not examined; distance of its position from the
 #: line from which on it is [m].
@@ -252,9 +252,9 @@ _BESIDE_M: Final = 1000.0
 def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> GrossErrors:
     """Find grossly wrong codes among raw ranges; `point`: their 3-D positions by least squares.
 
-    Epochs with large residuals, or positions far from the line, are examined: by the point of the line that most ranges
-    agree on, where redundant ranges do and no other accusation costs about as little; where the ranges agree with no
-    point of the line, in space.
+    Epochs with large residuals, or positions far from the line, are examined: at the point of the line that most ranges
+    agree on, if redundant ranges agree with it and no other exclusion costs about as little; in space, if the ranges
+    agree with no point of the line.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -276,7 +276,7 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
         gross[rows[sure]] = scan.gross[sure]
         open_arc = ~sure & (scan.agreed | nowhere[rows])
         arc[rows[open_arc]] = scan.arc_m[open_arc]
-        # where the ranges fit a point of the line, none of them is accused
+        # where the ranges fit a point of the line, none of them is rejected
         unsure[rows[open_arc]] = scan.gross[open_arc].any(axis=1)
         left = np.flatnonzero(~scan.agreed)
         if len(left):

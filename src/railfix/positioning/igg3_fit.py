@@ -28,7 +28,7 @@ class RobustFitLimits(Settings):
 
     keep: float = Field(default=1.5, gt=0)  #: Residuals up to this many scales have full weight.
     reject: float = Field(default=4.0, gt=0)  #: Residuals from this many scales on have no weight.
-    #: Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
+    #: Reweightings. On the demonstration with a 20 m error on one satellite, the fifth reweighting changes no decision.
     iterations: int = Field(default=5, ge=1)
 
 
@@ -62,7 +62,8 @@ def robust_fit(
 
     `place_ecef_m` is the solution of the plain fit, shape (T, 3); steps from it are linear.
 
-    `information`, shape (T, 3, 3) [1/m^2]: known beforehand (`map_information`: one unknown is left); none: three.
+    `information`, shape (T, 3, 3) [1/m^2]: a-priori information (`map_information`: one unknown remains); None: three
+    unknowns.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0

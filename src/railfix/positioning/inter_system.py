@@ -1,8 +1,8 @@
-"""3-D positions of several constellations, whose receiver clocks are tied by the biases known from earlier epochs.
+"""3-D positions of several constellations, with receiver clocks tied by biases from earlier epochs.
 
-The offsets of the constellations' clocks are stable to a metre over hours. Once one is known, a single satellite of a
-constellation contributes, and every satellite is checked against all others. It is estimated from earlier epochs only,
-so that results do not depend on chunks.
+The offsets of the constellations' clocks are stable to a metre over hours. Once an offset is known, even a single
+satellite of a constellation contributes, and every satellite is checked against all others. Offsets are estimated from
+earlier epochs only, so that results do not depend on chunks.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 class ClockOffsetLimits(Settings):
     """Limits of the inter-system biases."""
 
-    #: Standard deviation of an offset about its mean; infinite leaves every constellation its own clock. On an urban
+    #: Standard deviation of an offset about its mean; infinite: every constellation has its own clock. On an urban
     #: recording the spread was 1.0 m (Galileo, BeiDou).
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
-    #: Epochs nearer to each other than this are not independent: errors of a standing train are correlated over tens of
+    #: Epochs closer together than this are not independent: errors of a train at rest are correlated over tens of
     #: seconds.
     correlation_s: float = Field(default=30.0, gt=0)
-    #: Time constant of forgetting: offsets are stable to a metre over hours, so half an hour loses nothing, and the
-    #: effect of a receiver restart or of an undetected error fades.
+    #: Time constant of forgetting: offsets are stable to a metre over hours, so that half an hour is short enough, and
+    #: the effect of a receiver restart or an undetected error fades.
     window_s: float = Field(default=1800.0, gt=0)
 
 
@@ -78,8 +78,8 @@ def tie_clocks(
 ) -> tuple[InterSystemBiases, list[OffsetState]]:
     """Return the inter-system biases (P1 3.3: constellations) known from the epochs before each, and new states.
 
-    `ranges`: without ties, those that agree with each other alone, with the letter of each of its groups in `clocks`;
-    `free`: position with every clock on its own and a redundant range; `parts`: rows of each receiver.
+    `ranges`: without ties, only the ranges that agree with each other, with the letter of each of its groups in
+    `clocks`; `free`: position with every clock on its own and a redundant range; `parts`: rows of each receiver.
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
@@ -122,8 +122,8 @@ class PointPositions(NamedTuple):
     untied: Ranges  #: Position with a clock for each constellation.
     ranges: Ranges  #: Position with the inter-system biases known so far.
     point: SinglePoint  #: The conventional position, from the untied ranges.
-    tied: SinglePoint  #: From those with known biases.
-    #: Ranges that agree with each other in space, and the positions from these.
+    tied: SinglePoint  #: Conventional position from the ranges tied by known biases.
+    #: Ranges that agree with each other in space, and the positions from these ranges.
     agreeing: Ranges
     free: SinglePoint
     ties: InterSystemBiases
@@ -153,7 +153,7 @@ def tie_constellations(
 
     Each further constellation costs one satellite for its clock, unless its bias is known to a metre. Biases
     are differences of the receiver clocks of positions from ranges that agree with each other, averaged over earlier
-    epochs: results do not depend on how a log is cut.
+    epochs: results do not depend on the division of a log into chunks.
 
     Parameters
     ----------

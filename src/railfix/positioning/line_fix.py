@@ -25,7 +25,7 @@ from railfix.positioning.section_search import Section, SectionLimits, find_sect
 class FixLimits(NamedTuple):
     """Limits of the stages from 3-D position to position on the line."""
 
-    min_satellites: int = 3  #: P1 3.2: 2 are possible, and find wrong sections on sharp curves.
+    min_satellites: int = 3  #: P1 3.2: 2 satellites are possible, but give wrong sections on sharp curves.
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
     constrained: ConstrainedLimits = ConstrainedLimits()
@@ -52,7 +52,7 @@ def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimit
 
 
 def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
-    """Return positions in which some epochs, in rising order, are replaced by those from other ranges."""
+    """Return positions in which some epochs, in rising order, are replaced by positions from other ranges."""
     for index, own in antennas.split(epochs):
         part = ranges.take(own)
         solved = fix_on_line(

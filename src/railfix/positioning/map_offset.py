@@ -32,8 +32,8 @@ class MapOffsetLimits(Settings):
 
     #: Time constant of forgetting: long enough for six independent samples, short enough to find a wrong stretch.
     window_s: float = Field(default=120.0, gt=0)
-    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs nearer to each other than this count as one sample.
-    least_samples: float = Field(default=3.0, gt=0)  #: Independent samples needed before a verdict: one minute.
+    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
+    least_samples: float = Field(default=3.0, gt=0)  #: Independent samples required before a decision: one minute.
     #: Probability that noise alone passes the test: of the note, of the status (chi-square, two degrees of freedom).
     #: The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic stays
     #: below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
@@ -44,12 +44,12 @@ class MapOffsetLimits(Settings):
 
     @cached_property
     def note_threshold(self) -> float:
-        """Statistic from which on a run has a note."""
+        """Threshold of the statistic for a note on the run."""
         return float(scipy.special.chdtri(2, self.note_risk))
 
     @cached_property
     def threshold(self) -> float:
-        """Statistic from which on epochs have the status."""
+        """Threshold of the statistic for the status of epochs."""
         return float(scipy.special.chdtri(2, self.risk))
 
     @cached_property
@@ -66,7 +66,7 @@ class MapOffsetState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0  #: Window of the last epoch [windows].
     #: Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples: of the
-    #: epochs that are on the map, then of those off it; shape (18,).
+    #: epochs on the map, then of the epochs off the map; shape (18,).
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
@@ -103,7 +103,7 @@ class MapOffset(NotebookTable):
 
     @property
     def beyond_m(self) -> tuple[Floats, Floats]:
-        """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 without a verdict."""
+        """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 without a decision."""
         across = np.sign(self.across_m) * np.maximum(np.abs(self.across_m) - self.across_sigma_m, 0.0)
         up = np.sign(self.up_m) * np.maximum(np.abs(self.up_m) - self.up_sigma_m, 0.0)
         known = np.isfinite(self.across_m)

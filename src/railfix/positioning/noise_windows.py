@@ -1,4 +1,4 @@
-"""Sums over earlier epochs with exponential forgetting: of noise, clocks, lasting errors, and the map."""
+"""Sums over earlier epochs with exponential forgetting: of noise, clocks, persistent errors, and the map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class Windows(NamedTuple):
     ) -> Windows:
         """Compute the ages by the rows of each antenna and its last epoch before these.
 
-        A window is `window_s` or `least_epochs` epochs, whichever is longer: gaps forget no faster than epochs come.
+        A window is `window_s` or `least_epochs` epochs, whichever is longer: a gap counts as at most 1 / `least_epochs`
+        of a window.
         """
         times, ages = zip(*before, strict=True)
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
@@ -44,7 +45,8 @@ class Windows(NamedTuple):
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
         """Return the sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
 
-        `start`, shape (A, K): running sums after the epochs before; those after the last ones are returned as well.
+        `start`, shape (A, K): running sums after the previous epochs; the sums after the last epochs are returned as
+        well.
         """
         after, grown = np.array(start, dtype=np.float64), np.ascontiguousarray(self.growth[:, None] * values)
         return kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends), after

@@ -2,8 +2,8 @@
 
 Subtracting the weighted mean of a constellation's satellites from its residuals and design rows is the same as solving
 for that clock (the Schur complement of the clock block). Where the offsets between the clocks are known with a sigma
-(`InterSystemBiases`), each mean less its offset is one more observation of a common clock, eliminated in the same
-manner.
+(`InterSystemBiases`), each mean less its offset is one more observation of a common clock, which is eliminated in the
+same way.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
 height errors are two more unknowns with their covariance as prior, the same as an added covariance ``H_m S_m H_m^T``.
@@ -66,9 +66,9 @@ def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) 
 class ConstrainedLimits(Settings):
     """Limits of the iteration along the line."""
 
-    #: Last step inside a section: one of 5 m leaves 0.03 mm (`railfix.kernels.ranges`).
+    #: Largest last step inside a section: after a step of 5 m the error is 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)  #: Steps, walks into a neighbouring section included.
+    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, into neighbouring sections included.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -78,13 +78,13 @@ class Constrained(NotebookTable):
     arc_m: Floats  #: Along the trajectory; NaN where the iteration did not settle or was not started; shape (T,).
     section: Indices  #: Section that contains the position, -1 without a position; shape (T,).
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
-    exact_map_sigma_m: Floats  #: The part of it that the weights give, as if the map were exact; shape (T,).
+    exact_map_sigma_m: Floats  #: Its part from the weights alone, as for an exact map; shape (T,).
     #: Sigma along the line for unit, equal weights and an exact map; infinite where undetermined; shape (T,).
     dilution: Floats
-    #: How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere; shape (T,).
+    #: Distance beyond an end of the line at which the ranges place a position clamped to it; 0 elsewhere; shape (T,).
     overshoot_m: Floats
     clock_m: Floats  #: Shape (T, G).
-    wsse: Floats  #: Weighted sum of squared residuals, map error allowed for; shape (T,).
+    wsse: Floats  #: Weighted sum of squared residuals, with the map error taken into account; shape (T,).
     residual_m: Floats  #: Code - range - clock at the position on the line, shape (T, M).
     iterations: Integers  #: Shape (T,).
 
@@ -95,8 +95,9 @@ def position_on_line(
     """Compute the distance along the line by constrained least squares (P1 2.2(3)): ``R = r_i + d e_i``.
 
     Newton steps in d with the receiver clocks eliminated, inside a section; a step that leaves it stops at its end and
-    continues in the neighbouring one. Where both neighbours of a point send the step back, the point is the answer. At
-    an open end the position is clamped and `overshoot_m` is how far beyond it the ranges pull.
+    continues in the neighbouring one. Where the steps from both neighbouring sections lead back to their common point,
+    that point is the solution. At an open end the position is clamped, and `overshoot_m` is the distance beyond it
+    implied by the ranges.
 
     Parameters
     ----------
@@ -174,8 +175,8 @@ class SectionArrays(NamedTuple):
 class SinglePointLimits(Settings):
     """Limits of the iteration, and of the validation of its position (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm.
-    max_iterations: int = Field(default=12, ge=1)  #: Steps at most.
+    tolerance_m: float = Field(default=1.0, gt=0)  #: Largest last step: after a step of 1 m the error is 0.01 mm.
+    max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
     #: Probability that noise alone fails the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
     #: Largest position dilution of precision; 30, as RTKLIB has for the geometric one.
@@ -202,7 +203,7 @@ def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePoin
     ranges : Ranges
         Of `weighted_ranges`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
-        Where the iteration starts, good to some thousand kilometres.
+        Initial positions, good to some thousand kilometres.
     limits : SinglePointLimits, optional
     """
     limits = limits or SinglePointLimits()

@@ -1,4 +1,4 @@
-"""Pseudoranges ready to be fitted, each with its weight: the arrays that the stages of positioning take.
+"""Weighted pseudoranges: input arrays of the positioning stages.
 
 Arguments are checked here, at the interface; the stages and the compiled functions do not check them again.
 """
@@ -20,7 +20,7 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.corrected import ORBITS_M, is_orbit, is_pseudorange
 
-UNTIED_M: Final = 1e6  #: Sigma of an offset between clocks of which nothing is known [m].
+UNTIED_M: Final = 1e6  #: Sigma of an unknown offset between clocks [m].
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -29,7 +29,7 @@ class InterSystemBiases(RowArrays, NotebookTable):
 
     #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
     offset_m: Floats
-    sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where nothing is known; shape (T, G).
+    sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where the offset is unknown; shape (T, G).
 
 
 class RangeArrays(NamedTuple):
@@ -44,7 +44,7 @@ class RangeArrays(NamedTuple):
 
     @property
     def tied(self) -> bool:
-        """Whether anything is known of the offsets between the clocks."""
+        """Whether any offset between the clocks is known."""
         return len(self.offset_m) == len(self.code_m)
 
     @property
@@ -66,7 +66,7 @@ class Ranges:
 
     sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
     code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
-    weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
+    weight: Floats  #: 1/sigma^2, 0 for unused ranges; shape (T, M) [1/m^2].
     groups: tuple[slice, ...]  #: Channels that share one receiver clock are adjacent; one slice per clock.
     ties: InterSystemBiases | None = None  #: Known offsets between these clocks; None if there are none.
 
@@ -100,7 +100,7 @@ class Ranges:
 
     @cached_property
     def n_clocks(self) -> Integers:
-        """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
+        """Number of clocks with at least one channel, tied clocks counted as one, shape (T,)."""
         seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
         if self.ties is None:
             return np.asarray(seen.sum(axis=1), dtype=np.int64)
@@ -109,12 +109,12 @@ class Ranges:
 
     @property
     def redundancy(self) -> Integers:
-        """Ranges beyond the clocks and the distance along the line, shape (T,)."""
+        """Redundant ranges beyond the clocks and the distance along the line, shape (T,)."""
         return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
 
     @property
     def space_redundancy(self) -> Integers:
-        """Ranges beyond the clocks and a 3-D position, shape (T,)."""
+        """Redundant ranges beyond the clocks and a 3-D position, shape (T,)."""
         return np.asarray(self.n_used - self.n_clocks - 3, dtype=np.int64)
 
 
@@ -175,7 +175,7 @@ def weighted_ranges(
 
 
 def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
-    """Return an array of double precision with a number of axes; ValueError for another one."""
+    """Return an array of double precision with a given number of axes; ValueError for any other array."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 8):
         raise ValueError(

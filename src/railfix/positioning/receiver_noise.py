@@ -2,8 +2,8 @@
 
 Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting: the robust one, from the
 ranges of each epoch that agree with each other, for the RAIM test, which does not influence it; and the stated one,
-from the ranges that RAIM accepted, for every sigma and level. Epochs that RAIM did not resolve, and epochs off the map,
-teach neither of them.
+from the ranges that RAIM accepted, for every sigma and protection level. Epochs that RAIM did not resolve, and epochs
+off the map, contribute to neither.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ _MOST_FREEDOM: Final = 128
 class NoiseScaleLimits(Settings):
     """Estimation of a receiver's noise scale."""
 
-    #: Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
-    #: recordings): five such times are independent enough for a mean, and short enough that a street or a station left
-    #: behind is forgotten before the next one.
+    #: Time constant of forgetting. Code errors are correlated over about 20 s (0.6 after 10 s on recordings): five such
+    #: times give enough independent samples for a mean, and are short enough for a street or station to be forgotten
+    #: before the next one.
     window_s: float = Field(default=100.0, gt=0)
-    #: Redundant ranges that a scale of 1 counts for: two or three epochs. Infinite keeps the scale at 1.
+    #: Weight of the prior scale of 1 as a number of redundant ranges: two or three epochs. Infinite keeps the scale at
+    #: 1.
     prior: float = Field(default=20.0, gt=0)
-    least_epochs: float = Field(default=20.0, ge=1)  #: Epochs that the window spans at least, gaps left out.
+    least_epochs: float = Field(default=20.0, ge=1)  #: Fewest epochs in the window, gaps left out.
     #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
     #: predicts, so the variance stated for an epoch combines that of its window, counted this many times, with that of
     #: its own residuals. 4 is also the Student t of code errors on recordings.
@@ -46,8 +47,8 @@ class NoiseState:
     #: Of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0  #: Of the last epoch [windows].
-    #: Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of those
-    #: that RAIM left; shape (2,).
+    #: Weighted sum of squared residuals, and degrees of freedom: of the ranges kept by the robust fit, and of the
+    #: ranges accepted by RAIM; shape (2,).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
@@ -63,7 +64,7 @@ def noise_scale(
     limits: NoiseScaleLimits,
     least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Return the standard deviation of the ranges over that of their weights (P4 takes 1), and new sums.
+    """Return the ratio of the ranges' standard deviation to the assumed one (P4: 1), and new sums.
 
     Root mean square of the residuals of the epochs before, with forgetting, around a prior scale, shape (T,); it is at
     least `least`. `start`: sums before (A, 2).
@@ -80,8 +81,8 @@ def noise_scale(
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
     """Return the variance of the ranges of each epoch against their weights, shape (T,).
 
-    Posterior mean of a variance that scatters about that of the window with `spread` degrees of freedom (scaled inverse
-    chi-square distribution), given the epoch's own residuals.
+    Posterior mean of a variance that scatters about the window's variance with `spread` degrees of freedom (scaled
+    inverse chi-square distribution), given the epoch's own residuals.
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
@@ -119,7 +120,7 @@ def robust_clock(
     """Return the receiver clock of each group of channels: Huber-weighted mean of residuals, starting at their median.
 
     `residual_m`, `sigma_m`, shape (T, K): range errors plus the clock, NaN is ignored; `least_ranges`: fewest ranges
-    from which a clock is estimated.
+    for a clock estimate.
     """
     clock = np.full((len(residual_m), len(groups)), np.nan)
     share = np.zeros(residual_m.shape)

@@ -21,7 +21,7 @@ class SearchIndex:
         self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
-        self.tree = scipy.spatial.cKDTree(points)  #: Of its points.
+        self.tree = scipy.spatial.cKDTree(points)  #: k-d tree of its points.
         #: Stretches of each level: middle points, and the radii [m] that cover the rest.
         self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1
@@ -42,7 +42,7 @@ class SearchIndex:
 
     @cached_property
     def arc_of_points_m(self) -> Floats:
-        """Arc length of each point, the least of those that a line has there, shape (V,) [m]."""
+        """Arc length of each point, the smallest one where a line passes a point several times, shape (V,) [m]."""
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:

@@ -3,8 +3,8 @@
 P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares equals
 that of the residuals after each constellation's clock is eliminated. `find_section` returns the point with the least
 such ``q`` in a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a quadratic
-form, so stretches outside a ball are dropped. Where it does not, coarse to fine: the root of ``q`` changes at most by
-the root of the summed weights times the distance moved. Both are exact.
+form, so stretches outside a ball are dropped. Otherwise the search is coarse to fine: the root of ``q`` changes at most
+by the root of the summed weights times the distance moved. Both are exact.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Other positions are searched for as far as noise has this probability: farther than the limit of ambiguity, as a
-#: fault of one range can hide that much.
+#: Other positions are searched up to an excess that noise has with this probability: beyond the limit of ambiguity, as
+#: a fault of one range can hide that much.
 _REACH_RISK: Final = 1e-16
 
 
@@ -70,7 +70,7 @@ class Section:
 class SectionCandidates(NamedTuple):
     """Evaluated points, sorted by epoch and point, with q and its slope there; n epochs, p points."""
 
-    #: The epochs, and how many points each has (at least one); shape (n,).
+    #: The epochs, and their numbers of points (at least one each); shape (n,).
     at: Indices
     points: Indices
     #: Shapes (p,), (p,), (p, 3).
@@ -78,7 +78,7 @@ class SectionCandidates(NamedTuple):
     q: Floats
     half_gradient: Floats
     matrix: Floats  #: Normal matrices, shape (m, 3, 3).
-    matrix_of: Indices  #: Which of them belongs to each point, shape (p,).
+    matrix_of: Indices  #: Index of the normal matrix of each point, shape (p,).
 
 
 def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
@@ -94,10 +94,9 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
     point : SinglePoint
-        3-D positions from the same ranges (`point_position`), NaN where none exist: they save time, and change
-        nothing.
+        3-D positions from the same ranges (`point_position`), NaN where none exist: they only save time.
     limits : SectionLimits, optional
-        Of ambiguous sections (P1 3.2).
+        Limits of ambiguous sections (P1 3.2).
 
     Returns
     -------
@@ -177,7 +176,7 @@ def _in_ball(
 def _coarse_to_fine(
     ranges: Ranges, index: SearchIndex, weight_norm: Floats, freedom: Integers, limits: SectionLimits, epochs: Indices
 ) -> tuple[SectionCandidates, Integers]:
-    """Return the points that fit as well as noise allows, by dropping stretches of line that fit too badly."""
+    """Return the points that fit within the noise, by dropping stretches of line that fit too badly."""
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
     tried = np.zeros(len(ranges), dtype=np.int64)

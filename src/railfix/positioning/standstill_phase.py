@@ -1,8 +1,8 @@
 """Carrier phases of a train at rest with a base station: their probability given a position of known error.
 
-Double differences have integer ambiguities that stay while the train is at rest; along a track, integers that fit the
-phases of all satellites exist only near the true position (P1 2.5). Each satellite's phase has a constant error, which
-does not average out. LAMBDA: decorrelation and a search in a shrinking ellipsoid (Teunissen 1995,
+Double differences have integer ambiguities that are constant while the train is at rest; along a track, integers that
+fit the phases of all satellites exist only near the true position (P1 2.5). Each satellite's phase has a constant
+error, which does not average out. LAMBDA: decorrelation and a search in a shrinking ellipsoid (Teunissen 1995,
 doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
 
@@ -17,7 +17,7 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-#: Vectors whose square exceeds the least by more are not searched for: exp(-20) of its likelihood.
+#: Vectors whose square exceeds the least by more than this are not searched for: exp(-20) of its likelihood.
 _WITHIN: Final = 40.0
 _ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.
 
@@ -36,7 +36,7 @@ class IntegerSearch:
     def nearest(self, cycles: Floats, count: int, *, below: float = np.inf) -> tuple[Integers, Floats]:
         """Return at most `count` integer vectors (m, n), nearest first, and their squares ``(N - c)' inv(Q) (N - c)``.
 
-        None of a square of `below` or more.
+        Vectors with a square of `below` or more are omitted.
         """
         integers, squares = _search(cycles @ self._transform, self._lower, self._variance, count, below)
         return integers @ self._back, squares
@@ -115,7 +115,8 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Integer vectors summed over at most; those that add less than this (logarithm) to uniform phases are left out.
+#: Largest number of integer vectors in the sum; vectors that add less than this (logarithm) to uniform phases are left
+#: out.
 _VECTORS: Final = 20
 _NEGLIGIBLE: Final = -5.0
 

@@ -25,11 +25,11 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UN
 #: Steps of the integrals along and across the track [m].
 _ALONG_M: Final = 0.25
 _ACROSS_M: Final = 0.3
-#: A train nearer to a track than this is off it because the map is displaced: less likely by this factor than a missing
-#: track, and no nearer than the second value [m].
+#: Weight of a missing track within the clearance of a mapped track (the map would be displaced), relative to one
+#: farther away; 0 nearer than the second value [m].
 _BETWEEN_SHARE: Final = 0.1
 _BETWEEN_M: Final = 1.2
-#: A position farther than this from the most likely track, in standard deviations, decides nothing.
+#: A position farther than this from the most likely track, in standard deviations, gives no decision.
 _LARGEST_MISFIT: Final = 4.0
 #: Part of a track about the train that is integrated over, either side [m].
 _REACH_M: Final = 40.0
@@ -43,7 +43,7 @@ _ANY_PLACE_M: Final = 50.0
 #: Probability of a larger misfit of the mean codes below which the error model is rejected.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
-_FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of heights.
+_FREEDOM: Final = 8.0  #: Degrees of freedom of height errors.
 #: Probability that the phases of a standstill follow no model, by an undetected slip or half a cycle.
 _PHASE_FAULT_PRIOR: Final = 1e-3
 _UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a missing track can lie.
@@ -131,7 +131,7 @@ def standstill_fix(
     """Fix the position of an antenna at rest from mean code residuals at an origin; None where satellites are too few.
 
     Shapes (K,): `system` letters of the clocks, `residual_m` observed minus computed, means over `seconds`, `common_m`
-    sigmas of satellite and atmosphere errors; `receivers` is 2 where a base station's codes are subtracted.
+    sigmas of satellite and atmospheric errors; `receivers` is 2 where a base station's codes are subtracted.
     """
     letters = np.unique(system)
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -168,7 +168,7 @@ class YardTrack:
     name: str
     points_m: Floats
     up_m: float = np.nan  #: Height above the origin where the track is nearest to it; NaN without.
-    sigma_up_m: float = 0.0  #: Standard deviation of that.
+    sigma_up_m: float = 0.0  #: Standard deviation of this height.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +202,7 @@ def track_posterior(
     """Compute the probability that a train at rest stands on each track, or on none.
 
     `arms_m`: position of each antenna along the train, positive to its front; `prior`: weights of the mapped tracks by
-    name, those not named have none; `phases`: phases of each antenna with a base station; empty without one.
+    name, 0 for tracks not named; `phases`: phases of each antenna with a base station; empty without one.
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -255,7 +255,8 @@ def track_posterior(
 def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFix], errors: StandstillErrors) -> Floats:
     """Return the log likelihood of the codes' height on each track and on none, shape (tracks + 1,).
 
-    Student's t: a height that fits no track decides less. A track without height, and none, are as high as fits best.
+    Student's t: a height that fits no track has less influence. A track without height, and `NONE`, have the
+    best-fitting height.
     """
     codes = [fix.place for fix in fixes if fix.place is not None]
     up = np.array([track.up_m for track in tracks])

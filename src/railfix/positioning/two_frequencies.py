@@ -37,11 +37,11 @@ class TwoFrequencyLimits(Settings):
 
     #: Time constant of the mean differences of the codes: the error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
-    #: Epochs nearer to each other than this are one sample: the multipath of a standing train lasts this long.
+    #: Epochs closer together than this are one sample: the multipath of a train at rest is correlated over this time.
     correlation_s: float = Field(default=60.0, gt=0)
     #: Standard deviation of a broadcast group delay, difference of two signals.
     delay_sigma_m: float = Field(default=0.2, gt=0)
-    #: Sigmas beyond which a difference of the two codes weighs the range down.
+    #: Sigmas beyond which a difference of the two codes reduces the range's weight.
     suspicion: float = Field(default=4.0, gt=0)
 
 
@@ -59,7 +59,7 @@ class TwoFrequencyState:
     age: float = 0.0  #: Of the last epoch [windows].
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
-        """Return the state with the pairs of a chunk among its own, and the number of each of them."""
+        """Return the state with the pairs of a chunk added, and the number of each pair."""
         if names == self.names:
             return self, np.arange(len(names))
         known = {name: i for i, name in enumerate(self.names)}
@@ -74,7 +74,7 @@ class TwoFrequencyState:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Combined(NotebookTable):
-    """One pseudorange a satellite from two codes: T epochs by K channels; NaN where the first code is alone."""
+    """One pseudorange per satellite from two codes: T epochs by K channels; NaN where the second code is missing."""
 
     code_m: Floats  #: Shape (T, K).
     variance_m2: Floats  #: Correction added to the first code, shape (T, K).
@@ -96,7 +96,7 @@ def combine_codes(
     state: TwoFrequencyState,
     limits: TwoFrequencyLimits,
 ) -> tuple[Combined, TwoFrequencyState]:
-    """Combine the two codes of each satellite, with the ionosphere from the epochs before, however a log is cut.
+    """Combine the two codes of each satellite, with the ionosphere from earlier epochs, independently of chunks.
 
     `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is the noise assumed by the
     weights; `field_m`, shape (T, K, 4), are the standard deviations with sign of the modelled ionosphere on the first
@@ -132,7 +132,7 @@ def combine_codes(
     error = of_mean + delay + lever**2 * own_m2
     group = np.where(known, groups[second.pair], -1) if size else second.pair
     weight = np.where(known, 1.0 / error, 0.0)
-    for _ in range(2):  # the second time, a satellite that is far off counts little
+    for _ in range(2):  # in the second pass an outlying satellite has little weight
         field, of_field, bias, of_bias = _fit_field(mean, basis[..., :3], lever, weight, group)
         rest = mean - bias - lever * field
         weight = np.where(known, 1.0 / (error + (rest / _CLIP) ** 2), 0.0)
@@ -189,7 +189,7 @@ def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphe
 def _noise_scale(
     time: Datetimes, deviation: Floats, variance: Floats, known: Masks, own: TwoFrequencyState, ages: dict[str, float]
 ) -> tuple[Floats, Floats]:
-    """Return the variance of the differences over the assumed one, by the epochs before, shape (T,), and the sums."""
+    """Return the variance of the differences over the assumed one, from earlier epochs, shape (T,), and the sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
     sample = np.stack([channel_sums(size), channel_sums(known.astype(np.float64))], axis=1)
     last_epoch = [(own.last, own.age)]

@@ -1,4 +1,4 @@
-"""Delays of the signal in the ionosphere and the troposphere, from broadcast and standard models."""
+"""Ionospheric and tropospheric delays from broadcast and standard models."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
-#: Klobuchar coefficients that GPS broadcast on 2004-01-01, at middling solar activity; RTKLIB too takes them where it
-#: has none. Their vertical delay is 2.8 m RMS over day and latitude; that of the five other available days from 2005 to
-#: 2024 differs from it by 0.7 to 1.7 m RMS.
+#: Klobuchar coefficients that GPS broadcast on 2004-01-01, at moderate solar activity; RTKLIB too uses them where none
+#: were received. Their vertical delay is 2.8 m RMS over day and latitude; on five other available days from 2005 to
+#: 2024 the delay differs from it by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
-#: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
+#: Radius of the Earth over the radius of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
@@ -62,7 +62,7 @@ def klobuchar_delay_m(
     period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    # With this order of comparison NaN stays NaN and does not become the delay of the night.
+    # With this order of comparison NaN stays NaN and does not become the night-time delay.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
@@ -70,7 +70,7 @@ def klobuchar_delay_m(
 def saastamoinen_delay_m(
     latitude_deg: Floats, height_m: Floats, elevation_deg: Floats, *, relative_humidity: float = 0.7
 ) -> Floats:
-    """Return the tropospheric delay of Saastamoinen in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
+    """Return Saastamoinen's tropospheric delay in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
 
     Both parts are mapped by 1/sin(elevation). Ellipsoidal heights below sea level count as sea level. NaN where an
     input is NaN, at or below the horizon, and outside -100 m to 10 km.
@@ -117,12 +117,12 @@ class SeenFrom:
 
 @dataclass(frozen=True, kw_only=True)
 class Delays:
-    """Delays of T epochs by K channels, and the standard deviation of the errors that remain after them."""
+    """Delays of T epochs by K channels, and the standard deviation of the residual errors."""
 
     #: On the channel's own carrier; 0 where a model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Standard deviation in addition to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
     reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 
@@ -136,7 +136,7 @@ def model_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Return the delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off (`klobuchar` None)."""
+    """Return the delays of the Klobuchar and Saastamoinen models, 0 for a model that is off (`klobuchar` None)."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:

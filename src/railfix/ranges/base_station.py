@@ -1,4 +1,4 @@
-"""Range errors measured by a base station at a known position, and their differences with a train's."""
+"""Range errors measured by a base station at a known position, and differences of a train's ranges with them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SAME_S: Final = 0.05
 #: centimetres in 30 s, and phase errors by millimetres in a second.
 LONGEST_AGE_S: Final = 60.0
 _PHASE_AGE_S: Final = 1.1
-#: Added for each kilometre between the two: differences of ionosphere, troposphere and orbit errors.
+#: Added per kilometre between station and train: differences of ionospheric, tropospheric and orbit errors.
 _PER_KM_M: Final = 0.004
 LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
 
@@ -40,7 +40,7 @@ class BaseLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseErrors:
-    """Errors of the ranges of a base station by channel, B epochs by S channels."""
+    """Range errors of a base station by channel, B epochs by S channels."""
 
     ecef_m: Floats  #: Shape (3,).
     time: Datetimes  #: Shape (B,).
@@ -56,7 +56,7 @@ class BaseErrors:
         return len(self.time)
 
     def merge(self, later: BaseErrors) -> BaseErrors:
-        """Return these errors and later ones, with the channels of both."""
+        """Return these errors joined with later errors, with the channels of both."""
         parts = (self, later)
         keys = sorted({key for part in parts for key in part.keys})
         return replace(
@@ -92,8 +92,8 @@ class BaseErrors:
         """Return the newest errors at the epochs of a train (T,), for its channels (K,), near approximate positions (T,
         3) [m].
 
-        A channel that the station has on another signal of the same band uses that one: a constant of the constellation
-        is the difference.
+        A channel that the station observes on another signal of the same band uses that signal: they differ by a
+        constant of the constellation.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -130,7 +130,7 @@ def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str
 
 @dataclass(frozen=True, kw_only=True)
 class BaseStationSource:
-    """Another source, and the errors of the codes that a base station at a known position has measured with it."""
+    """Another source, and the code errors that a base station at a known position has measured with it."""
 
     other: CorrectionSource
     errors: BaseErrors
@@ -150,7 +150,7 @@ class BaseStationSource:
         return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the other source and the station's errors, whose sigma replaces that of the source."""
+        """Return the delays of the other source and the station's errors, whose sigma replaces the source's sigma."""
         given = self.other.delays(time, channels, satellites, seen)
         base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
         differenced = np.isfinite(base.code_m)

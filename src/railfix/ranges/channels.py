@@ -15,7 +15,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: A pseudorange lies between these [m]: nearest satellite less a receiver clock offset of 33 ms, GEO plus the same.
+#: A pseudorange lies between these [m]: nearest satellite less a receiver clock offset of 33 ms, GEO plus this offset.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
@@ -91,7 +91,7 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
 
 @dataclass(frozen=True, kw_only=True)
 class Channels:
-    """M channels of a log, and the K of them that settings allow."""
+    """M channels of a log, and the K channels among them that the settings allow."""
 
     #: Their columns in the observations, channels of one clock adjacent, a satellite's best signal first; shape (K,).
     columns: Indices
@@ -104,7 +104,7 @@ class Channels:
     frequency_hz: Floats  #: Shape (K,).
     every_frequency_hz: Floats  #: Shape (M,).
     left_out: Integers  #: Reason of the channels that settings leave out, 0 for the others; shape (M,).
-    member: Integers  #: 1 where a channel is of a satellite, S satellites; shape (M, S).
+    member: Integers  #: 1 where a channel belongs to a satellite, S satellites; shape (M, S).
     #: Columns of the second signals of each channel's satellite, in order of preference; -1 for none. P is 0 with one
     #: frequency; shape (K, P).
     second: Indices
@@ -114,7 +114,7 @@ class Channels:
     second_ratio: Floats
     second_noise: Floats
     pair_names: tuple[str, ...]  #: Satellite and both signals, length K P.
-    pair_groups: Integers  #: Number of the pairs with one delay in the receiver, shape (K P,).
+    pair_groups: Integers  #: Number of the group of pairs with a common receiver delay, shape (K P,).
 
     @cached_property
     def names(self) -> Strings:

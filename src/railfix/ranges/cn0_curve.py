@@ -1,6 +1,6 @@
 """Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
 
-It is fitted per constellation and signal; BeiDou and QZSS satellites are in two kinds of orbits with separate curves.
+It is fitted per constellation and signal; BeiDou and QZSS have satellites in two kinds of orbits, with separate curves.
 The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the median). Between the
 middles of the bins the curve runs by monotone cubic interpolation (PCHIP). Above the highest bin the last mean is used;
 below the lowest bin there is no curve. The file is TOML.
@@ -61,11 +61,11 @@ class Cn0Mean:
 
     kind: str  #: Key of `KINDS`.
     signal: str
-    elevation_deg: Floats  #: Middles of the bins, rising; shape (B,).
+    elevation_deg: Floats  #: Bin centres, rising; shape (B,).
     #: Mean and robust standard deviation, shape (B,) [dB-Hz] [dB].
     mean_dbhz: Floats
     spread_db: Floats
-    count: Integers  #: Samples of each bin, shape (B,).
+    count: Integers  #: Number of samples per bin, shape (B,).
 
     def __post_init__(self) -> None:
         for name in ("elevation_deg", "mean_dbhz", "spread_db", "count"):
@@ -119,7 +119,7 @@ class Cn0CurveSource(Settings):
 class Cn0Curve:
     """Mean C/N0 over elevation of an antenna and receiver."""
 
-    means: tuple[Cn0Mean, ...]  #: One a kind and signal.
+    means: tuple[Cn0Mean, ...]  #: One curve per kind and signal.
     source: Cn0CurveSource = field(default_factory=Cn0CurveSource)
 
     def __post_init__(self) -> None:
@@ -164,5 +164,5 @@ class Cn0Curve:
 
 
 def _plain(text: str) -> str:
-    """Type of an antenna or receiver with its blanks evened out."""
+    """Type of an antenna or receiver with normalised blanks."""
     return " ".join(text.split())

@@ -16,7 +16,7 @@ from railfix.ranges.cn0_curve import Cn0Curve, Cn0CurveSource, Cn0Mean, satellit
 
 __all__ = ["Cn0Samples", "CurveFit", "fit_cn0_curve"]
 
-#: Standard deviation of a normal variable against its median absolute deviation.
+#: Ratio of a normal variable's standard deviation to its median absolute deviation.
 _NORMAL_MAD: Final = 1.482_602_218_505_602
 
 
@@ -24,8 +24,8 @@ class CurveFit(Settings):
     """Settings of the fit of a curve."""
 
     bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
-    least_samples: int = Field(default=30, ge=1)  #: A bin of fewer samples is left out.
-    least_bins: int = Field(default=4, ge=2)  #: A kind and signal of fewer bins gets no curve.
+    least_samples: int = Field(default=30, ge=1)  #: A bin with fewer samples is left out.
+    least_bins: int = Field(default=4, ge=2)  #: A kind and signal with fewer bins gets no curve.
     #: Samples farther from their bin's median, in robust standard deviations, are left out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
@@ -62,10 +62,10 @@ def fit_cn0_curve(
     fit: CurveFit | None = None,
     source: Cn0CurveSource | None = None,
 ) -> Cn0Curve:
-    """Fit the mean C/N0 over elevation, one curve a kind and signal with bins enough.
+    """Fit the mean C/N0 over elevation, one curve per kind and signal with enough bins.
 
     `samples` are collected ones, or C/N0 (T, M), elevation (T, M), satellite and signal (M,), from a position with open
-    sky. ValueError: no kind and signal has samples enough.
+    sky. ValueError: no kind and signal has enough samples.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):

@@ -22,7 +22,7 @@ from railfix.io.logs import read_navigation, scan_observations
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
-_SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) requires about a day; below this a note is made [s].
+_SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) requires about a day; a shorter log causes a note [s].
 _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
 #: Lowest elevation of that check [deg], and the fraction of rejected calibration samples that gives a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
@@ -65,9 +65,9 @@ def cn0_curve_from_log(
     """Fit a curve on the log of a receiver, about a day, whose antenna stood under open sky.
 
     `position_ecef_m`: position of the antenna, shape (3,), to some kilometres; by default the header's.
-    InputFileError: a file is missing or of another kind; the log has no C/N0. SettingsError: the header has no position
-    and none was given. MismatchError: satellites were tracked that are below the horizon of the position, or the
-    navigation files have none of them, or too few samples for any curve.
+    InputFileError: a file is missing or not of the expected kind; the log has no C/N0. SettingsError: the header has no
+    position and none was given. MismatchError: satellites were tracked that are below the horizon of the position, or
+    the navigation files have none of them, or too few samples for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0

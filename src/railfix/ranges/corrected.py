@@ -43,7 +43,7 @@ class AntennaRanges(NotebookTable):
     #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    #: Code with satellite clock, group delay and atmosphere applied, and standard deviations; shape (T, K).
+    #: Code corrected for satellite clock, group delay and atmosphere, and standard deviations; shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
     reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
@@ -212,12 +212,12 @@ def corrected_ranges(
 
 
 def is_pseudorange(code_m: Floats) -> Masks:
-    """Return which numbers a pseudorange can have, any shape; false for NaN."""
+    """Return whether values are plausible pseudoranges, any shape; false for NaN."""
     return np.asarray((code_m > PLAUSIBLE_CODE_M[0]) & (code_m < PLAUSIBLE_CODE_M[1]))
 
 
 def is_orbit(sat_ecef_m: Floats) -> Masks:
-    """Return which positions (..., 3) a navigation satellite can have; false for NaN."""
+    """Return whether positions (..., 3) are plausible for a navigation satellite; false for NaN."""
     radius = np.sqrt(np.einsum("...i,...i->...", sat_ecef_m, sat_ecef_m))
     return np.asarray((radius > ORBITS_M[0]) & (radius < ORBITS_M[1]))
 

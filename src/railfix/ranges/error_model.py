@@ -1,7 +1,7 @@
 """Error model of pseudoranges on a railway: bias, sigma and overbound by direction and C/N0 (P1 7).
 
 The bins are elevation, azimuth relative to the car body and C/N0. The file is TOML with the bins, the conditions, and
-one array of numbers a column, in the order of elevation, then sector, then C/N0. `pooled` counts into `POOLED`.
+one array of numbers per column, in the order of elevation, then sector, then C/N0. `pooled` counts into `POOLED`.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Conditions(Settings):
     signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
     screens: tuple[str, ...]  #: Active screens.
     elevation_mask_deg: float = Field(ge=0.0, lt=90.0)
-    codes: Literal["raw", "smoothed"]  #: Pseudoranges as received, or smoothed by the carrier phase.
-    #: Models of the delays: "klobuchar", "saastamoinen", "off", or "sbas".
+    codes: Literal["raw", "smoothed"]  #: Raw pseudoranges, or carrier-smoothed pseudoranges.
+    #: Delay models: "klobuchar", "saastamoinen", "off", or "sbas".
     ionosphere: Literal["klobuchar", "off", "sbas"]
     troposphere: Literal["saastamoinen", "off", "sbas"]
 
@@ -131,11 +131,11 @@ class BinStatistics:
     """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool."""
 
     count: Integers  #: Samples of the bin itself.
-    blocks: Integers  #: Passes of a satellite through it, counted once a block of time: samples are correlated.
+    blocks: Integers  #: Passes of a satellite through the bin, counted once per block of time: samples are correlated.
     #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
-    #: `error_model_fit.gaussian_overbound` of the same.
+    #: `error_model_fit.gaussian_overbound` of the same samples.
     bound_bias_m: Floats
     bound_sigma_m: Floats
     pooled: Integers  #: Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
@@ -153,18 +153,18 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Measured priors above this come from too few blocks of time to leave a level.
+LARGEST_PRIOR: Final = 0.05  #: Measured priors above this rest on too few blocks for a finite level.
 
 
 class FaultRate(Settings):
-    """Probability that a used range is faulty at a time, measured."""
+    """Measured probability that a used range is faulty at a given time."""
 
     #: A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
     beyond_sigma: float = Field(gt=0)
     #: Ranges used, and those beyond.
     ranges: int = Field(ge=0)
     faulty: int = Field(ge=0)
-    #: Blocks of time of single satellites, which are independent of each other, and those with a faulty range.
+    #: Blocks of time of single satellites, which are independent of each other, and blocks with a faulty range.
     blocks: int = Field(ge=0)
     faulty_blocks: int = Field(ge=0)
     prior: float = Field(ge=0, le=1)  #: faulty / ranges.
@@ -174,12 +174,12 @@ class FaultRate(Settings):
     #: Blocks of time with two or more faulty satellites, over the number expected for independent satellites; 0 without
     #: any.
     together: float = Field(ge=0)
-    #: Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and those
-    #: in which two of these were faulty.
+    #: Blocks of time with at least two low satellites on one side of the track, each side counted separately, and
+    #: blocks in which two of these satellites were faulty.
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
     #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by those
-    #: blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
+    #: blocks: the `side_prior` to use, where it is small enough for a finite protection level. 1 without such blocks.
     side_upper: float = Field(default=1.0, ge=0, le=1)
     #: Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
     no_level_m: tuple[tuple[float, float], ...] = ()
@@ -195,13 +195,12 @@ class ErrorModel:
     """Errors of corrected pseudoranges by bin."""
 
     bins: ErrorBins
-    #: Errors before and after the screens. Weights and protection level use those after them; the difference is the
-    #: effect of the screens.
+    #: Errors before and after the screens. Weights and protection level use the errors after the screens; the
+    #: difference is the effect of the screens.
     before: BinStatistics
     after: BinStatistics
     #: "local": multipath and receiver noise alone (a reference station removed the other errors).
-    #: "satellite_and_atmosphere":
-    #: these, too, as they were on those days.
+    #: "satellite_and_atmosphere": satellite and atmospheric errors of the days recorded as well.
     covers: Literal["local", "satellite_and_atmosphere"]
     #: Settings under which the model is valid; None: unknown, compared with nothing.
     conditions: Conditions | None = None
@@ -214,7 +213,7 @@ class ErrorModel:
     ) -> tuple[Floats, Floats]:
         """Return the overbounding sigma and bias of observations, shapes as broadcast [m].
 
-        NaN where the direction is unknown or the model has nothing.
+        NaN where the direction is unknown or the model has no value.
         """
         index = self.bins.index(elevation_deg, relative_azimuth_deg, cn0_dbhz)
         inside, safe = index >= 0, np.maximum(index, 0)
@@ -230,7 +229,7 @@ _Count = Annotated[int, Field(ge=0)]
 
 
 class _Columns(Settings):
-    """`BinStatistics` as columns, one number a bin; NaN where a bin has none."""
+    """`BinStatistics` as columns, one number per bin; NaN where a bin has none."""
 
     count: tuple[_Count, ...]
     blocks: tuple[_Count, ...]

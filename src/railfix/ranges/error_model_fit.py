@@ -29,8 +29,8 @@ def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
 
     The k-th of n samples counts as the quantile of probability ``k / (n + 1)``, from either end. Sigma is the least
     that bounds both tails (beyond one standard score) about the median's distance from zero; the bias is then the least
-    that bounds the rest. Beyond the largest sample the bound is an extrapolation by the normal distribution and nothing
-    else. ValueError: fewer than three samples, or one that is not finite.
+    that bounds the rest. Beyond the largest sample the bound is only an extrapolation by the normal distribution.
+    ValueError: fewer than three samples, or one that is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
@@ -55,7 +55,7 @@ class ErrorModelFit(Settings):
     least_blocks: int = option(
         "Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one.", 30, metavar="N", ge=1
     )
-    #: Length of the blocks that a satellite's samples are counted in. Errors are correlated over tens of seconds where
+    #: Length of the blocks in which a satellite's samples are counted. Errors are correlated over tens of seconds while
     #: a train is at rest.
     block_s: float = Field(default=30.0, gt=0.0)
 
@@ -123,7 +123,7 @@ def _rows(order: Integers, start: Integers, of_set: Integers) -> Integers:
 
 
 def _members(shape: tuple[int, int, int]) -> tuple[Integers, ...]:
-    """For each level of pooling the number of the set that each bin belongs to."""
+    """Return, for each pooling level, the number of the set to which each bin belongs."""
     e, _, c = (part.ravel() for part in np.indices(shape))
     own = np.arange(e.size)
     return own, e * shape[2] + c, e, c, np.zeros(e.size, dtype=np.int64)
@@ -171,12 +171,12 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-#: A range that passed the screens is faulty beyond this many of its sigmas; confidence of the bounds of the rates.
+#: A range that passed the screens is faulty beyond this many of its sigmas; confidence of the rate bounds.
 _BEYOND_SIGMA: Final = 5.0
 _CONFIDENCE: Final = 0.95
 #: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
 _SIDE_ELEVATION_DEG: Final = 45.0
-#: Parts of the line that are compared with the whole of it [m].
+#: Length of the parts of the line that are compared with the whole line [m].
 _STRETCH_M: Final = 100.0
 #: Blocks of one satellite are numbered by time and satellite (`ErrorSamples.block`): satellites in a block of time.
 _SATELLITES: Final = 1_000_000
@@ -188,7 +188,7 @@ def fault_rate(samples: ErrorSamples) -> FaultRate:
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     every, bad = np.unique(samples.block[used]), np.unique(samples.block[faulty])
     ranges, count = int(used.sum()), int(faulty.sum())
-    # Within a faulty block only a part of the ranges is faulty; without one, one range of a block would be.
+    # Within a faulty block only some of the ranges are faulty; without a faulty block, one range of a block is assumed.
     part = (count / ranges) / (len(bad) / len(every)) if len(bad) else 1.0
     upper = _upper(len(bad), len(every))
     low = used & (samples.elevation_deg < _SIDE_ELEVATION_DEG)
@@ -214,7 +214,7 @@ def _upper(hits: int, trials: int) -> float:
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
-    """Blocks of time with two satellites or more on a side of the track among some samples, each side for itself."""
+    """Blocks of time with at least two satellites on a side of the track among some samples, each side separately."""
     right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
     one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
     _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
@@ -226,7 +226,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
     A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of its fraction of faulty blocks exceeds
     the upper limit of the whole line's; neighbouring stretches are joined. There no prior of the line bounds the local
-    faults, and the settings leave the train without a level (`Config.no_level_m`).
+    faults, and by the settings the train has no protection level (`Config.no_level_m`).
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)

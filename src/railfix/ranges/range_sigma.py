@@ -1,4 +1,4 @@
-"""Standard deviations of corrected pseudoranges: receiver noise and multipath, satellites and atmosphere."""
+"""Standard deviations of corrected pseudoranges: receiver noise, multipath, satellite and atmospheric errors."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ class NominalErrors(Settings):
     (A.4.4.10.4 and A.4.2.4).
     """
 
-    #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions state 2 m and 95
-    #: % of the time less.
+    #: Orbit and clock in the range; GPS and Galileo stay near half a metre; their service definitions state 2 m as the
+    #: 95 % bound.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Vertical delay error of Klobuchar's model. Mostly common to all satellites, but treated as independent.
+    #: Vertical delay error of the Klobuchar model. Mostly common to all satellites, but treated as independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
     #: Added in quadrature with typical coefficients, and to the ranges: the difference of the two models.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
@@ -71,5 +71,5 @@ class NominalErrors(Settings):
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
     def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
-        """Accuracies of records, any shape, where they are worse than usual; 0 for the others and for unknown ones."""
+        """Broadcast accuracies, any shape, where they are worse than usual; 0 for usual and for unknown accuracies."""
         return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)

@@ -1,4 +1,4 @@
-"""Codes of a second frequency of each satellite, corrected like the first."""
+"""Second-frequency codes of each satellite, corrected like the first code."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 
 @dataclass(frozen=True, kw_only=True)
 class SecondCodes:
-    """Second codes of satellites: T epochs by K channels of the first."""
+    """Second codes of satellites: T epochs by K channels of the first codes."""
 
     code_m: Floats  #: Corrected by the models; NaN where missing; shape (T, K).
     noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
-    group_delay_m: Floats  #: That has been subtracted, shape (T, K).
+    group_delay_m: Floats  #: Already subtracted, shape (T, K).
     #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
     #: shape (T, K).
     delay_sigma_m: Floats
@@ -44,10 +44,10 @@ def second_codes(
     delays: Delays,
     noise: CodeNoise,
 ) -> SecondCodes | None:
-    """Return the second code of each satellite, corrected as the first one; None where no channel has one.
+    """Return the second code of each satellite, corrected like the first code; None where no channel has a second code.
 
     The first signal of the order of preference that is observed, healthy and has a group delay. Satellite and clock are
-    those of the first code, and the group delay is that of the same record; where that record lacks a part of it,
+    the same as for the first code, and the group delay is from the same record; where that record lacks a part of it,
     another message of the satellite is used.
     """
     second = channels.second
@@ -84,7 +84,7 @@ def second_codes(
 def _delays(
     navigation: Navigation, channels: Channels, states: SatelliteStates, choice: int
 ) -> tuple[Floats, Floats, Masks]:
-    """Return group delay and its sigma [m], and ill health of a choice of second signals, shapes (T, K)."""
+    """Return group delay and its sigma [m], and whether the chosen second signals are unhealthy, shapes (T, K)."""
     shape = states.record.shape
     delay, sigma = np.full(shape, np.nan), np.zeros(shape)
     sick = np.zeros(shape, dtype=bool)
@@ -102,7 +102,7 @@ def _delays(
 
 @lru_cache(maxsize=64)
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
-    """Return group delay, its standard deviation and ill health of a signal by record, shape (n,) [m].
+    """Return a signal's group delay, its standard deviation and whether it is unhealthy, by record, shape (n,) [m].
 
     GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a missing delay is replaced by
     that of the satellite's record of another message with the nearest reference time.

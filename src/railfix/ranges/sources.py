@@ -1,6 +1,6 @@
 """Sources of corrections behind one protocol: broadcast or precise orbits.
 
-`base_station` has a base station, `sbas.sbas_sources` SBAS.
+`base_station` adds a base station, `sbas.sbas_sources` SBAS.
 
 A source gives the satellites at the times of transmission, then the delays of their signals as seen from an
 approximate position of the antenna.
@@ -26,7 +26,7 @@ class SourceSatellites(NamedTuple):
 
     states: SatelliteStates  #: At the times of transmission, corrections of the source applied.
     fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
-    reason: Bits  #: Reasons of those that the source does not correct, shape (T, K).
+    reason: Bits  #: Reasons of the satellites that the source does not correct, shape (T, K).
     fixes: object = None  #: Corrections of the satellites, for the delays of the same source.
 
 
@@ -38,7 +38,7 @@ class BaseDifferences:
     code_m: Floats
     phase_m: Floats
     arc: Integers  #: Number of the arc of the station's phase, shape (T, K).
-    #: Standard deviation of the errors of satellite and atmosphere that the difference of codes keeps, shape (T, K).
+    #: Standard deviation of the satellite and atmospheric errors that remain in the difference of codes, shape (T, K).
     sigma_m: Floats
 
 
@@ -47,10 +47,10 @@ class SourceDelays(NamedTuple):
 
     delays: Delays  #: Subtracted from the codes.
     sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
-    #: Standard deviation of satellites and atmosphere, and the part of it that is assumed by elevation alone; (T, K).
+    #: Standard deviation of satellite and atmospheric errors, and its part assumed by elevation alone; (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
-    base: BaseDifferences | None = None  #: Corrections subtracted from a base station.
+    base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
     floor: Literal["added", "included"] = "added"  #: Whether `sigma_m` includes the error floor of the codes.
 
 
@@ -63,7 +63,7 @@ class CorrectionSource(Protocol):
 
     @property
     def second(self) -> Literal["none", "optional", "required"]:
-        """Whether codes of a second frequency can be corrected alike, or are needed."""
+        """Whether second-frequency codes can be corrected in the same way, or are needed."""
 
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
@@ -79,8 +79,8 @@ def choose_ionosphere(
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
     """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
 
-    Coefficients of GPS, or of QZSS, or typical ones; None where the ionosphere is "off". BeiDou's coefficients are for
-    a different model.
+    GPS coefficients, else QZSS coefficients, else typical coefficients; None where the ionosphere is "off". BeiDou's
+    coefficients are for a different model.
     """
     if ionosphere == "off":
         return None, 0.0, ()
@@ -98,7 +98,7 @@ def choose_ionosphere(
 
 @dataclass(frozen=True, kw_only=True)
 class BroadcastSource:
-    """Broadcast records, or precise orbits and clocks where the navigation data has them, with models of the delays."""
+    """Broadcast records, or precise orbits and clocks where the navigation data has them, with delay models."""
 
     navigation: Navigation
     klobuchar: Floats | None  #: None leaves the ionosphere uncorrected; shape (8,).
@@ -129,14 +129,14 @@ class BroadcastSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites by their records; none lacks a correction."""
+        """Return the satellites by their records; every satellite has its correction."""
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s
         )
         return SourceSatellites(states, None, np.zeros(code_m.shape, dtype=np.int64))
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays by the models of Klobuchar and Saastamoinen."""
+        """Return the delays of the Klobuchar and Saastamoinen models."""
         delays = model_delays(
             time, seen, channels.frequency_hz, klobuchar=self.klobuchar, ionosphere_sigma_m=self.ionosphere_sigma_m,
             troposphere=self.troposphere,

@@ -40,7 +40,7 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Speeds farther apart leave the distance between them unknown [s], with this variance [m2].
+#: Across a longer time between two speeds the distance is unknown [s], with this variance [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
 
@@ -84,10 +84,10 @@ def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, 
         return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
 
 
-SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]  #: Speeds by Doppler, and how they were solved, by antenna.
+SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]  #: Doppler speeds and their solution, by antenna.
 
-_ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
-_MOVED: Final = 4.0  #: Fixes show the direction of travel when they are this many standard deviations apart.
+_ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first assumes constant speed between the fixes.
+_MOVED: Final = 4.0  #: Fixes determine the direction of travel when they are this many standard deviations apart.
 _TELLING: Final = 2.0  #: Closing errors below this many standard deviations are within the noise.
 
 
@@ -96,7 +96,7 @@ class ReferenceData:
     """Measurements for a reference."""
 
     logs: Mapping[str, PositionLog]  #: Positions by antenna, front, rear or both.
-    trajectories: Mapping[str, Trajectory]  #: Dopplers of these antennas, and of the antennas of `dopplers`.
+    trajectories: Mapping[str, Trajectory]  #: Trajectories of these antennas, and of the antennas of `dopplers`.
     dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: By antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
@@ -108,7 +108,7 @@ def build_references(data: ReferenceData, settings: ReferenceSettings | None = N
     """Return the reference positions of every antenna that has a log of positions.
 
     NoPositionError: when there are fewer than two good fixes. MismatchError: when there are two logs of positions
-    without the distance between the antennas, or pulses or accelerations of another time.
+    without the distance between the antennas, or pulses or accelerations from another time.
     """
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
@@ -126,7 +126,7 @@ def build_references(data: ReferenceData, settings: ReferenceSettings | None = N
 
 
 class _ReferenceBuilder:
-    """The work on one antenna."""
+    """Computation of the reference of one antenna."""
 
     def __init__(self, name: str, data: ReferenceData, settings: ReferenceSettings) -> None:
         self.name, self.data, self.settings = name, data, settings
@@ -177,7 +177,7 @@ class _ReferenceBuilder:
         fixes: Fixes,
         settings: ReferenceSettings,
     ) -> Floats:
-        """Return the closing error of each gap in standard deviations of the best sensor; 1 where there are few."""
+        """Return the closing error of each gap in standard deviations of the best sensor; 1 where there are too few."""
         good = fixes.good
         fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])
         variance = np.full(len(moved), np.inf)
@@ -238,7 +238,7 @@ class _ReferenceBuilder:
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
-        """Dopplers that project on this antenna's path: its own, and the other antenna's on one vehicle."""
+        """Dopplers usable on this antenna's path: its own, and the other antenna's on the same vehicle."""
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 
@@ -269,7 +269,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by a wheel if any, otherwise by Dopplers."""
+        """Return the distance travelled up to instants and its variance: by wheel if available, else by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
@@ -280,7 +280,7 @@ class _ReferenceBuilder:
         return way, white + lasting
 
     def _hint(self, time: Datetimes, joined: Speeds, fixes: Fixes) -> Floats:
-        """Return speeds that show the direction of the wheel: Dopplers, else close consecutive fixes."""
+        """Return speeds that determine the wheel's direction: Dopplers, else close consecutive fixes."""
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))

@@ -96,7 +96,7 @@ class ReferenceInputs(InputFiles):
 
 
 class ReferenceOptions(Settings):
-    """Options that do not change the reference."""
+    """Options that do not affect the reference."""
 
     logs: LogReading = Field(default_factory=LogReading)
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
@@ -154,7 +154,7 @@ def antenna_record(part: Built) -> dict[str, Any]:
 
 SYSTEMS: Final = ("G", "J", "E", "C", "R")  #: Constellations whose Dopplers are used.
 _CHUNK: Final = 3000  #: Epochs of an observation log read at once.
-_NAMED: Final = 5  #: Gaps named in the notes at most.
+_NAMED: Final = 5  #: Largest number of gaps named in the notes.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ def reference_files(
     """Build the reference of a run and write it into the folder `out`.
 
     ================== ======================================================================
-    reference.csv      `railfix.io.reference_log`, one row an instant and antenna
+    reference.csv      `railfix.io.reference_log`, one row per instant and antenna
     fixes.csv          every row of the position logs, with its reasons for rejection
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================

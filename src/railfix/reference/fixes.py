@@ -57,13 +57,14 @@ class ReferenceSettings(Settings):
     #: Largest difference between the distance of two fixes and the distance travelled (P2 3.3): constant part, and
     #: fraction of the distance [m] [-].
     travel_m: float = _positive(0.10)
-    #: Largest speed of a train: of several passes of the line at one point only those within reach are considered.
+    #: Largest speed of a train: where the line passes a point several times, only passes within reach are considered.
     max_speed_mps: float = _positive(100.0)
     #: Longer gaps between good fixes are not bridged.
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
     #: Bridged instants of larger standard deviation are left out.
     max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
-    #: Standard deviation of a fix along the track where the log has none; and the least one that is used.
+    #: Standard deviation of a fix along the track where the log has none; and the smallest standard deviation that is
+    #: used.
     fix_sigma_m: float = _positive(0.03)
 
     doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
@@ -78,16 +79,16 @@ class ReferenceSettings(Settings):
         "M",
         "--pulse",
     )
-    wheel_scale: float = _positive(0.01)  #: Standard deviation of that distance, relative.
+    wheel_scale: float = _positive(0.01)  #: Relative standard deviation of that distance.
     slip_m: float = _positive(0.005)  #: Random error of the wheel's distance [m per square root of m].
     #: Noise of the accelerometer, and standard deviation of its offset [m/s2 per square root of Hz] [m/s2].
     acceleration_mps2: float = _positive(0.02)
 
 
-#: Positions of two antennas that are tagged no farther apart belong to one instant [ns].
+#: Positions of two antennas with time tags no farther apart than this belong to one instant [ns].
 _PAIR_NS: Final = 5_000_000
 _LOOK_BACK: Final = 60  #: Runs of agreeing fixes that a run may be joined to, back from it.
-#: Standard deviations of the travelled distance that a difference may have.
+#: Largest difference in standard deviations of the travelled distance.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
@@ -129,7 +130,7 @@ class Fixes:
     lateral_m: Floats
     height_m: Floats
     sigma_m: Floats  #: Along the track, shape (n,).
-    #: Distance from the previous good fix minus the distance travelled; NaN where no sensor measured that; shape (n,).
+    #: Distance from the previous good fix minus the distance travelled; NaN where no sensor measured it; shape (n,).
     travel_m: Floats
 
     def __len__(self) -> int:
@@ -150,7 +151,7 @@ class Fixes:
 
 
 def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
-    """Check each row of a log by itself; without qualities (a CSV without the column) all are fixed."""
+    """Check each row of a log separately; without qualities (a CSV without the column) all count as fixed."""
     timed = np.flatnonzero(~np.isnat(log.time))
     rows = timed[np.argsort(log.time[timed], kind="stable")]
     time, ecef = log.time[rows], log.ecef_m[rows]
@@ -203,18 +204,18 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
-#: The other antenna's row counts in a pair whatever this check gave it.
+#: The other antenna's row counts in a pair whatever the result of its own check.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
-_OUT_OF_REACH_M = 1e6  #: A pass out of reach costs this much more than any other choice [m].
-_JITTER_M = 2.0  #: Positions may jitter by this much more than the train can run [m].
+_OUT_OF_REACH_M = 1e6  #: Cost of a pass out of reach, above any other choice [m].
+_JITTER_M = 2.0  #: Tolerance for jitter of positions, beyond the distance that the train can travel [m].
 
 
 def match(
     time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
 ) -> tuple[Floats, Floats, Floats, Indices]:
-    """Put F positions in order of time on a trajectory: the shortest chain of passes within `max_speed_mps`.
+    """Match F positions in order of time to a trajectory: the shortest chain of passes within `max_speed_mps`.
 
     Returns arc length, NaN where no pass is near enough; distance to the right and above, there or at the nearest
     point; and segment, shapes (F,).
@@ -227,7 +228,7 @@ def match(
     lateral, height = _beside(offset, trajectory, section)
     passes = find_segments_near(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
     beside, above = _beside(passes.offset_m, trajectory, passes.segment)
-    # beyond the ends of the line there is nothing to be on
+    # beyond the ends of the line there is no position on it
     beyond = np.abs(passes.along_m - passes.foot_m) > 0.5
     beyond &= (passes.segment == 0) | (passes.segment == len(trajectory.length_m) - 1)
     within = (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond
@@ -242,13 +243,13 @@ def match(
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
-    """Return the components of offsets to the right, and square to the path and that."""
+    """Return the components of offsets to the right, and perpendicular to both path and right."""
     right, along = trajectory.across[section], trajectory.tangent[section]
     return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
 
 
 def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
-    """Return one pass a position: the cheapest chain from the first to the last."""
+    """Return one pass per position: the cheapest chain from the first to the last."""
     found, first = np.unique(position, return_index=True)
     if len(found) == len(position):
         return np.arange(len(found))
@@ -286,7 +287,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows by their spacing against the travelled distance (P2 3.3): the chain of agreeing runs is kept."""
+    """Reject rows whose spacing disagrees with the travelled distance (P2 3.3): the chain of agreeing runs is kept."""
     rows = fixes.good
     if len(rows) < 2:
         return fixes

@@ -35,7 +35,7 @@ _LEAST_READING_M: Final = 1e-3
 _LEAST_STEP_M: Final = 1e-4
 
 
-SAME_INSTANT_NS: Final = 20_000_000  #: Tags that differ by no more belong to one instant [ns].
+SAME_INSTANT_NS: Final = 20_000_000  #: Time tags that differ by no more than this belong to one instant [ns].
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
@@ -63,7 +63,7 @@ class Evidence:
     #: Shape (N,).
     doppler_mps: Floats
     doppler_sigma_mps: Floats
-    wheel_m: Floats  #: Cumulated distance of the wheel along rising chainage, from any start; shape (N,).
+    wheel_m: Floats  #: Cumulative wheel distance along rising chainage, from an arbitrary origin; shape (N,).
     wheel_sigma_m: float  #: Standard deviation of one reading: half a pulse and similar errors.
     acceleration_mps2: Floats  #: Mean of each step along rising chainage, without gravity; shape (N - 1,).
 
@@ -78,7 +78,7 @@ class SmoothedReference:
     #: Shape (N,).
     speed_mps: Floats
     speed_sigma_mps: Floats
-    wheel_scale: Floats  #: Fraction by which the wheel's distance is too long; NaN without a wheel; shape (N,).
+    wheel_scale: Floats  #: Scale error of the wheel's distance, positive if too long; NaN without a wheel; (N,).
 
 
 class _States:
@@ -208,8 +208,8 @@ def _measurements(
 ) -> tuple[Floats, Floats, Floats]:
     """Return values (N, 4), NaN where missing, their variances (N, 4) and design (N, 4, n).
 
-    Fix = place. Doppler speed = speed + error. Wheel = place + difference. The accelerometer's mean over a step times
-    its duration = gain of speed + offset times the duration.
+    Fix = position. Doppler speed = speed + error. Wheel = position + difference. The accelerometer's mean over a step
+    times its duration = gain of speed + offset times the duration.
     """
     count = len(evidence.time)
     value, variance = np.full((count, 4), np.nan), np.ones((count, 4))
@@ -237,7 +237,7 @@ class Closings:
     """Closing errors of a measured distance between fixes, over W windows."""
 
     error_m: Floats  #: Distance measured less distance between the fixes, shape (W,).
-    white_m2: Floats  #: Variance that single readings and the fixes explain, shape (W,) [m2].
+    white_m2: Floats  #: Variance of single readings and of the fixes, shape (W,) [m2].
     duration_s: Floats  #: Shape (W,).
     distance_m: Floats  #: Shape (W,).
 
@@ -292,7 +292,7 @@ def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
 
 
-WINDOWS: Final = 20  #: Windows that an estimate needs.
+WINDOWS: Final = 20  #: Fewest windows for an estimate.
 #: 80th percentile of a squared standard normal variable.
 _CHI2_80: Final = 1.6424
 _LEAST_LASTING_MPS: Final = 1e-3
@@ -318,7 +318,7 @@ class Built:
     gaps: tuple[Gap, ...]
     #: Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
     left_out: dict[str, int]
-    bridged_by: dict[str, int]  #: Bridged instants by the sensors that measured there.
+    bridged_by: dict[str, int]  #: Bridged instants by the sensors that measured then.
     facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
 
 
@@ -382,7 +382,7 @@ def assemble_reference(
 
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Return the bridged instants by the sensors that have a number there, or a second or so from there."""
+    """Return the bridged instants by the sensors with a measurement then, or about a second away."""
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),
@@ -399,4 +399,4 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-_NEAR_NS: Final = 1_500_000_000  #: Sensors of 1 Hz measure everywhere, up to a missing epoch [ns].
+_NEAR_NS: Final = 1_500_000_000  #: A 1 Hz sensor counts as continuous, up to one missing epoch [ns].

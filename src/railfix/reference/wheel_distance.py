@@ -1,4 +1,4 @@
-"""Distance of a tachometer's pulse by good fixes, and distances along the line from its table."""
+"""Distance per tachometer pulse from good fixes, and distances along the line from the tachometer table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.io.reference_log import Pulses
 
-#: Windows that the distance of a pulse is estimated from: length [s], least distance [m], least number.
+#: Windows for the estimate of the distance per pulse: length [s], least distance [m], least number.
 _WINDOW_S: Final = 10.0
 _LEAST_DISTANCE_M: Final = 30.0
 _LEAST_WINDOWS: Final = 5
@@ -37,7 +37,8 @@ class Wheel:
         """Compute the cumulated distance along rising chainage at instants, shape (N,) [m].
 
         `speed_hint_mps`, from another source, gives the direction of unsigned pulses; it changes at the longest
-        standstill. NaN where the table has no reading, and where a turn without a stop leaves the direction open.
+        standstill. NaN where the table has no reading, and where the direction is undetermined because of a reversal
+        without a stop.
         """
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
@@ -61,7 +62,7 @@ def _cumulate(run: Floats, step: Floats) -> Floats:
 
 
 def _direction(run: Floats, hint: Floats) -> Floats:
-    """1 or -1 of each step, NaN where it is open, shape (N - 1,)."""
+    """Direction of each step, 1 or -1, NaN where undetermined, shape (N - 1,)."""
     known = np.where(np.abs(hint) > _DIRECTION_MPS, np.sign(hint), np.nan)
     at = np.flatnonzero(np.isfinite(known))
     if not len(at):
@@ -82,7 +83,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
     """Return the direction within a stretch in which it changes: at the longest stop, or open."""
     standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
     if not standing.any():
-        # Between neighbouring pulses of both directions no stop is required.
+        # Between neighbouring pulses of opposite directions no stop is required.
         return np.full(len(step), np.nan)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(np.int8)))
     begin, end = edges[::2], edges[1::2]
@@ -92,7 +93,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
 
 
 def estimate_wheel(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
-    """Return the wheel with the given distance of a pulse, or the median of estimates from good fixes."""
+    """Return the wheel with the given distance per pulse, or the median of estimates from good fixes."""
     source = "given"
     if pulses.kind == "distance":
         pulse_m, source = 1.0, "metres in the table"

@@ -20,8 +20,8 @@ class AntennaSpacingLimits(Settings):
 
     #: Largest difference from the spacing; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Filter positions must also differ by this many of their standard deviations where both were predicted; limits of
-    #: their speeds.
+    #: Filter positions, and speeds, must also differ by this many of their standard deviations, as both may be
+    #: predicted.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
     #: Largest difference of the two speeds by the filter. Antennas of one vehicle have equal speeds, up to a few cm/s
     #: where the track curves or its cant changes; a smaller difference of single epochs moves no position by a metre.

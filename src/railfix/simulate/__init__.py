@@ -4,7 +4,7 @@
 arrays in chunks. The same scenario gives the same numbers. ``railfix simulate`` is the same from the command line.
 
 Atmospheric delays and the rigid body are computed here independently of the packages that the estimators
-use, by the same published formulas, so that an error in either shows as a position error.
+use, by the same published formulas, so that an error in either causes a position error.
 """
 
 import lazy_loader

@@ -33,7 +33,7 @@ _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points that the curve is integrated to [m]; the spline between them is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-_ROUNDS: Final = 8  #: Rounds of the integration on the ellipsoid: each gains the factor (length / Earth radius).
+_ROUNDS: Final = 8  #: Rounds of the integration on the ellipsoid: each reduces the error by (length / Earth radius).
 
 #: Pattern of the simulated test line: length [m], radius (right positive) [m] and cant [m] at its end.
 PATTERN: Final = (
@@ -63,7 +63,7 @@ class Alignment(Knots):
 
     @property
     def length_m(self) -> float:
-        """Chainage of the end."""
+        """Chainage of the end of the line."""
         return float(self.knot_m[-1])
 
     def curvature_at(self, chainage_m: ArrayLike) -> Floats:
@@ -79,7 +79,7 @@ class Alignment(Knots):
         return np.interp(np.asarray(chainage_m, dtype=np.float64), self.grade_knot_m, self.grade)
 
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
-        """Return the line's own marking [m]."""
+        """Return the line's kilometrage [m]."""
         if self.file is not None:
             return interpolate_kilometrage(chainage_m, self.file.point_m, self.file.track.kilometrage_m)
         return np.asarray(np.asarray(chainage_m, dtype=np.float64) + self.settings.kilometrage_start_m)
@@ -202,7 +202,7 @@ def _integrate(line: Alignment) -> tuple[Floats, Floats]:
 
     ``d azimuth = curvature * plan step + sin(latitude) d longitude`` (convergence of the meridians),
     ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``,
-    ``d height = climb``; integrated in rounds, each by Gauss's rule of two points a step.
+    ``d height = climb``; integrated in rounds, each by Gauss's rule of two points per step.
     """
     cells = int(np.ceil(line.length_m / _STEP_M))
     step = line.length_m / cells

@@ -54,7 +54,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # Always drawn, so that the slips of one phase do not depend on another's.
+        # Always drawn, so that the slips of one phase are independent of other phases.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
             continue
@@ -85,7 +85,7 @@ def pulse_times_s(
     tooth_errors: Floats | None = None,
 ) -> Floats:
     """Compute pulse times [s after the start]; `phase` in [0, 1), `tooth_errors` are fractions of the spacing."""
-    # The motion's own corners are nodes too, so that without slips nothing is approximate.
+    # The breakpoints of the motion are nodes, too, so that without slips the result is exact.
     corner = motion.time_s[(motion.time_s > 0.0) & (motion.time_s < duration_s)]
     node = np.unique(np.concatenate([np.arange(0.0, duration_s, _STEP_S), corner, [duration_s]]))
     chainage, speed = motion.at(node)
@@ -158,7 +158,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
 
 
 def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Return the truth of the wheel's slips and slides, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the ground truth of the wheel's slips and slides, see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     slips = wheel_slips(simulation, settings)
     start = scenario.start + timedelta([slip.start_s for slip in slips])

@@ -80,7 +80,7 @@ def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, 
 
 
 def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:
-    """Indices of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
+    """Indices of a satellite's records in force from `first` to `last`, by transmission; none where one is missing."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
     # Of records sent at the same time, the one with the later reference time.
@@ -97,7 +97,7 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     return np.asarray(rows[: len(rows) if served.all() else 0])
 
 
-#: Klobuchar coefficients of GPS, alpha then beta (invented, of ordinary size); they serve all constellations.
+#: Klobuchar coefficients of GPS, alpha then beta (fictitious, of ordinary size); they are used for all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
 #: Seconds between the transmission of the record before and the next (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
@@ -183,7 +183,7 @@ def _orbits(system: str, scenario: Scenario, rng: np.random.Generator) -> list[_
 
 
 def _slot_name(system: str, k: int) -> str:
-    """BeiDou's satellites have the positions of real ones of their kind: C01 to C05 are read as GEO."""
+    """BeiDou satellites have the numbers of real satellites of their kind: C01 to C05 are read as GEO."""
     if system == "C":
         return f"C{k + 19 if k < 19 else k + 22:02d}"
     return f"{system}{k + 1:02d}"
@@ -205,7 +205,7 @@ def _figure_of_eight(
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Return the records of one satellite: the one before the run, the current one, and the following ones."""
+    """Return the records of one satellite: the record before the run, the current record, and the following records."""
     every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
     mu, rotation = GM[system], ROTATION[system]
     start_sow = float(to_week(scenario.start)[1])
@@ -262,7 +262,7 @@ def _digits(value: float) -> str:
     return f"{value:.12E}"
 
 
-#: Longest piece of `SatelliteTable` [s], nodes of a piece, and the flight time it is worked out for [s].
+#: Longest piece of `SatelliteTable` [s], nodes of a piece, and the flight time for which it is computed [s].
 _PIECE_S: Final = 60.0
 _NODES: Final = 7
 _FLIGHT_S: Final = 0.08
@@ -360,7 +360,7 @@ class SatelliteTable:
             raise ValueError("tag is outside of the span that the satellite table was made for")
         piece = np.searchsorted(self._knots, when, side="right") - 1
         u = ((when - self._middle[piece] - late_s - _FLIGHT_S) / self._half)[:, None, None]
-        # Horner's rule for value, slope and half the bend.
+        # Horner's rule for value, slope and half the second derivative.
         value = self._powers[-1][piece]
         slope, bend = np.zeros_like(value), np.zeros_like(value)
         for k in range(_NODES - 2, -1, -1):

@@ -1,7 +1,7 @@
-"""Errors common to all receivers nearby, and Gauss-Markov processes independent of the chunks.
+"""Errors common to all nearby receivers, and Gauss-Markov processes independent of the chunks.
 
 The exact process is drawn at nodes and interpolated by cubics through four of them (Catmull and Rom 1974); the loss of
-variance (less than 1 %) is put back on the average.
+variance (less than 1 %) is compensated on average.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from railfix.ranges.sbas.troposphere import rtca_mapping
 from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 
-_NODES_A_TIME: Final = 32  #: Nodes in one correlation time.
-#: Least nodes before the start of the run, and least room about it [s]: clock biases put instants outside.
+_NODES_A_TIME: Final = 32  #: Nodes per correlation time.
+#: Least nodes before the start of the run, and least margin around it [s]: clock biases shift instants outside.
 _BEFORE: Final = 3
 _ROOM_S: Final = (0.1, 1.0)
 
@@ -71,7 +71,7 @@ def nodes_before(spacing_s: float) -> int:
 
 
 def node_count(duration_s: float, spacing_s: float) -> int:
-    """Return the number of nodes that a run of a duration needs, with the room before and after it."""
+    """Return the number of nodes for a run of a given duration, with the margins before and after it."""
     return nodes_before(spacing_s) + int(np.ceil((duration_s + _ROOM_S[1]) / spacing_s)) + 4
 
 
@@ -112,7 +112,7 @@ class ClockWalk(Interpolated):
         drift = np.cumsum(frequency_walk * white[:, 0])
         bias = np.cumsum(walk * white[:, 1])
         drift, bias = drift - drift[start], bias - bias[start]
-        # The trapezoid rule: the drift goes evenly from node to node.
+        # The trapezoid rule: the drift is linear from node to node.
         turned = np.concatenate([[0.0], np.cumsum((drift[1:] + drift[:-1]) / 2.0)]) * interval_s
         bias = bias + turned - turned[start]
         super().__init__(bias[:, None], interval_s)
@@ -254,7 +254,7 @@ class CommonErrors:
         return error
 
     def clock_error_m(self, time_s: Floats) -> Floats:
-        """True minus broadcast clock of each satellite, shape (T, S) [m]; a clock that is ahead shortens the code."""
+        """True minus broadcast clock of each satellite, shape (T, S) [m]; a clock that is fast shortens the code."""
         error = np.zeros((len(time_s), len(self._satellites)))
         for columns, process in self._clocks:
             error[:, columns] += process.at(time_s)

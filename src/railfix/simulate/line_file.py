@@ -2,7 +2,7 @@
 
 Between the points it is a cubic spline in space (not-a-knot), whose arc length is the chainage. Cant changes linearly
 from point to point, on the side of the file's radius, of the spline's curvature where the file has none. A file with a
-curve tighter than 30 m is an error.
+curve of a radius below 30 m is an error.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from railfix.simulate.settings import (
 )
 from railfix.track import Track, read_track
 
-#: Length of the pattern of P1's test line [m], and of a generated line, where none is given.
+#: Default length of the pattern of P1's test line [m], and of a generated line.
 PATTERN_LENGTH_M: Final = 756.0
 GENERATED_LENGTH_M: Final = 36_000.0
 LONGEST_LINE_M: Final = 1e7  #: Longest line, and longest element of one [m].
@@ -66,16 +66,16 @@ class Element(ScenarioSettings):
 class Gradient(ScenarioSettings):
     """Gradient from a chainage on."""
 
-    from_m: NotNegative  #: Chainage of the change, the middle of its vertical curve.
+    from_m: NotNegative  #: Chainage of the change of gradient, the middle of its vertical curve.
     permille: float = Field(ge=-100.0, le=100.0)  #: Positive where the line rises with chainage.
-    vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve that joins it to the gradient before.
+    vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve that joins it to the previous gradient.
 
 
 class Terrain(ScenarioSettings):
     """Limits of the elements of a generated line from a chainage on; lengths and radii are uniform in their ranges."""
 
     from_m: NotNegative = 0.0
-    #: Range of the lengths of straights and curves, transitions not counted, and of the radii.
+    #: Range of the lengths of straights and curves, without transitions, and of the radii.
     straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)
     curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
     radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)
@@ -146,16 +146,16 @@ class LineSettings(ScenarioSettings):
     longitude_deg: Finite = 135.45
     height_m: Finite = 162.0
     azimuth_deg: Finite = 63.0  #: Direction of the line at its first point. Not used for a file.
-    #: Kilometrage of the first point; it rises with chainage. A file brings its own.
+    #: Kilometrage of the first point; it rises with chainage. A file has its own.
     kilometrage_start_m: Finite = 12_340.0
-    #: Largest spacing of the map's points; curves include their transitions. A file brings its points.
+    #: Largest spacing of the map's points; curves include their transitions. A file has its own points.
     straight_spacing_m: Positive = 20.0
     curve_spacing_m: Positive = 2.32
 
     elements: tuple[Element, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Level where absent.
     #: The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated line ends here.
-    #: Elements have their own sum, and a file its own length (NaN here).
+    #: For elements the length is their sum, for a file its own length (NaN here).
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
 
     generated: GeneratedLine = GeneratedLine()
@@ -286,7 +286,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
 def _cut(elements: list[Element], length_m: float) -> list[Element]:
     """Return the elements up to the length: a last curve that does not fit is replaced by a straight."""
     while elements and sum(item.length_m for item in elements) > length_m:
-        # Straight, transition, curve, transition: all four go.
+        # Straight, transition, curve, transition: all four are replaced.
         del elements[-4:]
     rest = length_m - sum(item.length_m for item in elements)
     return [*elements, Element(kind="straight", length_m=rest)] if rest > 0.0 else elements
@@ -302,7 +302,7 @@ def _profile(settings: LineSettings, rng: np.random.Generator) -> list[Gradient]
         permille = float(np.round(rng.uniform(-here.permille, here.permille) * 2.0) / 2.0)
         if abs(height) > _HIGH_M:
             permille = -float(np.sign(height)) * abs(permille)
-        # Half of the vertical curve ahead and half of the one behind have to fit.
+        # Half of the vertical curve ahead and half of the vertical curve behind have to fit.
         fits = 0.9 * min(step, behind) / limits.vertical_radius_m * 1e3
         permille = float(np.clip(permille, before - fits, before + fits))
         if place + 2.0 * step > settings.length_m:
@@ -327,7 +327,7 @@ class FileLine:
 
 
 def line_of_file(settings: LineFile) -> FileLine:
-    """Return the line through the points of a track file; InputFileError where it has too few, or bends too sharply."""
+    """Return the line through the points of a track file; InputFileError where it has too few, or too sharp a curve."""
     track = read_track(
         settings.path,
         crs=settings.crs or None,

@@ -1,8 +1,8 @@
 """Chainage and speed of the train over time, and true positions of its antennas.
 
-A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow, stopping at stations.
-Antennas are on a rigid body with both bogie centres on the continuous line, by Newton's method and Rodrigues' rotation,
-independently of `railfix.track.vehicle`.
+A shuttle between two points, or a run curve: as fast as the line, its curves and the train permit, stopping at
+stations. Antennas are on a rigid body with both bogie centres on the continuous line, by Newton's method and Rodrigues'
+rotation, independently of `railfix.track.vehicle`.
 """
 
 from __future__ import annotations
@@ -103,14 +103,14 @@ def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> F
 
 
 _STEP_M: Final = 2.0  #: Spacing of the positions at which a run curve evaluates the limits [m].
-_RAIL_HEAD_M: Final = 0.070  #: Contact points of the wheels are this much farther apart than the gauge [m].
+_RAIL_HEAD_M: Final = 0.070  #: Distance of the wheels' contact points less the gauge [m].
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
     """Return the motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or such are given.
 
     Its duration is the scenario's unless given; 0: one way, to the last stop and its standstill. SettingsError: when
-    the train has no room on the line.
+    the train does not fit on the line.
     """
     settings = scenario.run
     scenario.check_room(line.length_m)
@@ -126,7 +126,7 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Return the motion between two chainages, standing at each, for at least a duration."""
+    """Return the motion between two chainages, with a standstill at each, for at least a duration."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
@@ -176,7 +176,7 @@ def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, cont
 
 
 def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, contact_m: float) -> Floats:
-    """From standing to standing: rows of time from the start, chainage, speed and acceleration, shape (4, P).
+    """Motion from standstill to standstill: rows of time from the start, chainage, speed, acceleration, shape (4, P).
 
     The square of the speed that can be reached from the limits behind is the least of their squares
     plus ``2 a`` times the distance to each; from the limits ahead likewise.

@@ -99,7 +99,7 @@ class TrackingNoise:
         self._settings = settings
         self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
         self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
-        # Epochs since the signal could last not be tracked; at the start as if it always could.
+        # Epochs since the signal could last not be tracked; at the start it is assumed to have been trackable.
         self._since = np.full(channels, self._wait + 1, dtype=np.int64)
         self._seen = np.zeros(channels, dtype=np.bool_)
         self._present = np.zeros(channels, dtype=np.bool_)
@@ -114,7 +114,7 @@ class TrackingNoise:
         weak = cn0_dbhz < threshold
         if again is None:
             return np.asarray(weak)
-        # The last of both events decides; between them the state before the first epoch.
+        # The later of both events decides; without either, the state before the first epoch holds.
         epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
         fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
         risen = np.maximum.accumulate(
@@ -151,7 +151,7 @@ def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
     return np.where(losses == 0, 0.0, cycles)
 
 
-#: Signals of each constellation, the first one first.
+#: Signals of each constellation, the first signal first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
 #: Two of each satellite with `ReceiverSettings.second` "L5".
 _WITH_L5: Final = {"G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q"), "C": ("1P", "5P")}

@@ -1,4 +1,4 @@
-"""Stream of SBAS messages, one a second, whose corrections undo the simulated errors (RTCA DO-229D, A.4.4)."""
+"""Stream of SBAS messages, one per second, whose corrections cancel the simulated errors (RTCA DO-229D, A.4.4)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
 def fast(
     second: int, prc: Sequence[float], udrei: Sequence[int], *, kind: int = 2, iodf: int = 0, iodp: int = 0
 ) -> Bytes:
-    """Types 0 and 2 to 5; corrections in metres, slots left over are not monitored."""
+    """Types 0 and 2 to 5; corrections in metres, remaining slots are not monitored."""
     values = [round(v / STEP_M) for v in prc] + [0] * (13 - len(prc))
     grades = list(udrei) + [NOT_MONITORED] * (13 - len(udrei))
     return message(kind, second, (iodf, 2), (iodp, 2), *((v, 12) for v in values), *((g, 4) for g in grades))

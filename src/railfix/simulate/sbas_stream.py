@@ -1,4 +1,4 @@
-"""Streams of simulated SBAS messages, one a second, and their file; messages of dual-frequency SBAS (L5)."""
+"""Streams of simulated SBAS messages, one per second, and their file; messages of dual-frequency SBAS (L5)."""
 
 from __future__ import annotations
 
@@ -154,12 +154,12 @@ LOST: Final = 53  #: Stream of random numbers of lost messages.
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
-    """Return messages from `lead_s` before the run to its end, one a second.
+    """Return messages from `lead_s` before the run to its end, one per second.
 
     Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
-    long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` adds
-    to clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected. On L5:
-    integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
+    long-term corrections, grid, degradation and integrity. All corrections cancel the errors that `Scenario.errors`
+    adds to clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
+    On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario

@@ -31,7 +31,7 @@ from railfix.simulate.settings import (
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle, in the order in which they are written.
 #: Names of other files of a run.
 _FILES: Final = (*ANTENNAS, "nav", "track", "vehicle", "truth", "sections", "scenario", "readme", "sbas")
-LONGEST_S: Final = 8.64e6  #: Longest run, a hundred days; more epochs than this are many runs [s].
+LONGEST_S: Final = 8.64e6  #: Longest run, a hundred days; longer series are split into several runs [s].
 
 
 class Station(ScenarioSettings):
@@ -53,7 +53,7 @@ class SpeedLimit(ScenarioSettings):
 
 
 class RunSettings(ScenarioSettings):
-    """Motion of the train: it stands, runs from stop to stop and back, until the end of the run."""
+    """Motion of the train: it waits, then runs from stop to stop and back, until the end of the run."""
 
     #: Accelerations are constant. Where a leg is too short the cruising speed is not reached.
     cruise_mps: Positive = 40.0 / 3.6
@@ -68,9 +68,9 @@ class RunSettings(ScenarioSettings):
     stations: tuple[Station, ...] = ()
 
     limits: tuple[SpeedLimit, ...] = ()
-    #: Curves are run at the speed whose equilibrium cant is the curve's cant and this; None: curves do not limit.
+    #: Curves are run at the speed whose equilibrium cant is the curve's cant plus this; None: no limit by curves.
     cant_deficiency_m: Positive | None = None
-    jerk_mps3: Positive | None = None  #: Largest jerk; None: accelerations begin and end at once.
+    jerk_mps3: Positive | None = None  #: Largest jerk; None: unlimited jerk.
     #: Direction of the first leg. The vehicle's front points to rising chainage in either direction of running.
     direction: Literal["rising", "falling"] = "rising"
     at_end: Literal["return", "stand"] = "return"  #: After the last stop.
@@ -120,7 +120,7 @@ class SkySettings(ScenarioSettings):
     cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
     #: Satellites whose newer records are unhealthy, while the record before the run is healthy.
     unhealthy: tuple[str, ...] = ("G02",)
-    #: Only that many, the highest of each epoch, are tracked.
+    #: Largest number of satellites tracked, the highest ones of each epoch.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
     #: Delays in the ranges as multiples of the models'; 1 leaves no error after correction.
     ionosphere_scale: NotNegative = 1.0
@@ -147,7 +147,7 @@ class ReceiverSettings(ScenarioSettings):
     sin(elevation)`` with the C/N0 that is written.
     """
 
-    signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables a satellite, 2 gives eight.
+    signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables per satellite, 2 gives eight.
     #: Second signals: L2C, E5b, B3I; or L5, E5a and B2a, with B1C instead of B1I and B-CNAV1 instead of D1.
     second: Literal["L2", "L5"] = "L2"
     #: 0 switches that noise off.
@@ -165,12 +165,12 @@ class ReceiverSettings(ScenarioSettings):
     #: Clock of the front receiver at the start [s], and [s/s]; a separate rear clock has other values of this size.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
     clock_drift: Finite = 2.0e-7
-    #: "millisecond" puts a clock that is over half a millisecond off back by a whole one.
+    #: "millisecond" steps a clock that is off by over half a millisecond back by a whole millisecond.
     clock_steps: Literal["none", "millisecond"] = "none"
 
     @property
     def has_l5(self) -> bool:
-        """Whether two signals of a satellite are L1 and L5, or their like."""
+        """Whether two signals of a satellite are L1 and L5, or their equivalents."""
         return self.signals_per_satellite == 2 and self.second == "L5"
 
 
@@ -191,7 +191,7 @@ class Scenario(ScenarioSettings):
 
     seed: Seed = 20_240_305  #: The same scenario gives the same numbers.
     start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")  #: First time tag, GPS time.
-    #: The number of epochs is their product; the interval must be a multiple of 100 ns.
+    #: Duration and rate; their product is the number of epochs. The interval must be a multiple of 100 ns.
     duration_s: float = Field(default=200.0, gt=0.0, le=LONGEST_S)
     rate_hz: float = Field(default=10.0, gt=0.0, le=1000.0)
     #: Settings of the parts.

@@ -39,7 +39,7 @@ from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
 
-#: Word for a duration that the run curve gives.
+#: Word for a duration given by the run curve.
 WHOLE_RUN: Final = "run"
 _FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
 
@@ -100,7 +100,7 @@ def find_scenario(name: FilePath) -> Path:
 
 
 def load_recipe(name: FilePath) -> Recipe:
-    """Return the contents of a scenario file (a path, or the name of a shipped scenario), one run or several.
+    """Return the contents of a scenario file (a path, or the name of a shipped scenario), one or several runs.
 
     InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
     twice, other keys); settings of a run are checked by `Recipe.scenario`.

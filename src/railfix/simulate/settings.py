@@ -118,8 +118,8 @@ class SatelliteErrorSettings(ScenarioSettings):
     radial_sigma_m: NotNegative = 0.0
     along_sigma_m: NotNegative = 0.0
     cross_sigma_m: NotNegative = 0.0
-    orbit_time_s: Positive = 7200.0  #: Their correlation time.
-    group_delay_sigma_m: NotNegative = 0.0  #: Constant of each satellite and signal, in the code alone.
+    orbit_time_s: Positive = 7200.0  #: Correlation time of these errors.
+    group_delay_sigma_m: NotNegative = 0.0  #: Group delay, constant for each satellite and signal, in the code alone.
 
 
 class IonosphereErrorSettings(ScenarioSettings):
@@ -142,7 +142,7 @@ class TroposphereErrorSettings(ScenarioSettings):
 
 
 class SatelliteFault(Interval):
-    """Satellite whose ranges are wrong for a time, without a warning in its message."""
+    """Satellite whose ranges are faulty for a time, without a warning in its message."""
 
     satellite: str = Field(pattern=f"^[{SYSTEMS}][0-9]{{2}}$")  #: "G07".
     step_m: Finite = 0.0  #: Added to code and phase from the start on.
@@ -290,7 +290,8 @@ class InertialSettings(ScenarioSettings):
     #: Vibration of the body at 20 m/s and more, of each axis, in proportion to the speed below that.
     vibration_sigma_mps2: NotNegative = 0.0
     vibration_sigma_radps: NotNegative = 0.0
-    #: Its mean frequency; the relative bandwidth is 15 percent. Frequencies above half of `rate_hz` are aliased.
+    #: Mean frequency of the vibration; the relative bandwidth is 15 percent. Frequencies above half of `rate_hz` are
+    #: aliased.
     vibration_hz: Positive = 12.0
 
 
@@ -307,7 +308,7 @@ class RadarSettings(ScenarioSettings):
     bias_mps: Finite = 0.0
     scale: Finite = 0.0  #: Measured over true, less 1: an error of the mounting angle.
     noise_sigma_mps: NotNegative = 0.0  #: White.
-    #: Gauss-Markov part of the scale, as pitching of the body causes.
+    #: Gauss-Markov part of the scale, as caused by pitching of the body.
     sway_ratio_sigma: NotNegative = 0.0
     sway_time_s: Positive = 0.5
     #: Range of speeds that are measured.
@@ -370,7 +371,7 @@ class BaliseSettings(ScenarioSettings):
     """Balises and their reader on the vehicle."""
 
     balises: tuple[Balise, ...] = ()
-    #: Other balises have this spacing from each other and the beginning of the line, named B001 and on; 0 for none.
+    #: Further balises at this spacing from the beginning of the line on, named B001 and so on; 0 for none.
     spacing_m: NotNegative = 0.0
     along_m: Finite = 0.0  #: Position of the reader along the body, like the antennas'.
     noise_sigma_m: NotNegative = 0.0  #: Error of a reading along the line.
@@ -400,7 +401,7 @@ class SbasSettings(ScenarioSettings):
     #: Indicators of the accuracy of all satellites and grid points, as sent.
     udrei: Annotated[int, Field(ge=0, le=13)] = 5
     givei: Annotated[int, Field(ge=0, le=14)] = 9
-    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: The same on L5.
+    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: The indicator on L5.
     #: Errors of the service's own estimates: white, of each fast correction, each axis, each grid delay.
     clock_sigma_m: NotNegative = 0.0
     orbit_sigma_m: NotNegative = 0.0
@@ -411,5 +412,5 @@ class SbasSettings(ScenarioSettings):
     alert_m: Positive = 10.0
     alert_s: NotNegative = 6.0
     lost_chance: Share = 0.0  #: Probability that a message is not received.
-    #: The messages begin this long before the run, so that all corrections are available at its start.
+    #: Time by which the messages precede the run, so that all corrections are available at its start.
     lead_s: NotNegative = 300.0

@@ -44,7 +44,7 @@ class Piece:
     clock_m: Floats  #: Receiver clock times the speed of light, shape (T,).
     code_sigma_m: Floats  #: Standard deviation of the noise in the codes, shape (T, M).
     clean_code_m: Floats  #: The codes without noise and without disturbances, shape (T, M).
-    error_m: Floats  #: Part of `clean_code_m` by `Scenario.errors` that no model corrects; shape (T, M).
+    error_m: Floats  #: Part of `clean_code_m` from `Scenario.errors` that no model corrects; shape (T, M).
 
 
 class Simulation:
@@ -83,7 +83,7 @@ class Simulation:
 
     @cached_property
     def common_errors(self) -> CommonErrors:
-        """Errors of satellites and atmosphere, of `satellites`."""
+        """Satellite and atmospheric errors of `satellites`."""
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
@@ -190,7 +190,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
     sky = found.satellite_ecef_m
     elevation, azimuth = elevation_azimuth(sky, antenna_ecef_m)
     latitude, longitude, height = geodetic_from_ecef(antenna_ecef_m)
-    # Far below the horizon nothing is tracked; the formulas only have to stay finite there.
+    # Far below the horizon no signal is tracked; the formulas only have to remain finite there.
     raised = np.maximum(elevation, 1.0)
     troposphere = saastamoinen_delay_m(latitude, height, raised)
     ionosphere = klobuchar_delay_m(
@@ -308,7 +308,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
 def _disturb(
     simulation: Simulation, receiver: Receiver, geometry: SightGeometry, cn0_dbhz: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return what the surroundings add to code [m], phase [m] and Doppler [Hz], and the C/N0 with it, each (T, M)."""
+    """Return the surroundings' effects on code [m], phase [m] and Doppler [Hz], and the resulting C/N0, each (T, M)."""
     code, phase, doppler = np.zeros((3, *cn0_dbhz.shape))
     for source in simulation.disturbances if receiver.antenna in ANTENNAS else ():
         more = source(geometry)

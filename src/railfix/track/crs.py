@@ -1,6 +1,6 @@
-"""Coordinate reference systems of maps: how each is tied to the Earth, and coordinates in degrees of its frame.
+"""Coordinate reference systems of maps: their relation to the Earth, and coordinates in degrees of their frames.
 
-Definitions are those of the EPSG dataset (https://epsg.org). Motions against a plate are for the notes alone.
+Definitions are those of the EPSG dataset (https://epsg.org). Motions relative to a plate are used for notes only.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _ALIGNED: Final = {
     "ITRF2014": "IGS14, IGb14, WGS 84 (G2139), ATRF2014, SIRGAS-CON SIR17P01",
     "ITRF2020": "IGS20, WGS 84 (G2296)",
 }
-#: Code of the realisation of the ITRF that a frame of a name is.
+#: Code of the ITRF realisation of a frame's name.
 REALISATIONS: Final = _ITRF | {name: _ITRF[itrf] for itrf, names in _ALIGNED.items() for name in names.split(", ")}
 
 
@@ -54,8 +54,9 @@ class HeldFrame:
     plate: str  #: Plate of the ITRF2020 model that carries most of the country.
     #: Least and largest motion of the country relative to that plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: Other neglected motions.
-    #: Another plate, and two points (latitude, longitude) of a line to the right of which it carries the country.
+    but: str = ""  #: Sentence on other neglected motions.
+    #: Second plate, and two points (latitude, longitude) of a line; this plate carries the country to the right of the
+    #: line.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
 
     @property
@@ -149,10 +150,10 @@ SAME: Final = {
 }
 
 
-TRANSIT: Final = "WGS 84 (Transit)"  #: The first realisation of WGS 84, 0.8 m from the later ones.
+TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later ones.
 #: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
 WORKING_FRAME: Final = "EPSG:9989"
-#: Frames that maps of a region are usually in: name, three-dimensional code. The first of a point is the likelier one.
+#: Usual frames of maps of a region: name, three-dimensional code. Of a point's frames the first is the likeliest.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
@@ -161,19 +162,19 @@ REGIONAL: Final = {
 MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
 #: Largest scale of a grid for a single line, less 1: national grids have up to 0.005.
 LARGEST_SCALE: Final = 0.01
-MODERN_M: Final = 0.5  #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
+MODERN_M: Final = 0.5  #: Accuracy [m] above which a PROJ transformation is between datums of different age.
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
 #: Operations with a worse accuracy are not used [m]; 999 in the EPSG dataset means unknown.
 WORST_M: Final = 100.0
-#: Parts of the name of an operation of PROJ that change no datum.
+#: Parts of a PROJ operation's name that do not change the datum.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
 Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
 
 @lru_cache(maxsize=32)
 def kind_of_frame(crs: str) -> Kind:
-    """Return how a CRS is tied to the Earth; SettingsError when it is unknown."""
+    """Return the kind of a CRS by its relation to the Earth; SettingsError if the CRS is unknown."""
     geodetic = get_geodetic_frame(crs)
     name = geodetic.name
     if name in REALISATIONS:
@@ -187,7 +188,7 @@ def kind_of_frame(crs: str) -> Kind:
 
 @lru_cache(maxsize=64)
 def _system(crs: str) -> CRS:
-    """Return the system of a name, which takes PROJ a millisecond to find; CRSError when it knows none."""
+    """Return the system of a name, which PROJ needs a millisecond to find; CRSError if there is none."""
     return CRS.from_user_input(crs)
 
 
@@ -203,7 +204,7 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 
 
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
-    """The CRS given for a file, or the one that the file names; SettingsError when they contradict each other."""
+    """Return the CRS given for a file, or named by the file; SettingsError if they contradict each other."""
     if given is None or named is None:
         used = given or named
         if used is not None:
@@ -212,11 +213,11 @@ def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | No
     one, other = (find_crs(name, path=path).to_2d() for name in (given, named))
     if not one.equals(other, ignore_axis_order=True):
         raise SettingsError(f"{path}: crs {given} (--crs) contradicts the file's own CRS {named}")
-    return given if find_crs(given).is_compound else named  # with its height datum, where it has one
+    return given if find_crs(given).is_compound else named  # with its height datum, if it has any
 
 
 def unit_of_grid(crs: str, *, path: str) -> float:
-    """Return the metres of the unit of a projected CRS; SettingsError when it has none."""
+    """Return the length of a projected CRS's unit [m]; SettingsError if it has none."""
     system = find_crs(crs, path=path)
     if not system.is_projected and not (system.is_compound and system.sub_crs_list[0].is_projected):
         raise SettingsError(f"{path}: {crs} is {system.name}, no grid; a design is in one, such as EPSG:25832 (--crs)")
@@ -224,7 +225,7 @@ def unit_of_grid(crs: str, *, path: str) -> float:
 
 
 def unit_of_heights(crs: str | None) -> float:
-    """Return the metres of the unit of the heights of a CRS; 1 where it has none."""
+    """Return the length of the unit of a CRS's heights [m]; 1 if it has none."""
     axes = [] if crs is None else find_crs(crs).axis_info
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
@@ -266,7 +267,7 @@ class Operations:
     lacking: tuple[Any, ...] = ()
 
     def describe_lacking(self, crs: str | None = None) -> str:
-        """Return the most accurate operation that lacks a grid, and how to get that; empty without one."""
+        """Return the most accurate operation that lacks a grid, and how to get the grid; empty without one."""
         if not self.lacking:
             return ""
         best = min(self.lacking, key=lambda o: (not _is_served(o), known_accuracy_m(o.accuracy)))
@@ -297,13 +298,13 @@ def name_operation(description: str, crs: str | None = None) -> str:
 
 
 def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operations:
-    """Find PROJ's operations between two systems but ballpark ones, whose area of use contains a box, best first."""
+    """Find PROJ's operations between two systems over a box, except ballpark operations, best first."""
     area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of grids that are not installed, which are named here
+        warnings.simplefilter("ignore", UserWarning)  # warns of missing grids, which are reported here
         try:
             group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
-        except (ProjError, IndexError):  # IndexError: pyproj cannot make an operation that is known at one epoch alone
+        except (ProjError, IndexError):  # IndexError: pyproj cannot construct an operation known at a single epoch
             return Operations(usable=())
     if box is None:
         return Operations(usable=tuple(group.transformers), lacking=tuple(group.unavailable_operations))
@@ -313,7 +314,7 @@ def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operati
 
 
 def rank_operation(operation: Transformer) -> tuple[bool, float]:
-    """Order operations: those for land, where railways are, first, then by accuracy; ties keep PROJ's order."""
+    """Return the sort key of operations: operations for land first, then by accuracy; ties keep PROJ's order."""
     area = "" if operation.area_of_use is None else operation.area_of_use.name
     return "offshore" in area and "onshore" not in area, known_accuracy_m(operation.accuracy)
 

@@ -1,9 +1,10 @@
-"""Curve of a centreline between its points: arcs and clothoids in plan, parabolas in height, ramps of the cant.
+"""Curve of a centreline between its points: arcs and clothoids in plan, parabolas in height, cant ramps.
 
-Between two points the curve is a cubic over their chord, given by its directions at both ends. The direction at a point
-is the mean of the directions that the chords on either side have there for a curvature that is linear between points:
-the map's radii, or the circle through each point and its neighbours. Arcs, clothoids and parabolas are thus followed
-within millimetres; every point lies on the curve, and chainages stay those of the chords.
+Between two points the curve is a cubic over their chord, defined by its directions at both ends. The direction at a
+point is the mean of the directions computed from the chords on either side, for a curvature that is linear between
+points. The curvature at a point is from the map's radii, or from the circle through the point and its neighbours. Arcs,
+clothoids and parabolas are thus followed within millimetres; every point lies on the curve, and chainages are measured
+along the chords.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Curvatures of the map are used where they move the middle of a chord by no more than this from the curvatures of the
-#: points and their neighbours [m]; elsewhere the radius belongs to another point, or to the other side.
+#: Largest difference of a chord's middle ordinate between the map's curvature and the curvature from neighbouring
+#: points at which the map's is used [m]; with more, the radius belongs to another point, or to the other side.
 _AGREES_M: Final = 0.03
-_CORNER_RAD: Final = 0.25  #: Points at which the line turns by more than this are corners, which no curve rounds [rad].
-#: Ends of ramps are searched for between points, not at them: at least this fraction of the gap from either, and where
-#: the values of the two lines differ by this much over it.
+_CORNER_RAD: Final = 0.25  #: Points at which the line turns by more than this are corners, which are not rounded [rad].
+#: Ends of ramps are searched for between points, at least this fraction of the gap away from either point, and where
+#: the values of the two lines differ by this much over the gap.
 _BREAK_SHARE: Final = 1e-3
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Chords of the points of `curved_line` leave the curve by no more than this [m].
@@ -68,8 +69,9 @@ class CentreCurve:
         return np.asarray(self.length_m[segment] * share * (1.0 - share) * (first * (1.0 - share) - last * share))
 
     def chords_m(self, within_m: float) -> Floats:
-        """Return chainages, including those of the points, whose chords stay within a distance of the curve."""
-        # a cubic leaves its chord by an eighth of the change of direction, and more where its slopes differ in size
+        """Return chainages, including all points' chainages, whose chords stay within a distance of the curve."""
+        # A cubic deviates from its chord by an eighth of the change of direction, and more if its slopes differ in
+        # size.
         turn = np.abs(self.to_right).sum(axis=1) + np.abs(self.to_top).sum(axis=1)
         pieces = np.maximum(np.ceil(np.sqrt(self.length_m * turn / (6.0 * within_m))), 1.0).astype(np.int64)
         start, piece = places_in_groups(pieces)
@@ -99,12 +101,12 @@ def centre_curve(track: Track) -> CentreCurve:
 
 
 def _to_ends(inner: Floats) -> Floats:
-    """Return values of the inner points, extended by those of their neighbours at both ends, shape (V,)."""
+    """Return values of the inner points, extended at both ends by the neighbouring values, shape (V,)."""
     return np.concatenate([inner[:1], inner, inner[-1:]]) if len(inner) else np.zeros(2)
 
 
 def _with_radii(track: Track, of_points: Floats) -> Floats:
-    """Return the curvature at each point: of the map where it agrees with the points, else theirs."""
+    """Return the curvature at each point: from the map where it agrees with the points, else from the points."""
     with np.errstate(divide="ignore"):
         of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
     around = np.stack([np.roll(of_points, 1), of_points, np.roll(of_points, -1)])

@@ -1,7 +1,7 @@
-"""Elements of an alignment in plan, profile and cant, as design files (IFC, LandXML) have them, and their segments.
+"""Elements of an alignment in plan, profile and cant, as in design files (IFC, LandXML), and their segments.
 
 The direction is the integral of the curvature in closed form, the position that of the direction by Gauss-Legendre
-quadrature. Lengths are those of the plan, directions counter-clockwise from the x axis (easting), curvature positive to
+quadrature. Lengths are in plan, directions counter-clockwise from the x axis (easting), curvature positive to
 the left, as in IFC 4.3 and LandXML.
 """
 
@@ -45,10 +45,10 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _PIECE_RAD: Final = 0.5  #: Longest piece of one quadrature [rad of direction]; 12 nodes are exact to rounding below it.
-#: Steps of points of an alignment: chords stay within 1 cm of arcs down to 100 m radius.
+#: Spacing of an alignment's points: chords stay within 1 cm of arcs down to 100 m radius.
 _CHORD_M: Final = 0.01
 _LONGEST_M: Final = 25.0
-_CLOTHOID_POINTS: Final = 2001  #: Points of a clothoid of the profile, between which it is linear within 1 um.
+_CLOTHOID_POINTS: Final = 2001  #: Points of a profile clothoid, between which it is linear within 1 um.
 _JOINT_M: Final = 0.01  #: Elements that begin farther than this from the end of the previous one are reported [m].
 
 
@@ -67,7 +67,7 @@ class PlanElement:
     length_m: float
     law: str = "linear"  #: Key of `LAWS`.
     #: For a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
-    #: rail rises. The law describes the path of the centre of gravity, from which the track has this distance.
+    #: rail rises. The law describes the path of the centre of gravity, at this distance from the track.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -165,10 +165,10 @@ class ProfileElement:
 
     @cached_property
     def _clothoid(self) -> tuple[Floats, Floats, Floats]:
-        """Distances, heights above the start, gradients of a clothoid, with an angle by the square of its length."""
+        """Return distances, heights above the start and gradients of a clothoid, its angle as the square of length."""
         start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
         length = self.length_m
-        for _ in range(20):  # the length along the curve whose projection is that in plan
+        for _ in range(20):  # the length along the curve whose projection is the length in plan
             way = np.linspace(0.0, length, _CLOTHOID_POINTS)
             angle = start + self.bend * way + (turn - self.bend * length) * (way / length) ** 2
             place, height = (
@@ -253,7 +253,7 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Points of an alignment with chords within 1 cm of its arcs, further points, notes on open joints."""
+    """Return points of an alignment with chords within 1 cm of its arcs, further points, and notes on open joints."""
     starts = plan_starts(plan)
     length = starts[-1] + plan[-1].length_m
     places = [np.array([0.0, length]), np.asarray(at_m, dtype=np.float64)]
@@ -344,7 +344,7 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Reject a profile that leaves out more of the plan than `_PROFILE_BEYOND_M`; note the part left out."""
+    """Reject a profile that lacks more of the plan than `_PROFILE_BEYOND_M`; note the missing part."""
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)
     left_out = max(low, 0.0) + max(length - high, 0.0)
@@ -355,7 +355,7 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
 
 
 def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> None:
-    """Reject an alignment whose length on the map differs from its design length: its grid is another one."""
+    """Reject an alignment whose length on the map differs from its design length, as in a wrong grid."""
     designed = sum(element.length_m for element in plan)
     geod = CRS.from_user_input(place.frame).get_geod()
     found = float(geod.line_length(place.longitude_deg, place.latitude_deg)) if geod is not None else designed
@@ -368,7 +368,7 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
 
 
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
-    """Side of the curve at each point, and of the nearest curve where the line is straight: at the foot of a ramp."""
+    """Return the side of the curve at each point; on straight track, as at the foot of a ramp, of the nearest curve."""
     if not bent.any():
         return np.ones(len(curvature))
     place = np.arange(len(curvature))

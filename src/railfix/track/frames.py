@@ -1,8 +1,8 @@
-"""Reference frames of track maps, and maps moved to the frame of the satellites.
+"""Reference frames of track maps, and transformation of maps to the satellites' frame.
 
-Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation to centimetres. Maps are in a frame that moves
-with its plate, or in the ITRF at the epoch of their survey. PROJ transforms with coordinate epoch; where it cannot, the
-motion of the plate is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), with a note.
+Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation to centimetres. Maps are in a plate-fixed
+frame, or in the ITRF at the epoch of their survey. PROJ transforms with the coordinate epoch; otherwise the plate
+motion is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), with a note.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ PLATES: Final = tuple("AMUR ANTA ARAB AUST CARB EURA INDI NAZC NOAM NUBI PCFC SO
 
 @dataclass(frozen=True, kw_only=True)
 class FrameShift:
-    """How a map was moved to the frame of the satellites."""
+    """Transformation of a map to the satellites' frame."""
 
     frame: str  #: Frame of the map, as its CRS is named.
     used: str  #: Frame and epoch of the positions.
-    method: str  #: The transformation, in words.
+    method: str  #: Description of the transformation.
     #: Shift at the middle of the line.
     east_m: float = 0.0
     north_m: float = 0.0
@@ -71,7 +71,7 @@ class FrameShift:
 
 
 def decimal_year(time: np.datetime64 | Datetimes) -> float:
-    """Return the time as a decimal year, as frames' epochs are written."""
+    """Return the time as a decimal year, as used for frames' epochs."""
     year = np.asarray(time, dtype="datetime64[Y]")
     start, end = year.astype("datetime64[s]"), (year + np.timedelta64(1, "Y")).astype("datetime64[s]")
     part = (np.asarray(time, dtype="datetime64[s]") - start) / (end - start)
@@ -84,7 +84,7 @@ class MapMotion(TypedDict, total=False):
     epoch: float | None  #: Epoch of the map's coordinates, where its frame is an ITRF [year].
     plate: str | None  #: Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
     #: Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
-    #: deformation included; `epoch` is that of the file, from which on the plate moves them.
+    #: deformation included; `epoch` is the file's epoch, from which on the plate moves them.
     parameters: FilePath | None
 
 
@@ -102,7 +102,7 @@ def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> 
 def points_at(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Move points of a map (n, 3) to the frame of the satellites at a time; return also the shift at the middle one."""
+    """Move points of a map (n, 3) to the satellites' frame at a time; return also the shift at the middle point."""
     epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
     kind, frame, year = kind_of_frame(crs), get_geodetic_frame(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
@@ -145,7 +145,7 @@ def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
 def in_map_frame(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Transform positions, or NaN, from the frame of the satellites to that of a map: `points_at` subtracted."""
+    """Transform positions, or NaN, from the frame of the satellites to a map's frame: the inverse of `points_at`."""
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")
@@ -158,7 +158,7 @@ def in_map_frame(
 def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return the coordinates of an ITRF at an epoch, in the working frame at the log's."""
+    """Return ITRF coordinates of an epoch in the working frame at the log's epoch."""
     name = get_geodetic_frame(crs).name
     moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
@@ -180,7 +180,7 @@ def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
 def _from_held(
     ecef_m: Floats, name: str, held: HeldFrame, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Coordinates of a frame that is the ITRF at an epoch, moved by the plate that carries its middle since then."""
+    """Return coordinates of a frame that is the ITRF at an epoch, moved since then by the plate of their middle."""
     since = epoch or held.epoch
     latitude, longitude, _ = geodetic_from_ecef(ecef_m[len(ecef_m) // 2])
     plate = plate or held.plate_at(float(latitude), float(longitude))
@@ -190,7 +190,7 @@ def _from_held(
 
 
 def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
-    """A note on the realisation that represents an ensemble, or a frame with the coordinates of another."""
+    """Return a note on the realisation of an ensemble, or on a frame with another frame's coordinates."""
     if frame.name in SAME and not operation.description.startswith(frame.name):
         code, how_well = SAME[frame.name]
         return (f"map: {frame.name} is taken as {CRS.from_user_input(code).name}; {how_well}",)
@@ -207,7 +207,7 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Move JGD2011 by a semi-dynamic correction, once in each thousandth of a degree, and with the plate."""
+    """Move JGD2011 by a semi-dynamic correction, computed once per thousandth of a degree, and with the plate."""
     with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans
     try:
@@ -237,7 +237,7 @@ def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """Return a note on how far a map without a named frame may be off at a point of it."""
+    """Return a note on the possible error of a map without a named frame at one of its points."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():

@@ -105,7 +105,7 @@ def _circle_curvature(plan: Floats) -> Floats:
 
 
 def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
-    """Compute the means of values at points of the line from one chainage to another; NaN with an unknown one."""
+    """Compute the means of values at points of the line from one chainage to another; NaN with an unknown value."""
     unknown = np.isnan(values)
 
     def between(part: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Coordinates of a map in degrees of a modern frame, the operation that led there, and its accuracy, in one value.
+"""Coordinates of a map in degrees of a modern frame, with the transformation and its accuracy.
 
 Operations are those of PROJ (https://proj.org) whose area of use contains the map and whose grids are installed; a
 ballpark operation, which does not change the datum, is never used.
@@ -41,10 +41,11 @@ from railfix.track.crs import (
 _UNEVEN: Final = (
     "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
 )  # fmt: skip
-_CELL_DEG: Final = 0.25  #: Maps within one cell of this size have one operation [deg].
+_CELL_DEG: Final = 0.25  #: Cell size: maps within one cell have the same operation [deg].
 #: Accuracies better than this are within the accuracy of a map [m].
 NEGLIGIBLE_M: Final = 0.1
-#: An operation with a missing grid is reported where its accuracy is better than this fraction of that of the one used.
+#: An operation with a missing grid is reported where its accuracy is better than this fraction of the used operation's
+#: accuracy.
 _BETTER: Final = 0.9
 
 
@@ -103,14 +104,14 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
     crs : str
         Coordinate reference system of the map.
     x, y : ndarray, shape (n,)
-        Easting and northing in its unit, or longitude and latitude in its unit; finite.
+        Easting and northing, or longitude and latitude, in the units of the CRS; finite.
     path : str
-        File that is named in errors.
+        File named in errors.
 
     Raises
     ------
     InputFileError
-        The coordinates are not of the CRS.
+        The coordinates are not in the CRS.
     SettingsError
         PROJ has no operation from the datum of the CRS there, or its grid is not installed.
     """
@@ -138,7 +139,7 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return coordinates of positions in a CRS (inverse of `georeference`); modern frames, within 2 m, count as one."""
+    """Return coordinates of positions in a CRS (inverse of `georeference`); modern frames are equal, within 2 m."""
     if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
         conversion, unit, origin = _to_datum(crs)
         degrees = (place.longitude_deg - origin) / unit, place.latitude_deg / unit
@@ -215,9 +216,9 @@ def _targets(crs: str, box: Box) -> Iterable[str]:
 
 
 def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
-    """Return the accuracy of the first of some operations [m]: as stated by PROJ, or the remainder of the others.
+    """Return the accuracy of the first operation [m]: as stated by PROJ, or from its distance to the others.
 
-    Where an operation lies farther from the first than its own accuracy, the first may be off by the remainder.
+    If another operation differs from the first by more than its own accuracy, the first may be wrong by the excess.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -266,7 +267,7 @@ def _bounds(crs: str) -> Box:
 
 
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Reject points of a grid whose unit of length there differs from that of the ground: they are of another grid."""
+    """Reject points at which the scale of the grid differs from 1: they belong to another grid."""
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
     if len(xy) < 2 or method in _UNEVEN:
@@ -295,7 +296,7 @@ def _to_datum(crs: str) -> tuple[Transformer, float, float]:
 
 
 def _in_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return latitude and longitude [deg] of coordinates on the datum of their own CRS."""
+    """Return latitude and longitude [deg] of coordinates on the datum of their CRS."""
     conversion, unit, origin = _to_datum(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in conversion.transform(x, y))
     return (latitude, longitude) if (unit, origin) == (1.0, 0.0) else (latitude * unit, longitude * unit + origin)

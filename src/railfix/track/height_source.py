@@ -1,4 +1,4 @@
-"""Heights for a map that has none: a raster, a profile by chainage or kilometrage, or the 3-D positions of a run."""
+"""Heights for a map without heights: a raster, a profile by chainage or kilometrage, or the 3-D positions of a run."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ RASTERS: Final = (
     ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
 )  # fmt: skip
 HeightSource = FilePath | PositionLog  #: A file, or positions in memory.
-_SPACING_M: Final = 50.0  #: Largest distance of the points that heights are put on [m].
+_SPACING_M: Final = 50.0  #: Largest spacing of the points that receive heights [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
-_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are of another line [m].
-_REACH_M: Final = 200.0  #: Points farther than this from a height along the line have none [m].
-#: Standard deviation of the weights of positions along the line [m]: of fixed ones, and of single ones, whose errors
-#: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
+_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan belong to another line [m].
+_REACH_M: Final = 200.0  #: Points farther than this along the line from any height have no height [m].
+#: Standard deviation of the weights of positions along the line [m]: of fixed positions, and of single positions, whose
+#: errors persist for hundreds of metres; the error in a vertical curve of 2 km radius is then up to 5 m.
 _KERNEL_M: Final = 15.0
 _LARGEST_KERNEL_M: Final = 150.0
 #: Positions whose heights are this many median deviations off have zero weight (Cleveland 1979, robust locally weighted
@@ -43,7 +43,7 @@ _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError with all further options that a raster needs; InputFileError where it is none."""
+    """Raise SettingsError with all missing options of a raster; InputFileError if the file is not a raster."""
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []
@@ -66,7 +66,7 @@ def with_heights(
     sigma_m: float | None = None,
 ) -> Track:
     """Return the track with heights and sigmas of a raster (`RASTERS`; needs `height_datum`, `sigma_m`), of a CSV by
-    chainage or kilometrage, or of a log of positions. InputFileError: no heights for a part of the line.
+    chainage or kilometrage, or of a log of positions. InputFileError: heights are missing for a part of the line.
     """
     track = _dense(track)
     if isinstance(source, PositionLog):
@@ -82,7 +82,7 @@ def with_heights(
 
 
 def _dense(track: Track) -> Track:
-    """The track with points at most `_SPACING_M` from each other, so that heights are followed along straights, too."""
+    """Return the track with points at most `_SPACING_M` apart, so that heights are followed on straight track, too."""
     pieces = np.ceil(np.diff(track.chainage_m) / _SPACING_M).astype(np.intp)
     if not (pieces > 1).any():
         return track
@@ -105,7 +105,7 @@ def _dense(track: Track) -> Track:
 
 @contextmanager
 def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
-    """Yield a raster and its CRS; InputFileError where it names none."""
+    """Yield a raster and its CRS; InputFileError if it names no CRS."""
     with needs_extra(f"{path}: a raster"):
         import rasterio
     try:
@@ -145,7 +145,7 @@ def _from_raster(
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
-    """Sample a raster at rows and columns, shape (2, n), in windows about neighbouring points; NaN without."""
+    """Sample a raster at rows and columns, shape (2, n), in windows about neighbouring points; NaN without a value."""
     from scipy.ndimage import map_coordinates
 
     low = np.floor(place.min(axis=1)).astype(np.int64)
@@ -205,7 +205,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
     fitted = _smooth(target, place, height, sigma, reach_m=reach_m)
-    # neighbouring positions have common errors: the standard deviation is that of one position
+    # neighbouring positions have common errors: the standard deviation is that of a single position
     spread = float(np.median(sigma)) if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
@@ -222,7 +222,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
 
 
 def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
-    """Return the weighted straight lines through the heights about each target; NaN farther than a reach from any."""
+    """Return the weighted straight lines through the heights about each target; NaN if all are beyond the reach."""
     kernel = float(np.clip(_KERNEL_M * np.median(sigma) / SIGMA_HEIGHT_M, _KERNEL_M, _LARGEST_KERNEL_M))
     weight = 1.0 / sigma**2
     for _ in range(_WEIGHED_AGAIN if kernel > _KERNEL_M else 0):

@@ -1,4 +1,4 @@
-"""Ellipsoidal heights of a map, the geoid model or operation that led there, and its accuracy (P1 3.1(1))."""
+"""Ellipsoidal heights of a map, with the geoid model or transformation and its accuracy (P1 3.1(1))."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
-#: Their standard deviation [m] (GSI: 2 cm against GNSS and levelling).
+#: Standard deviation of these models [m] (GSI: 2 cm against GNSS and levelling).
 _JAPAN_M: Final = 0.02
 GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Geoids by name.
 #: Advice for orthometric heights without a geoid.
@@ -61,7 +61,7 @@ def check_height_datum(height_datum: str | None) -> None:
 
 def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidModel:
     """Return heights of a geoid (`JAPAN_MODELS`, ``egm96``, a pyproj grid, a vertical or compound CRS) above the
-    ellipsoid of the frame of some points. SettingsError: not known or not installed.
+    ellipsoid of the frame of some points. SettingsError: the geoid is unknown or not installed.
     """
     key = geoid.strip().lower() if isinstance(geoid, str) else ""
     if isinstance(geoid, CRS) and geoid.to_authority() == ("EPSG", "5773"):
@@ -96,19 +96,19 @@ def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
     return np.asarray(scipy.ndimage.map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
 
 
-_WRAP: Final = 16  #: Columns of the grid that are repeated at both sides, so that the spline goes round the Earth.
+_WRAP: Final = 16  #: Columns of the grid that are repeated at both sides, so that the spline is periodic in longitude.
 
 
 @lru_cache(maxsize=1)
 def _egm96_spline() -> Floats:
-    """Return the spline coefficients of the grid, which is kept as differences of centimetres along both axes."""
+    """Return the spline coefficients of the grid, which is stored as differences in centimetres along both axes."""
     with (files("railfix.track") / "egm96_15.npz").open("rb") as file, np.load(file) as data:
         heights = data["second_differences_cm"].astype(np.int64).cumsum(axis=0).cumsum(axis=1) / 100.0
     return read_only(scipy.ndimage.spline_filter(np.pad(heights, ((0, 0), (_WRAP, _WRAP)), mode="wrap"), order=3))
 
 
 def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
-    """Return a geoid by PROJ: a grid file, or the operation from a height datum to the ellipsoid of the frame."""
+    """Return a geoid model from PROJ: a grid file, or the operation from a height datum to the frame's ellipsoid."""
     try:
         if isinstance(geoid, str) and (geoid.lower().endswith((".tif", ".tiff", ".gtx")) or _is_file(geoid)):
             steps = f"+proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=vgridshift +grids={geoid} +multiplier=1"
@@ -168,9 +168,9 @@ def heights_of_file(
     geoid: str | None = None,
     geoid_m: Floats | None = None,
 ) -> EllipsoidalHeights:
-    """Return ellipsoidal heights of a file, whose own datum, geoid and `geoid_m` count where `reading` gives none.
+    """Return ellipsoidal heights of a file, whose datum, geoid and `geoid_m` are used unless `reading` gives others.
 
-    InputFileError: the file names an unknown datum. SettingsError: none is known, or two contradict each other.
+    InputFileError: the file names an unknown datum. SettingsError: no datum is known, or two contradict each other.
     """
     check_height_datum(reading.height_datum)
     if datum is not None and datum not in HEIGHT_DATUMS:
@@ -185,7 +185,7 @@ def heights_of_file(
     if used == "ellipsoidal":
         geoid_m = None
     elif geoid_m is not None and not isinstance(model, str):
-        model = None  # of the compound CRS, which is replaced by the map's own
+        model = None  # the compound CRS's model is replaced by the map's own
     elif model is None:
         model = geoid
     return ellipsoidal_heights(heights_m, place, datum=used, geoid=model, geoid_m=geoid_m, path=path)
@@ -194,9 +194,7 @@ def heights_of_file(
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Height datum and requested geoid, or the datum and geoid of a compound CRS; SettingsError if they contradict each
-    other.
-    """
+    """Return the given height datum and geoid, or the compound CRS's; SettingsError if they contradict each other."""
     vertical = get_vertical_datum(crs)
     if vertical is None:
         return height_datum, geoid
@@ -236,7 +234,7 @@ def ellipsoidal_heights(
     path: str,
     geoid_m: Floats | None = None,
 ) -> EllipsoidalHeights:
-    """Convert heights of a datum to ellipsoidal ones, by a model or the map's `geoid_m`."""
+    """Convert heights of a datum to ellipsoidal heights, by a model or the map's `geoid_m`."""
     if datum == "ellipsoidal":
         if geoid is not None:
             raise SettingsError(f"{path}: geoid {geoid!r} was given, but the heights are ellipsoidal already")

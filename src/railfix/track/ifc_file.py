@@ -39,7 +39,8 @@ _LAWS: Final = {
 _ARCS: Final = {
     "CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle", "CLOTHOID": "clothoid",
 }  # fmt: skip
-_SIMILAR_M: Final = 1e-3  #: A form of the cubic parabola whose end is nearer to the next element by more is taken [m].
+#: Least gain in the distance to the next element for which another form of the cubic parabola is used [m].
+_SIMILAR_M: Final = 1e-3
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
 _PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
 
@@ -168,7 +169,7 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _units(step: _Step) -> tuple[float, float]:
-    """Return the metres of a length and radians of an angle in the file."""
+    """Return the file's units of length [m] and angle [rad]."""
     length = angle = 1.0
     assigned = {r for _, e in step.of_kind("IFCUNITASSIGNMENT") for r in e.values[0]}
     for number, entity in step.entities.items():
@@ -212,7 +213,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of its layout in plan where that is relative to the alignment's."""
+    """Return the placement of an alignment, or of its layout in plan if this is relative to the alignment."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative
@@ -246,8 +247,10 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 
 
 def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
-    """Return the elements, cubic parabolas as ordinates over the tangent: those of IFC 4.3 (``y = x^3 / (6 R L)``), or
-    those of the projected length or of Japan's correction where the next element begins at their end.
+    """Return the elements, with cubic parabolas as ordinates over the tangent.
+
+    They are as in IFC 4.3 (``y = x^3 / (6 R L)``), or by the projected length or with Japan's correction if the next
+    element begins at the end of that form.
     """
     result: list[Plan] = []
     for element, after in zip(plan, [*plan[1:], None], strict=True):
@@ -318,7 +321,7 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
 
 
 def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
-    """Return the elements in plan, Viennese bends with the lean of their cant; `leans` are metres a metre of it."""
+    """Return the elements in plan, Viennese bends with the lean of their cant; `leans` are metres per metre of cant."""
     result = []
     for element, lean, start in zip(plan, leans, plan_starts(plan), strict=True):
         if element.law == "viennese":

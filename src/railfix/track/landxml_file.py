@@ -37,7 +37,7 @@ _UNITS: Final = {
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
-#: The biquadratic parabola (of InfraModel, Finland) is Helmert's law: the curvature runs by two parabolas.
+#: The biquadratic parabola (of InfraModel, Finland) is Helmert's law: the curvature follows two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
     "bloss": "bloss",
@@ -47,15 +47,15 @@ _SPIRALS: Final = {
 }
 _CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHalfWave": "cosine"}
 _SAME_M: Final = 1e-6  #: Elements shorter than this have no direction and are left out [m].
-#: Half the length of the line over which the kilometrage jumps at a station equation [m].
+#: Half the length over which the kilometrage jumps at a station equation [m].
 _JUMP_M: Final = 0.05
 #: Least and largest fraction of the ordinate of a cubic parabola at the end of a spiral.
 _ORDINATE_SHARE: Final = (0.9, 1.25)
-_BROKEN_RAD: Final = 0.1  #: Directions of elements that differ by more at a joint are of another order of coordinates.
+_BROKEN_RAD: Final = 0.1  #: Change of direction at a joint above which the order of the coordinates is wrong [rad].
 
 
 def finite_number(text: Any) -> float:
-    """Return a finite number of a text; ValueError where it is none."""
+    """Return the finite number in a text; ValueError if there is none."""
     value = float(text)
     if not np.isfinite(value):
         raise ValueError(f"{text} is not finite")
@@ -122,7 +122,7 @@ def _elements(parent: Any) -> list[Any]:
 
 
 def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Stations:
-    """Return distances in plan and the stations just before and after them: of the start, and of station equations."""
+    """Return distances in plan, with the stations just before and after, of the start and of station equations."""
     rows, before, sign = [(0.0, start, start)], (0.0, start), 1.0
     for equation in alignment.iterfind("{*}StaEquation"):
         ahead = finite_number(equation.get("staAhead")) * scale
@@ -148,8 +148,8 @@ def _point(element: Any, name: str, scale: float, easting_first: bool) -> np.nda
 def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -> tuple[list[Plan], tuple[str, ...]]:
     """Return the elements in plan, and a note where the file has easting before northing, against LandXML.
 
-    The order is the one in which the coordinates lie in the area of the CRS; where both do, the one in which elements
-    continue the direction of the preceding ones.
+    With the chosen order the coordinates lie in the area of the CRS; if both orders do, elements continue the direction
+    of their predecessors.
     """
     plans, broken, inside = [], [], []
     for easting_first in (False, True):
@@ -227,7 +227,7 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
 def _read_ordinates(
     path: str, shape: Shape, points: tuple[Floats, Floats, Floats], curvature: tuple[float, float]
 ) -> OrdinateElement:
-    """Return a transition of ordinates through its ends, the tangent of its straight end being that to its PI."""
+    """Return a transition of ordinates through its ends, with the tangent at its straight end towards its PI."""
     start, middle, end = points
     into = curvature[0] == 0.0
     if (curvature[0] == 0.0) == (curvature[1] == 0.0):
@@ -247,7 +247,7 @@ def _read_ordinates(
     share = abs((element.last if into else element.first) / (curvature[1] if into else curvature[0]))
     if not _ORDINATE_SHARE[0] < share < _ORDINATE_SHARE[1]:
         raise InputFileError(path, f"the end of a {shape} transition is not that of its radius ({share:.2f} times)")
-    if not into:  # the direction at the curve is that of the tangent less the turn
+    if not into:  # the direction at the curve is the tangent's direction less the turn
         element = replace(element, direction_rad=element.direction_rad + element.turn_rad)
     return element
 

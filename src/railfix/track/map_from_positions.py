@@ -23,10 +23,11 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 _TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
-#: Positions off the line between their neighbours by more than a distance [m], this many medians of such distances and
-#: what a curve of this radius [m] needs are outliers; the search is repeated without them, in some rounds, where there
-#: are enough positions. Along the line a change of speed counts with this acceleration [m/s2]. The line is straight
-#: between neighbours near in time [s], or where the cosine of the turns of the path around them is this at least.
+#: A position is an outlier if its distance from the line between its neighbours exceeds a distance [m], this multiple
+#: of the median distance, and the ordinate of a curve of this radius [m]; with enough positions the search is repeated
+#: without outliers, in some rounds. Along the line a change of speed is allowed for by this acceleration [m/s2]. The
+#: line is straight between neighbours near in time [s], or where the cosine of the turns of the path around them is at
+#: least this.
 _BESIDE_M: Final = 5.0
 _BESIDE_MEDIANS: Final = 6.0
 _LEAST_RADIUS_M: Final = 150.0
@@ -35,7 +36,7 @@ _ENOUGH: Final = 10
 _ACCELERATION_MPS2: Final = 2.0
 _NEAR_S: Final = 2.5
 _STRAIGHT: Final = 0.87
-_STANDING_WINDOW_S: Final = 3.0  #: Half of the window of the displacement.
+_STANDING_WINDOW_S: Final = 3.0  #: Half of the displacement window [s].
 
 
 class ThinningLimits(Settings):
@@ -51,8 +52,8 @@ class ThinningLimits(Settings):
     #: Neighbouring points farther apart, joined by a straight line, are reported.
     jump_m: float = Field(default=50.0, gt=0)
     gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points farther apart do not form a line: an error.
-    #: Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
-    #: times, positions farther than `gap_m` from the others.
+    #: Positions that the vehicle could reach from the others only above this speed are wrong and dropped; without
+    #: times, positions farther than `gap_m` from the others are dropped.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
@@ -87,7 +88,7 @@ def thin(
 ) -> Thinned:
     """Choose the positions (n, 3) [m] that become points of a map; rows with NaN, or not `usable`, are dropped.
 
-    Noise and drift of a stationary antenna make no loops: stationary rows are dropped first, and a point is kept only
+    Noise and drift of a stationary antenna cause no loops: stationary rows are dropped first, and a point is kept only
     at full spacing from the last. The last usable position is kept where it is at least a fifth of the spacing further
     on.
     """
@@ -129,7 +130,7 @@ def thin(
 
 
 def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks:
-    """Flag rows that one vehicle can have passed: outward from the longest piece without a jump, shape (n,)."""
+    """Flag rows that one vehicle can have passed, outward from the longest piece without a jump, shape (n,)."""
     if len(ecef_m) < 2:
         return np.ones(len(ecef_m), dtype=np.bool_)
     timed = not np.isnat(time).any()
@@ -191,7 +192,7 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 def _goes_on(points: Floats, direction: Floats) -> Masks:
     """Return whether the path before and after each inner point goes on in the direction between its neighbours.
 
-    The next position or the next but one shows it, since the next one may be an outlier as well.
+    The next position or the one after it is used, since the next may be an outlier as well.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -248,7 +249,7 @@ def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
     start, step = points[chosen[piece]], points[chosen[piece + 1]] - points[chosen[piece]]
     share = np.einsum("ni,ni->n", points[inside] - start, step) / np.einsum("ni,ni->n", step, step)
     off = np.linalg.norm(points[inside] - start - share[:, None] * step, axis=1)
-    # near an end of the chord it would make a kink, not a curve
+    # near an end of the chord the point would make a kink, not a curve
     off = np.where((share > 0.2) & (share < 0.8), off, 0.0)
     worst = np.zeros(len(chosen) - 1)
     np.maximum.at(worst, piece, off)
@@ -270,7 +271,7 @@ def from_positions(
 ) -> Track:
     """Create a track from positions (n, 3) [m] in the order of travel, thinned and without stationary ones.
 
-    `time` is NaT where unknown; `usable` drops rows; `spacing_m` counts where no `limits` are given. The notes of the
+    `time` is NaT where unknown; `usable` drops rows; `spacing_m` is used without `limits`. The notes of the
     track record that it is the path of the antenna, and its gaps and reversals. ValueError: fewer than two points are
     left.
     """
@@ -320,7 +321,7 @@ def create_track(
 
 
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
-    """Flag the rows of a log within the quality limits: by default fixes (1) where it has a quality, else all."""
+    """Flag the rows of a log within the quality limits: by default fixes (1) if it has a quality column, else all."""
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
         raise InputFileError(log.path, "a quality was given, but the log has no column 'quality'")
@@ -340,15 +341,15 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     return usable
 
 
-#: Standard deviations of positions by their quality number (RTKLIB), plan and height [m]; a fix has that of P1 for a
-#: surveyed map. 2: float, 3: SBAS, 4: differential, 5: single point without corrections.
+#: Standard deviations of positions by their quality number (RTKLIB), plan and height [m]; for a fix, P1's standard
+#: deviation of a surveyed map. 2: float, 3: SBAS, 4: differential, 5: single point without corrections.
 SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (SIGMA_PLAN_M, SIGMA_HEIGHT_M), 2: (0.5, 1.0), 3: (1.5, 3.0), 4: (1.0, 2.0), 5: (3.0, 6.0)}
 )
 
 
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
-    """Return the sigmas in plan and height of a map's positions, the larger of stated and usual, and their basis."""
+    """Return the sigmas in plan and height of a map's positions, the larger of stated and usual, with their basis."""
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]
     reasons = []

@@ -2,7 +2,7 @@
 
 https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the arc from its north pole, a
 clothoid by its point of zero curvature, the azimuth there and the arc from it. The tables state neither which side is
-positive, nor the constant of a clothoid: the form in which a segment meets its neighbours on its edge is used.
+positive, nor the constant of a clothoid: the form with which a segment meets its neighbours on its edge is used.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _POINT: Final = ("TRACK_EDGE_ID", "POSITION", *_NUMBERS[:3])
 
 
 def read_edges(path: Path, reading: MapReading) -> list[Segment]:
-    """Read the edges of S_DM_TRACKPOINT, by default in ETRS89, or those of S_DM_TRACK_SEGMENT_POSITION."""
+    """Read the edges of S_DM_TRACKPOINT, by default in ETRS89, or of S_DM_TRACK_SEGMENT_POSITION."""
     if mate_table(path) != "S_DM_TRACKPOINT":
         return _read_segments(path, reading)
     table = read_mate(path, _POINT).sort("TRACK_EDGE_ID", "POSITION", maintain_order=True)
@@ -125,7 +125,7 @@ def _find_crs(cell: str) -> str | None:
 
 
 def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
-    """Return the elements of an edge, of each row the form that meets its neighbours best."""
+    """Return the elements of an edge, each in the form that meets its neighbours best."""
     forms = [_forms(path, row) for row in rows]
     gaps = (np.array([[_gap(a, b) for a in before] for b in after]) for before, after in pairwise(forms))
     chosen = cheapest_path([np.zeros(len(options)) for options in forms], gaps)
@@ -142,7 +142,7 @@ def _end(element: PlanElement) -> tuple[np.ndarray, float]:
 
 
 def _gap(before: PlanElement, after: PlanElement) -> float:
-    """Return the distance from the end of an element to the start of the next, plus that of directions over 10 m."""
+    """Return the distance from the end of an element to the next start, plus the change of direction times 10 m."""
     place, direction = _end(before)
     turn = np.angle(np.exp(1j * (direction - after.direction_rad)))
     return float(np.hypot(*(place - (after.x_m, after.y_m))) + 10.0 * abs(turn))
@@ -179,23 +179,23 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
-    """Return an element by azimuth and curvature clockwise, as a design has them counter-clockwise from the easting."""
+    """Return an element from clockwise azimuth and curvature, which a design has counter-clockwise from the easting."""
     direction = np.pi / 2.0 - azimuth
     return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
 
 
 def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float, length: float) -> PlanElement:
-    """Return the part of a clothoid from an arc from its point without curvature on."""
+    """Return the part of a clothoid that begins at an arc length from its point of zero curvature."""
     if arc == 0.0:
         return _element(east, north, azimuth, 0.0, rate * length, length)
-    # backward from the origin a clothoid has the same curvature to the other side, and the opposite direction
+    # Backward from the origin a clothoid has the same curvature to the other side, and the opposite direction.
     way = _element(east, north, azimuth if arc > 0.0 else azimuth + np.pi, 0.0, rate * abs(arc), abs(arc))
     (x, y), _ = _end(way)
     return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)
 
 
 def _turn(element: PlanElement) -> PlanElement:
-    """Return an element from its end to its start."""
+    """Return an element in the reverse direction."""
     (x, y), direction = _end(element)
     return replace(
         element, x_m=float(x), y_m=float(y), direction_rad=direction + np.pi, first=-element.last, last=-element.first
@@ -216,7 +216,7 @@ def _profile(path: str, row: Row) -> ProfileElement:
 
 
 def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
-    """The outer rail above the inner one, about the middle, on the side of the sharpest curve within the element."""
+    """Return the cant, outer rail above inner rail about the middle, on the side of the element's sharpest curve."""
     start, length, first, last = (_number(path, row, name) for name in (*_SPAN, "INITIAL_CANT", "END_CANT"))
     if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:
         first, last = last, first

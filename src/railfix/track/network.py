@@ -1,7 +1,7 @@
 """A network of tracks: track centrelines, the connections of their ends, and routes through it (P1 4.2(1)).
 
-Connections are stated by the file, else ends nearer to each other than a tolerance. At a switch each leg is navigable
-with the stem, but not with the other leg.
+Connections are stated by the file, or else join ends within a tolerance of each other. At a switch each leg is
+navigable with the stem, but not with the other leg.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from railfix.track.trajectory import NearestOnPolyline, project_on_segments
 if TYPE_CHECKING:
     import networkx as nx
 
-#: Prior probability that the train is on a track that the map lacks, and the least distance of two tracks [m].
+#: Prior probability that the train is on an unmapped track, and the least distance of two tracks [m].
 UNMAPPED_PRIOR: Final = 0.05
 CLEARANCE_M: Final = 3.0
-#: Height of an antenna above the rails that is not known, and its standard deviation [m]: from bogies to roofs.
+#: Assumed height of an antenna above the rails, and its standard deviation [m], for bogies to roofs.
 ANTENNA_UP_M: Final = 2.5
 ANTENNA_SIGMA_M: Final = 1.5
-_DIRECTION_M: Final = 10.0  #: Way over which the direction of an end is taken [m].
-_NEAR_WAY_M: Final = 5_000.0  #: Length of routes that are searched before the whole network is [m].
+_DIRECTION_M: Final = 10.0  #: Length over which the direction of an end is computed [m].
+_NEAR_WAY_M: Final = 5_000.0  #: Length of routes searched before the whole network is searched [m].
 _SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
-#: Number of nearest samples examined for each position at first; more where these do not extend far enough.
+#: Number of nearest samples examined for each position at first; more if these do not extend far enough.
 _SAMPLES: Final = 32
-_TOGETHER: Final = 256  #: Positions that are processed together: every nearby sample of each is in memory.
+_TOGETHER: Final = 256  #: Positions processed together: every nearby sample of each is in memory.
 #: Properties that the connections do not change.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
 _NAMED: Final = 8  #: Number of tracks that a message names individually.
@@ -45,7 +45,7 @@ _NAMED: Final = 8  #: Number of tracks that a message names individually.
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """Connection of the end of a track with the end of another; ends are 0 (first point) and 1 (last)."""
+    """Connection of the end of a track with another track's end; ends are 0 (first point) and 1 (last)."""
 
     first: int
     first_end: int
@@ -65,21 +65,21 @@ class Candidates(RowArrays):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Network(NotebookTable):
-    """Tracks, each from one end or switch to the next, their connections, and notes on the source of these."""
+    """Tracks, each from one end or switch to the next, their connections, and notes on the connections' source."""
 
     tracks: tuple[Segment, ...]
     links: tuple[Link, ...]
     notes: tuple[str, ...] = ()
 
     def connect(self, links: tuple[Link, ...], note: str) -> Network:
-        """Return the network with other connections, and a note on them; the data of its points are kept."""
+        """Return the network with new connections, and a note on them; the data of its points are kept."""
         network = replace(self, links=links, notes=(note,))
         vars(network).update({name: vars(self)[name] for name in _OF_POINTS if name in vars(self)})
         return network
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the tracks, those of the file; repeated ones numbered."""
+        """Names of the tracks from the file; repeated names are numbered."""
         seen: dict[str, int] = {}
         names = []
         for track in self.tracks:
@@ -95,7 +95,7 @@ class Network(NotebookTable):
 
     @cached_property
     def points_m(self) -> Floats:
-        """Points of all tracks on the ellipsoid, shape (V, 3) ECEF [m]: distances are those in plan."""
+        """Points of all tracks on the ellipsoid, shape (V, 3) ECEF [m], so that distances are in plan."""
         latitude = np.concatenate([t.latitude_deg for t in self.tracks])
         longitude = np.concatenate([t.longitude_deg for t in self.tracks])
         return read_only(ecef_from_geodetic(latitude, longitude, np.zeros(len(latitude))))
@@ -131,7 +131,7 @@ class Network(NotebookTable):
 
     @cached_property
     def joints(self) -> Integers:
-        """Joint at each end of each track, shape (tracks, 2): ends that links bring together have one number."""
+        """Joint at each end of each track, shape (tracks, 2); linked ends have the same number."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -182,17 +182,17 @@ class Network(NotebookTable):
 
     @cached_property
     def sigma_plan_m(self) -> float:
-        """Standard deviation of the tracks in plan: the worst that the files state, or that of a surveyed map."""
+        """Standard deviation of the tracks in plan: the worst of the files, by default a surveyed map's."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
     @cached_property
     def sigma_height_m(self) -> float:
-        """Standard deviation of the tracks' heights, likewise."""
+        """Standard deviation of the tracks' heights: the worst of the files, by default a surveyed map's."""
         return sigma_of_files(self.tracks, "sigma_height_m", SIGMA_HEIGHT_M)
 
     @cached_property
     def datum_plan_m(self) -> float:
-        """Standard deviation of the transformation of the tracks from their datum, included in the above [m]."""
+        """Standard deviation of the tracks' transformation from their datum, included in the above [m]."""
         return max(track.datum_plan_m for track in self.tracks)
 
     @property
@@ -202,7 +202,7 @@ class Network(NotebookTable):
 
     @cached_property
     def _index(self) -> tuple[scipy.spatial.cKDTree, Indices, Indices, float]:
-        """Tree of samples of all segments, segment and track of each sample, and how far a piece reaches from it."""
+        """Tree of samples of all segments, segment and track of each sample, and the reach of a sample's piece."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
         inner[self.first_point[1:-1] - 1] = False
@@ -237,7 +237,7 @@ class Network(NotebookTable):
         return join_rows(parts)
 
     def _near(self, latitude_deg: Floats, longitude_deg: Floats, within_m: float, most: int) -> Candidates:
-        """Return some of `near`: arrays have every sample near each position."""
+        """Return a part of `near`; arrays contain every sample near each position."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
@@ -305,8 +305,8 @@ class Network(NotebookTable):
     ) -> dict[int, tuple[float, list[int]]]:
         """Return the shortest routes to each entry of a track, searched near it first, else in the whole network.
 
-        A route has its length and its nodes of `graph`: the one at which it begins, and those at which tracks are
-        entered. `routes` are those so far, by the node that is left.
+        A route has its length and its nodes of `graph`: the start node, and the nodes at which tracks are entered.
+        `routes` are the routes so far, by the node that is left.
         """
         import networkx as nx
 
@@ -340,7 +340,7 @@ class Network(NotebookTable):
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         routes = {4 * wanted[0] + end: (0.0, [4 * wanted[0] + end]) for end in (1, 3)}
         for stop in wanted[1:]:
-            # a track that is entered at one end is left at the other
+            # a track entered at one end is left at the other
             routes = {entry ^ 3: route for entry, route in self.extend_routes(routes, stop).items()}
         return [node // 4 for node in min(routes.values())[1]] if routes else None
 

@@ -1,11 +1,11 @@
-"""Probability of each track at each position of a log, with an error that the positions have in common.
+"""Probability of each track at each position of a log, with a common error of the positions.
 
-A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, a
-track that the map lacks, and the common error of the positions: a first-order Gauss-Markov process east, north and up,
-on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining error of each position has heavy tails
-(Student's t) and persists for `correlation_s`; the likelihood of a position is weighted by the fraction of that time it
-stands for. A track that the map lacks runs beside the
-nearest one at a constant distance (`SHIFTS_M`), clear of all others, or is anywhere else.
+A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, or an
+unmapped track, and the common error of the positions: a first-order Gauss-Markov process east, north and up, on a
+lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining error of each position has heavy tails
+(Student's t) and persists for `correlation_s`; the likelihood of a position is weighted by the fraction of that time
+that it represents. An unmapped track runs parallel to the nearest track at a constant distance (`SHIFTS_M`), clear of
+all others, or is anywhere else.
 """
 
 from __future__ import annotations
@@ -20,42 +20,44 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
 from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Network
 
-#: Negative logarithm of the likelihood of a position on a track that the map does not have and that runs beside none,
-#: compared with one at distance 0.
+#: Negative logarithm of the likelihood of a position on an unmapped track that is parallel to no track, compared with a
+#: position at distance 0.
 _UNMAPPED_COST: Final = 5.0
-#: Distances right of the nearest track at which a track that the map lacks can run beside it [m].
+#: Distances to the right of the nearest track at which an unmapped track can run parallel to it [m].
 SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
-#: Shares of these in the prior, in inverse proportion: tracks are mostly neighbours.
+#: Prior fractions of these distances, in inverse proportion: most parallel tracks are neighbours.
 _SHARES: Final = 1.0 / np.abs(SHIFTS_M) / (1.0 / np.abs(SHIFTS_M)).sum()
-#: Probability, from a position to the next, that such a track comes to be `SHIFTS_M` nearer or farther.
+#: Probability, from a position to the next, that such a track changes to the next nearer or farther of `SHIFTS_M`.
 _DRIFTS: Final = 1e-3
 _SHIFT_STEP_M: Final = 2.0
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of positions.
 #: Negative logarithms of the probability, from a position to the next, of passing to another track without connection,
-#: of leaving the map and of entering it, and the same two of a track beside that the map lacks: a train is on one for
-#: `UNMAPPED_PRIOR` of the time, a quarter of an hour at a time. To a track by way of none is as improbable as the jump.
+#: of leaving the map and of entering it, and of leaving to and entering from a parallel unmapped track: a train is on
+#: unmapped track for `UNMAPPED_PRIOR` of the time, a quarter of an hour at a time. A change of track by way of unmapped
+#: track is as improbable as the jump.
 _JUMP_COST: Final = 17.0
 _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
-#: The same of passing an open end, at which the map ends. A position lies beyond one from so many of its standard
-#: deviations on, and from a distance within these limits [m].
+#: Negative logarithm of the probability of passing an open end, at which the map ends. A position lies beyond an open
+#: end if it is this many standard deviations beyond it, limited to these distances [m].
 _OPEN_COST: Final = 2.0
 _BEYOND_SIGMAS: Final = 5.0
 _BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
-#: Length by which a connection may exceed the straight distance of two positions [m], and fraction of it: a bend.
+#: Length by which a connection may exceed the straight distance of two positions, as in a bend [m], and fraction of
+#: that distance.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
-#: Difference of path length and distance at which a joint is half as probable as where they agree [m].
+#: Difference of path length and distance at which a joint is half as probable as with equal lengths [m].
 _PASSING_M: Final = 5.0
 #: Least gain of a change of track, in positions on the right track; less at a joint, which is identified by its
 #: probability: on a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
-COMMON_S: Final = 600.0  #: Time over which the common error lasts [s].
+COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
 #: Balls of the urn of one horizontal axis, and of the vertical one: a quarter of them is the variance in steps.
 _BALLS: Final = 12
 _BALLS_UP: Final = 8
@@ -67,11 +69,12 @@ class Residuals:
     """Positions with their candidates, n rows with up to m candidates each.
 
     `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
-    without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
-    without (n, m). `clear` tells which `SHIFTS_M` from the nearest track are clear of all tracks (n, S), `moved_m` how
-    far that track lies right of the nearest one of the previous position, and `turned` whether its direction is
-    opposite (n,). `weight` is the share of the correlation time that a position covers, `seconds` since the one before;
-    `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
+    without a candidate; `beyond_m` the distance of the position beyond an end; `above_m` its height above the track,
+    NaN without a height (n, m). `clear` flags the `SHIFTS_M` from the nearest track that are clear of all tracks (n,
+    S), `moved_m` is the distance of that track to the right of the previous position's nearest track, and `turned`
+    flags an opposite direction (n,). `weight` is the fraction of the correlation time that a position covers, `seconds`
+    the time since the previous position; `sigma_m` and `common_m` are per horizontal axis, `common_up_m` is 0 where
+    heights are not used.
     """
 
     across: Floats
@@ -97,7 +100,7 @@ class Transitions:
         self._track, self._place = candidates.track, candidates.chainage_m
         self._clear, self._moved, self._turned = residuals.clear, residuals.moved_m, residuals.turned
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Path lengths from an end of a track to the ends of others, and the search limit.
+        #: Path lengths from an end of a track to other tracks' ends, and the search limit.
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
@@ -109,13 +112,13 @@ class Transitions:
         beyond = np.abs(residuals.beyond_m) / np.clip(_BEYOND_SIGMAS * residuals.sigma_m, *_BEYOND_M)[:, None]
         opens = at_end.any(axis=2) & (beyond > 1.0)
         self._same = (self._track[:-1, :, None] == self._track[1:, None, :]) & (self._track[:-1, :, None] >= 0)
-        #: Whether an open end is passed in leaving a track, or in coming to one: the position after, or before, lies
-        #: beyond it; shapes (n - 1, m).
+        #: Whether an open end is passed on leaving, or on entering, a track: the next, or previous, position lies
+        #: beyond the end; shapes (n - 1, m).
         self._left = (self._same & opens[1:, None, :]).any(axis=2)
         self._entered = (self._same & opens[:-1, :, None]).any(axis=1)
-        # errors do not change by metres in one step: a position beyond the end, next to one that is not, is no error
+        # errors do not change by metres in one step: a position beyond the end next to a position before it is no error
         stays = np.where(opens, np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2)), 1.0)
-        #: Likelihood of staying on a track where the position before, or after, is the only one beyond its open end.
+        #: Likelihood of staying on a track if only the previous, or only the next, position is beyond its open end.
         self._stays = np.where(self._left, 1.0, stays[:-1]), np.where(self._entered, 1.0, stays[1:])
 
     @property
@@ -132,14 +135,14 @@ class Transitions:
         share[:m, -1] = np.where(left, np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
         share[-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
-        # a train that has passed an open end, or comes to one, is on a track that the map lacks; as it begins on one
-        # with `UNMAPPED_PRIOR`, leaving has that factor, too, and a run and its return are equally probable
+        # A train that has passed an open end, or approaches it from beyond, is on unmapped track. As it begins there
+        # with `UNMAPPED_PRIOR`, leaving has this factor, too, so that a run and its return are equally probable.
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
         share[:m, m:-1][left] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
         share[m:-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
-        # of one track that the map lacks: a part that runs beside a track, and a part that runs beside none
+        # of one unmapped track: a part that is parallel to a track, and a part that is parallel to none
         share[-1, m:-1], share[m:-1, -1] = UNMAPPED_PRIOR * free, UNMAPPED_PRIOR * np.exp(-_ENTER_COST)
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
             way = self._way(k, i, j)
@@ -150,7 +153,7 @@ class Transitions:
         return share
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Path length between two positions over ends of tracks [m], infinite beyond the limit."""
+        """Return the path length between two positions over ends of tracks [m], infinite beyond the limit."""
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
         for end, rest in enumerate((float(self._place[k, i]), float(self._rest[k, i]))):
@@ -173,7 +176,7 @@ class Transitions:
 
 
 def _shifted(moved_m: float, turned: bool) -> Floats:
-    """Return passages between `SHIFTS_M`, from row to column, where the track that they count from moves or turns."""
+    """Return passages between `SHIFTS_M`, from row to column, if their reference track moves or turns."""
     place = (SHIFTS_M - moved_m) * (-1.0 if turned else 1.0)
     apart = np.abs(place[:, None] - SHIFTS_M)
     nearest = apart == apart.min(axis=1, keepdims=True)
@@ -219,7 +222,7 @@ class _CommonError:
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
-        """Return values after the matrices of each axis: small ones, where one for all axes would wait for threads."""
+        """Return values multiplied by each axis's matrix: a single matrix for all axes would wait for threads."""
         axis, heights = len(plan), len(up)
         east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
         north = np.matmul(plan, east.reshape(-1, axis, axis, heights))
@@ -237,20 +240,20 @@ def _student(square: Floats) -> Floats:
 
 
 def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
-    """Of a position given each state, shape (m + S + 1, C, U), up to a factor."""
+    """Return the likelihood of a position given each state, shape (m + S + 1, C, U), up to a factor."""
     m, offset = residuals.offset_m.shape[1], residuals.offset_m[k]
     known = np.flatnonzero(np.isfinite(offset))
     across, beyond = residuals.across[k, known], residuals.beyond_m[k, known, None]
     off_track = offset[known, None] - across @ lattice.plan_m.T
     square = off_track**2
     if beyond.any():
-        # the common error may lie along the track, too: the remaining distance beyond the end counts
+        # the common error may be along the track, too: the remaining distance beyond the end is used
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
     cost = np.full((m + len(SHIFTS_M) + 1, *lattice.first.shape), np.inf)
     cost[-1] = _UNMAPPED_COST
     cost[known] = _student(square / residuals.sigma_m[k] ** 2)[..., None]
-    # a track that the map lacks crosses others, but does not lie on them for long
+    # an unmapped track crosses others, but does not coincide with them for long
     cost[m:-1] = np.where(residuals.clear[k], 0.0, _UNMAPPED_COST)[:, None, None]
     if len(known):
         cost[m:-1] += _student(((off_track[:1] - SHIFTS_M[:, None]) / residuals.sigma_m[k]) ** 2)[..., None]
@@ -267,14 +270,14 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
     length = _BLOCK // len(lattice.up_m)
-    # of a long log the first positions of the blocks are stored, and each block is computed again on the backward pass
+    # for a long log the first position of each block is stored, and each block is recomputed on the backward pass
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
     probability, gains, changes = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1)), moves.changes
     after = expected = np.ones((states, *lattice.first.shape))
     move = np.eye(states)
-    none = np.arange(m + 1)  # all states without a track of the map are one
+    none = np.arange(m + 1)  # all states without a mapped track are one
     for start in reversed(firsts):
         block = [at for _, at in _forward(residuals, moves, lattice, start, firsts[start], min(start + length, n))]
         for k in reversed(range(start, start + len(block))):
@@ -297,8 +300,10 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
 
 @dataclass(frozen=True)
 class _At:
-    """One position going forward: probabilities of all states given the positions so far and its likelihood, shapes
-    (m + S + 1, C, U), and the passages to it, shape (m + S + 1, m + S + 1).
+    """Forward step at one position.
+
+    It has the probabilities of all states given the positions so far and the likelihood of the position, shapes
+    (m + S + 1, C, U), and the passages to the position, shape (m + S + 1, m + S + 1).
     """
 
     share: Floats
@@ -309,7 +314,7 @@ class _At:
 def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
-    """Yield positions from one, where all states have given probabilities, to before another."""
+    """Yield the forward states from one position, with given probabilities, to before another."""
     m = residuals.offset_m.shape[1]
     states = m + len(SHIFTS_M) + 1
     share, move = first, np.eye(states)
@@ -330,7 +335,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """The sequence of the largest gains: neighbouring pairs expected to be right, less the required gain of changes."""
+    """Return the sequence of largest gain: expected number of right neighbouring pairs, less the cost of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

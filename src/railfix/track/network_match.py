@@ -1,4 +1,4 @@
-"""Positions of a run on a network of tracks: the track of each, and how probable it is."""
+"""Positions of a run on a network of tracks: the track of each position, and its probability."""
 
 from __future__ import annotations
 
@@ -22,41 +22,42 @@ from railfix.track.network_decode import SHIFTS_M, Residuals, Transitions, decod
 from railfix.track.track import ANOTHER_PLACE_M
 
 #: Standard deviation of the distance of a position from its track where its log states none and none can be estimated,
-#: and the least that is estimated [m].
+#: and its least estimate [m].
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0
 _ALONE_M: Final = 15.0  #: Distance of the next track from a position by which sigmas are estimated [m].
 #: Positions farther from the track than this, and than this multiple of their noise, are off it for another reason [m].
 _LARGEST_LEVEL_M: Final = 5.0
 _BESIDE: Final = 3.0
-_ENOUGH: Final = 30  #: Positions that an estimate needs.
+_ENOUGH: Final = 30  #: Number of positions that an estimate requires.
 _COMMON_M: Final = 2.0  #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map.
-_COMMON_SHARE: Final = 0.7  #: Share of the stated standard deviation that the common error has where it is smaller.
-_BEST: Final = 0.1  #: Quantile of the stated standard deviations that the common error has where it is smaller.
-#: Least distance to which tracks are searched for [m], and farther ones in standard deviations and metres.
+#: Fraction of the stated standard deviation that is assumed for the common error, if this is smaller.
+_COMMON_SHARE: Final = 0.7
+_BEST: Final = 0.1  #: Quantile of the stated standard deviations that is used for the common error.
+#: Least search distance for tracks [m], and larger search distances in standard deviations and metres.
 _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
 _FARTHEST_M: Final = 100.0
-#: Positions farther from all tracks than this many times that distance, for less than a time [s], are wrong.
+#: Positions farther from all tracks than this multiple of the search distance, for less than a time [s], are wrong.
 _FAR: Final = 6.0
 _WRONG_S: Final = 60.0
-#: Number of tracks near such positions that are examined, and the placeholder for none.
+#: Number of tracks near such positions that are examined, and the placeholder for no track.
 _MOST_FAR: Final = 8
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
 #: Placeholder of a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
-_ROUNDED_M: Final = 0.1  #: Distances of tracks are known to this [m].
-_STEP_S: Final = 0.4  #: Time between positions that state none, or one before the last [s].
+_ROUNDED_M: Final = 0.1  #: Resolution of the distances of tracks [m].
+_STEP_S: Final = 0.4  #: Time step of positions without a time, or with a time before the last [s].
 _MOST_TRACKS: Final = 16  #: Tracks near a position that are examined.
-_APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each other for which heights count [m].
+_APART_UP_M: Final = 1.0  #: Least height difference of two tracks near each other for which heights are used [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog(RowArrays):
-    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None or NaN without any.
+    """Positions in plan, n rows, NaT or NaN where unknown; `sigma_m` is per axis; heights may be None or NaN.
 
-    Heights are those of an antenna `antenna_up_m` above the rails, None where that is not known [m].
+    Heights are those of an antenna `antenna_up_m` above the rails, None if unknown [m].
     """
 
     path: str
@@ -70,7 +71,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return positions in the satellites' frame in that of the network; otherwise MismatchError."""
+        """Return positions transformed from the satellites' frame to the network's; MismatchError if far from it."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -110,8 +111,9 @@ def _check_region(network: Network, log: PlanLog) -> None:
 @dataclass(frozen=True, kw_only=True)
 class Matched:
     """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
-    the right; `probability` is given the whole log, NaN without or with a wrong position; `probabilities`, shape (n,
-    m), of each candidate, the rest to 1 of no mapped track; `notes` state assumptions on the log.
+    the right; `probability` is conditional on the whole log, NaN without a position or with a wrong one;
+    `probabilities`, shape (n, m), are per candidate, and their complement to 1 is for unmapped track; `notes` state
+    assumptions on the log.
     """
 
     track: Indices
@@ -163,7 +165,8 @@ def match(
     correlation_s: float = 20.0,
 ) -> Matched:
     """Match positions of a run, in the order of travel and in the frame of the network, to its tracks no farther than
-    `within_m`; `sigma_m` is of the distance from the track, `correlation_s` the time over which errors persist.
+    `within_m`; `sigma_m` is the standard deviation of the distance from the track, `correlation_s` the correlation time
+    of errors.
     """
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
@@ -197,7 +200,7 @@ def match(
 
 
 def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None) -> tuple[Floats, tuple[str, ...]]:
-    """Return standard deviations of the distances of positions from their track, and a note where they are assumed."""
+    """Return standard deviations of the distances of positions from their track, and a note if they are assumed."""
     if sigma_m is not None:
         return np.full(len(given), sigma_m), ()
     stated = np.isfinite(log.sigma_m[given])
@@ -210,7 +213,7 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 
 
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
-    """Return the standard deviation of distances by their median where one track alone is near, and how it was found.
+    """Return the standard deviation of distances from their median where only one track is near, and its basis.
 
     With parallel tracks, errors of the positions cannot be distinguished from another track.
     """
@@ -228,7 +231,7 @@ def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[floa
 
 
 def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
-    """Return a note on times that step back."""
+    """Return a note on decreasing times."""
     back = np.flatnonzero(np.diff(log.time[given]) < np.timedelta64(0))
     if not len(back):
         return ()
@@ -249,7 +252,7 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 
 
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
-    """Whether a position far from all tracks is wrong: those before and after it, within `_WRONG_S`, are near some."""
+    """Return whether a position far from all tracks is wrong: both neighbours in `_WRONG_S` are near a track."""
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):
         return np.zeros(len(time), dtype=np.bool_)
@@ -260,7 +263,7 @@ def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
 
 
 def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
-    """Return how much larger than stated errors are, at least 1: by changes of the distance over `correlation_s`."""
+    """Return the ratio of actual to stated errors, at least 1, from changes of the distance over `correlation_s`."""
     seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
     rows = np.arange(len(seconds))
     later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)
@@ -272,7 +275,7 @@ def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
 
 
 def _median_scale(ratio: Floats) -> float:
-    """Return how much larger than normal, of variance 1, values are by their median, at least 1."""
+    """Return the ratio of values to the standard normal distribution by their median, at least 1."""
     ratio = np.abs(ratio[np.isfinite(ratio)])
     return max(1.0, float(np.median(ratio)) / _NORMAL_MEDIAN) if len(ratio) else 1.0
 
@@ -308,13 +311,13 @@ def _residuals(
     spread = np.nanmax(above, axis=1, initial=-np.inf) - np.nanmin(above, axis=1, initial=np.inf)
     counts = not np.isnan(network.height_m).any() and bool((spread > _APART_UP_M).any())
     seconds = np.concatenate([[0.0], np.diff(log.time[given]) / np.timedelta64(1, "s")])
-    # no time, or one that steps back: rows are in the order of travel
+    # no time, or a decreasing time: rows are in the order of travel
     seconds = np.round(np.where(seconds >= 0.0, seconds, _STEP_S), 1).astype(np.float64)
     weight = np.clip(seconds / correlation_s, 1e-3, 1.0)
     weight[0] = 1.0
     sigma_up = np.full(len(given), np.nan) if log.sigma_up_m is None else log.sigma_up_m[given]
     sigma_up = np.where(np.isfinite(sigma_up), sigma_up, 2.0 * sigma_m)
-    # reflections put heights off to one side for minutes
+    # reflections bias heights to one side for minutes
     sigma_up = sigma_up * _median_scale(np.nanmin(np.abs(above), axis=1, initial=np.inf) / sigma_up)
     axis, beyond = over(right, 0.0), over(np.where(outward, ahead_m, 0.0), 0.0)
     of_antenna = ANTENNA_SIGMA_M if log.antenna_up_m is None else 0.0
@@ -336,7 +339,7 @@ def _residuals(
 
 
 def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) -> dict[str, Any]:
-    """Return where tracks that the map lacks can run: `clear`, `moved_m` and `turned` of `Residuals`."""
+    """Return the possible positions of unmapped tracks: `clear`, `moved_m` and `turned` of `Residuals`."""
     cosine = np.einsum("nmi,ni->nm", across, across[:, 0])
     offset = np.where(np.isfinite(offset_m), offset_m, 0.0)
     right_m = offset[:, :1] - offset * cosine  # of the nearest track
@@ -352,7 +355,7 @@ def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) 
 
 
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
-    """Return the matched positions on their rows of a log, and the other rows without one."""
+    """Return the matched positions at their rows of a log, the other rows without a match."""
 
     def over(values: Any, empty: float) -> Any:
         full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)

@@ -23,7 +23,7 @@ from railfix.track.route import MapReading, Segment, check_order, first_gap, ori
 from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
-TOLERANCE_M: Final = 0.5  #: Ends nearer than this are one point, where the file states no connection [m].
+TOLERANCE_M: Final = 0.5  #: Ends nearer than this are one point if the file states no connection [m].
 #: Largest change of direction between two tracks that a train passes [rad]; the legs of a switch differ by about pi.
 _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
@@ -31,14 +31,14 @@ _LARGEST_TURN_RAD: Final = np.radians(60.0)
 def read_network(
     paths: Sequence[FilePath], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> Network:
-    """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
+    """Read a network from map files, connected as stated there, else where ends, or an end and a track, meet."""
     tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]
     check_order(tracks)
     return connect_network(tracks, paths, tolerance_m=tolerance_m)
 
 
 def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
-    """Connect tracks to a network: as their files state it, otherwise by their ends; see `read_network`."""
+    """Connect tracks to a network: as stated by their files, otherwise by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
@@ -55,7 +55,7 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
 
 
 def _of_nodes(tracks: list[Segment]) -> Network:
-    """Connect ways of OpenStreetMap at their shared nodes, inner ones too, and nowhere else."""
+    """Connect ways of OpenStreetMap at their shared nodes, including inner nodes, and nowhere else."""
     used = Counter(node for track in tracks for node in track.nodes)
     inner = [[i for i, node in enumerate(t.nodes[1:-1], start=1) if used[node] > 1] for t in tracks]
     whole = Network(tracks=tuple(tracks), links=())
@@ -80,7 +80,7 @@ def _of_nodes(tracks: list[Segment]) -> Network:
 
 
 def _relations(path: FilePath) -> list[Relation]:
-    """Return connections that a file states, empty where it states none."""
+    """Return the connections stated by a file, empty if there are none."""
     kind = find_kind(path)
     if kind == "xml":
         return read_railml_relations(path)
@@ -121,11 +121,11 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
 
 
 def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
-    """Connections of ends within a tolerance; navigable where the direction changes by less than 60 deg."""
+    """Return connections of ends within a tolerance, navigable where the direction changes by less than 60 deg."""
     ends, outward = end_points(network)
     pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
     level = np.array([track.metadata.get("level", "") for track in network.tracks])
-    # a bridge and a tunnel whose ends meet in plan are not connected; the ground meets either
+    # a bridge and a tunnel whose ends meet in plan are not connected; a track on the ground connects to either
     apart = (level[pairs[:, 0] // 2] != level[pairs[:, 1] // 2]) & (level[pairs // 2] != "").all(axis=1)
     pairs = pairs[~apart]
     pairs = pairs[np.lexsort(pairs.T[::-1])]
@@ -139,7 +139,7 @@ def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tupl
 
 
 def is_route(segments: Sequence[Segment]) -> bool:
-    """Return whether segments join to one route in their order: ends meet, and no train would have to turn back."""
+    """Return whether segments in their order form one route: ends meet, and no train has to turn back."""
     if first_gap(segments) is not None:
         return False
     _, outward = end_points(Network(tracks=tuple(orient(segments)), links=()))
@@ -147,7 +147,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
 
 
 def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]]:
-    """Return the inner places of tracks at which another track ends, in order [m], by the number of the track."""
+    """Return the inner chainages of tracks at which another track ends, in order [m], by track number."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -165,7 +165,7 @@ def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]
 
 
 def _divide(whole: Network, places: Mapping[int, Sequence[float]]) -> tuple[Network, list[int]]:
-    """Return the network with tracks divided at inner places [m], and the number of the whole track of each part."""
+    """Return the network with tracks divided at inner chainages [m], and the undivided track's number of each part."""
     parts: list[tuple[Segment, int]] = []
     for k, track in enumerate(whole.tracks):
         way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
@@ -201,9 +201,9 @@ _JOINT_M: Final = 0.5  #: Connected ends farther apart than this do not meet [m]
 _KINK_DEG: Final = 15.0
 #: Least spacing of parallel tracks [m]: a smaller one leaves no clearance between vehicles.
 _LEAST_SPACING_M: Final = 2.5
-#: Tracks may be nearer than that within this way of their ends, where a switch brings them together [m].
+#: Tracks may be nearer than this within this distance of their ends, where they join in a switch [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Least length over which tracks that are too near to each other are reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Least length of tracks too near to each other that is reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +229,7 @@ class NetworkQuality:
     findings: tuple[NetworkFinding, ...]
 
 
-#: Kinds of findings that are errors of the network; they come first.
+#: Kinds of findings that are errors of the network; they are listed first.
 FAULTS: Final = ("gap", "joint", "kink")
 
 
@@ -264,13 +264,13 @@ def _finding(network: Network, kind: str, tracks: Sequence[int], point: int, sen
 
 
 def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFinding]:
-    """Yield ends without a connection near another such end, or that turn into nothing."""
+    """Yield ends without a connection that are near another such end."""
     if not loose:
         return
     ends, outward = end_points(network)
     points = np.array([ends[t, e] for t, e in loose])
     facing = np.array([outward[t, e] for t, e in loose])
-    # two adjacent track ends point the same way
+    # two adjacent track ends point in the same direction
     near = [(a, b) for a, b in cKDTree(points).query_pairs(_GAP_M) if facing[a] @ facing[b] < 0.0]
     for a, b in sorted(near):
         (t, e), (u, _) = loose[a], loose[b]

@@ -1,4 +1,4 @@
-"""The route of a run through a network of tracks, and gaps of its log filled by the shortest route."""
+"""Route of a run through a network of tracks, and filling of gaps in its log by the shortest route."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 
-#: Rows that are filled: those without a position between known positions, or also those whose positions lie off the
-#: map.
+#: Rows to be filled: rows without a position between known positions, or also rows with positions off the map.
 Rows = Literal["gaps", "off-map"]
-#: Farthest track examined from a position that drifts, and largest difference of a route from the distance travelled
-#: [m]; and steps of which the speed is the median.
+#: Largest distance of a track from a drifting position, and largest difference of a route from the distance travelled
+#: [m]; number of steps whose median is the speed.
 _DRIFT_M = 500.0
 _STEPS = 15
 
@@ -38,7 +37,7 @@ class Filled:
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
-    """Fill rows without usable position along the shortest route at even speed; "off-map" also those off the map."""
+    """Fill rows without usable position along the shortest route at even speed; "off-map" includes rows off the map."""
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
     )
@@ -93,7 +92,7 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 
 
 def _distance_m(log: PlanLog) -> Floats:
-    """Distance by the steps between positions, each the median of `_STEPS`, as positions jump; NaN without position."""
+    """Return the distance by steps, each a median over `_STEPS`, as positions jump; NaN without a position."""
     from scipy.ndimage import median_filter
 
     ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
@@ -106,7 +105,7 @@ def _distance_m(log: PlanLog) -> Floats:
 def _put_on(
     filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
 ) -> None:
-    """Put rows on a route in proportion to `at`, of which the first and, with known ends, the last are its ends."""
+    """Place rows on a route in proportion to `at`, whose first and, with known ends, last rows are its ends."""
     numbers, enter, leave = legs
     share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
     share = share[1 : len(rows) + 1]
@@ -140,9 +139,9 @@ def _fill_legs(
 
 
 def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:
-    """Return the tracks that a run passed in order of travel, each once, and those that no route joins to them.
+    """Return the tracks passed by a run in order of travel, each once, and passed tracks that no route joins to them.
 
-    MismatchError: no position lies on a track; the message names the log and where its positions lie.
+    MismatchError: no position lies on a track; the message names the log and the location of its positions.
     """
     seen = matched.track[matched.track >= 0]
     if not len(seen):
@@ -151,22 +150,22 @@ def find_route(network: Network, matched: Matched, path: str = "the log") -> tup
     share = {t: float(matched.probabilities[matched.candidates.track == t].sum()) for t in set(passed)}
     routes = [network.route_over(passed)]
     if routes[0] is None:
-        # the train turned back, the map has a gap, or positions lay on a track that was not passed
+        # the train turned back, the map has a gap, or positions are on a track that was not passed
         routes = [_choose_route(network, order, share) for order in (passed, passed[::-1])]
     once = [part for route in routes if route is not None for part in _once(network, route)]
-    # `fsum` rounds the same in any order: the return over the same tracks has the same length
+    # `fsum` is independent of the order: the return over the same tracks has the same length
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
 
 
 def left_out_note(network: Network, left_out: Sequence[int]) -> str:
-    """Return the note on tracks that no route joins to those of a run, `find_route`."""
+    """Return the note on tracks that no route joins to the tracks of a run, see `find_route`."""
     beside = ", ".join(network.names[k] for k in left_out)
     return f"no route joins these tracks to {beside}: the train turned back there, or the map has a gap"
 
 
 def _beside(network: Network, matched: Matched) -> str:
-    """Return how the positions lie to the tracks that they are near but not on, the end of a sentence."""
+    """Return the end of a sentence on the positions' distance from tracks that they are near but not on."""
     track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
     near = track >= 0
     if not near.any():
@@ -207,7 +206,7 @@ def _joints(network: Network, route: list[int]) -> list[int]:
 
 
 def _choose_route(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
-    """Choose a route over the most probable tracks, in the order in which each first comes: its parts are routes."""
+    """Choose a route over the most probable tracks, in the order of first passage; its parts are routes."""
     rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
 
     def is_none(count: int) -> int:

@@ -1,4 +1,4 @@
-"""Track maps as CSV with named columns, and as GeoJSON (RFC 7946): LineString, MultiLineString, or features of them."""
+"""Track maps as CSV with named columns, and as GeoJSON (RFC 7946): LineString, MultiLineString, or their features."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from railfix.track.vector_file import (
     with_left_out,
 )
 
-#: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
+#: RFC 7946, section 4: longitude and latitude on WGS 84 if the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
-#: Property of features that are connections of tracks, no tracks (`railfix.track.network_read`).
+#: Property of features that are connections of tracks, not tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
-#: All properties of the feature of a line, and its id.
+#: All properties of a line's feature, and its id.
 _FEATURE: Final = "@feature"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
 def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_GeojsonLine]:
-    """Yield every LineString below a GeoJSON object, with the members that apply to it."""
+    """Yield every LineString below a GeoJSON object, with the members that apply to the line."""
     kind = node.get("type")
     own = {key: node[key] for key in _MEMBERS if key in node}
     if kind == "FeatureCollection":
@@ -91,7 +91,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name of one of several features: its own name, or its id."""
+    """Return the name of one of several features, or its id."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -205,7 +205,7 @@ def _without_geometry(document: dict[str, Any]) -> list[int]:
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Return the ways of the JSON of Overpass, which is not GeoJSON."""
+    """Return the ways of an Overpass JSON document, which is not GeoJSON."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
@@ -279,7 +279,7 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     place = _place(crs, latitude, longitude, path=table.path)
     geoid_m = table.numbers("geoid_m") if datum == "orthometric" and "geoid_m" in table else None
     above = None
-    if heights.any():  # heights that are all 0 are none, as in files of other formats
+    if heights.any():  # heights that are all 0 count as missing, as in files of other formats
         above = heights_of_file(
             heights, place, replace(reading, crs=None, height_datum=datum), path=table.path,
             geoid=table.metadata.get("geoid"), geoid_m=geoid_m,
@@ -297,7 +297,7 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
 
 
 def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColumns:
-    """Return the table with usual spellings of its columns under the names of railfix; the datum names the height."""
+    """Return the table with usual column names replaced by railfix names; the height column is named by the datum."""
     places = with_usual_names(table, ("latitude_deg", "longitude_deg"))
     named = with_usual_names(places, ("height_m",))
     theirs = named.usual.get("height_m")
@@ -385,7 +385,8 @@ def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = No
     """Write a track as CSV with ellipsoidal heights; a failed write leaves no file.
 
     Attributes without any value are omitted. The file reads back equal to the track within
-    1e-10 degrees and 0.1 mm. Standard deviations of each point, plan and height, shape (V, 2) [m], are columns more.
+    1e-10 degrees and 0.1 mm. Standard deviations of each point, plan and height, shape (V, 2) [m], are additional
+    columns.
 
     Raises
     ------
@@ -401,7 +402,7 @@ def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = No
     for column, (name, factor, _) in OPTIONAL_COLUMNS.items():
         values = getattr(track, name) / factor
         if not np.isnan(values).all():
-            unknown = "nan" if column == "radius_m" else ""  # blank is straight
+            unknown = "nan" if column == "radius_m" else ""  # a blank cell is straight track
             columns[column] = [unknown if np.isnan(v) else f"{v:.10g}" for v in values]
     if sigma_m is not None:
         columns |= {name: [f"{v:.3f}" for v in sigma_m[:, i]] for i, name in enumerate(SIGMA_COLUMNS)}

@@ -1,6 +1,6 @@
 """Quality checks of a track map: spacing, mid-chord deviation, kinks, duplicates, kilometrage, gradient, cant.
 
-A map error affects all satellites alike, so no screen of the observations detects it (P1 2.2(1), 4.1(3)).
+A map error affects all satellites alike, so observation screening cannot detect it (P1 2.2(1), 4.1(3)).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
-_LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere was meant to be in another unit [m].
+_COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this have errors of up to half of it [deg]: 0.6 m.
+_LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere is in another unit [m].
 _NEAR_DUPLICATE_M: Final = 0.10  #: Points nearer than this are the same point measured twice.
 _CURVED_1PM: Final = 1 / 3000  #: Curvature of less than this is straight [1/m].
-_ADVERSE_M: Final = 0.005  #: Cant of less than this has no side [m].
+_ADVERSE_M: Final = 0.005  #: The side of cant of less than this is not checked [m].
 _CENTIMETRE_M: Final = 0.01  #: Largest distance of a chord from its arc, from which `needed_spacing_m` follows [m].
 #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
 _KINK_DEG: Final = 3.0
@@ -41,7 +41,7 @@ class MapLimits(Settings):
 
     mid_chord_m: float = Field(default=0.30, gt=0)  #: Chord from arc at the middle of a segment (P1 4.1(3): 0.30 m).
     spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment (P1 2.2(1): some tens of metres on straight track).
-    #: A segment longer than this is a point that does not belong to the line, or a missing piece of it.
+    #: A longer segment indicates a point that does not belong to the line, or a missing piece of the line.
     gap_m: float = Field(default=2000.0, gt=0)
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
     gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest segment.
@@ -174,7 +174,7 @@ def _runs(
     *,
     severity: Severity | None = None,
 ) -> Iterator[Finding]:
-    """Yield a finding of a fault for each range of neighbours of a mask over V points or V - 1 segments."""
+    """Yield a finding for each range of neighbours in a mask over V points or V - 1 segments."""
     usual, text = _FAULTS[fault]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     over = 1 if len(mask) == len(track) - 1 else 0
@@ -225,7 +225,7 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 
 
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
-    """Yield curves of negative cant: errors where all, or all to one side, have it; else warnings (turnouts)."""
+    """Yield curves with negative cant: errors if all curves, or all to one side, have it; else warnings (turnouts)."""
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))
     side = np.where(np.isnan(track.radius_m), of_points, of_map)

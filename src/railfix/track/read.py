@@ -47,19 +47,19 @@ def read_track(
     crs : str, optional
         Coordinate reference system of files without one, for example ``EPSG:6677``.
     height_datum : {"ellipsoidal", "orthometric"}, optional
-        For GeoJSON without one; for CSV the column name gives it.
+        Height datum of GeoJSON files that state none; in CSV files the column name states it.
     geoid : str, optional
         Geoid of orthometric heights: ``japan`` (JPGEO2024), ``gsigeo2011``, a pyproj grid or CRS.
     name : str, optional
-        Name of the route; by default that of the file, otherwise the file name.
+        Name of the route; by default the name in the file, otherwise the file name.
     max_gap_m : float [m]
         Widest gap between the ends of two segments.
     sigma_plan_m, sigma_height_m : float, optional [m]
-        Accuracy of the map; by default that of the file, else 0.30 m and 0.60 m (P1 4.1(3)).
+        Accuracy of the map; by default as stated in the file, else 0.30 m and 0.60 m (P1 4.1(3)).
     duplicates : {"merge", "keep"}
         Equal consecutive points become one, with a note, or are kept for `railfix.track.check_track`.
     heights : path, optional
-        Second source of the heights of a map that has none; see `railfix.track.height_source.with_heights`.
+        Source of heights for a map without heights; see `railfix.track.height_source.with_heights`.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def track_of_segments(
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """Join segments to a track, with heights from a second source where they have none; see `read_track`."""
+    """Join segments to a track, with heights from a second source if they lack heights; see `read_track`."""
     check_heights(segments, heights, geoid=geoid, height_datum=height_datum, sigma_height_m=sigma_height_m)
     track = join(
         [replace(s, height_m=np.zeros(len(s.height_m))) if s.height_datum == NO_HEIGHTS else s for s in segments],
@@ -153,7 +153,7 @@ def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _without_repeated(segment: Segment, reading: MapReading) -> Segment:
-    """Return a segment without points that repeat the one before; InputFileError where fewer than two are left."""
+    """Return a segment without repeated consecutive points; InputFileError if fewer than two points are left."""
     points = np.stack([segment.latitude_deg, segment.longitude_deg, np.nan_to_num(segment.height_m)])
     new = np.concatenate([[True], (np.diff(points) != 0.0).any(axis=0)])
     if new.sum() < 2:
@@ -173,7 +173,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with an accuracy in plan that is valid for all, including the transformation from its datum."""
+    """Return a segment with an accuracy in plan that includes the transformation from its datum."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

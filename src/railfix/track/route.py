@@ -40,7 +40,7 @@ class MapOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class MapReading:
-    """Options for reading a map file: those of `railfix.track.read_track` of the same names."""
+    """Options for reading a map file, as the arguments of `railfix.track.read_track` of the same names."""
 
     crs: str | None = None
     height_datum: str | None = None
@@ -70,7 +70,7 @@ class Segment:
     geoid: str
     metadata: dict[str, str]  #: Name, accuracy and origin, where the file has them.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates here.
-    #: Standard deviations of their transformations, in addition to the map's own accuracy [m]; NaN if unknown.
+    #: Standard deviations of the coordinates' transformations, in addition to the map's accuracy [m]; NaN if unknown.
     datum_plan_m: float = 0.0
     datum_height_m: float = 0.0
     notes: tuple[str, ...] = ()
@@ -120,12 +120,12 @@ def _ends(segments: Sequence[Segment]) -> Floats:
     return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
 
 
-#: Fraction of the points at which a line of trains may turn back, as it does where they reverse.
+#: Largest fraction of points at which a line may turn back, as where trains reverse.
 _MOST_BACK: Final = 0.05
 
 
 def check_order(segments: Iterable[Segment]) -> None:
-    """Raise InputFileError where the points of a segment are not in their order along a line."""
+    """Raise InputFileError if the points of a segment are not in order along a line."""
     for segment in segments:
         points = ecef_from_geodetic(segment.latitude_deg, segment.longitude_deg, np.zeros(len(segment.latitude_deg)))
         steps = np.diff(points, axis=0)
@@ -139,7 +139,7 @@ def check_order(segments: Iterable[Segment]) -> None:
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Orient segments in the order of the route so that each begins, within `max_gap_m`, where the last ends."""
+    """Orient segments in route order so that each begins, within `max_gap_m`, where the previous one ends."""
     gap = first_gap(segments, max_gap_m=max_gap_m)
     if gap is not None:
         k, size = gap
@@ -154,7 +154,7 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
 
 
 def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
-    """Whether each segment, of ends of shape (n, 2, 3), must be reversed to begin at the end of the previous one."""
+    """Return whether each segment, with ends (n, 2, 3), must be reversed to begin at the previous segment's end."""
     turned = [False] * len(ends)
     if len(ends) > 1:
         distance = np.linalg.norm(ends[0][:, None] - ends[1][None, :], axis=-1).min(axis=1)
@@ -234,8 +234,9 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the worst accuracy of the pieces: as stated by the files, or the default of P1 4.1(3), with that of the
-    transformation from their datum.
+    """Return the worst accuracy of the pieces, as stated by the files, or the default of P1 4.1(3).
+
+    It includes the accuracy of the transformation from their datum.
     """
     sigmas: list[float] = []
     for piece in pieces:

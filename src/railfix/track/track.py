@@ -1,7 +1,7 @@
 """3-D centreline of a railway line with curve attributes (P1 2.2(1), 4.1(3)).
 
 Right is positive: seen in the direction of rising chainage, a curve to the right has a positive radius. Cant is the
-height of the outer rail above the inner one. The height of a point is that of the middle between the rail tops.
+height of the outer rail above the inner one. The height of a point is at the middle between the rail tops.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.notebook import NotebookTable, plural
 
 SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
-SIGMA_HEIGHT_M = 0.60  #: Standard deviation of its height [m]: about twice the plan's (P1 4.1(3)).
+SIGMA_HEIGHT_M = 0.60  #: Standard deviation of this centreline's height [m]: about twice that in plan (P1 4.1(3)).
 #: Note on a section that is joined against the order of its points, after its name.
 BACKWARDS = "is used against the order of its points"
-UNNAMED = "not named (WGS 84 assumed)"  #: Name of the reference system of a map that names none.
+UNNAMED = "not named (WGS 84 assumed)"  #: Reference system of a map that does not name any.
 #: Kilometrage has a break where it differs by more than this and a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Ellipsoidal heights of railways, tunnels below the sea included [m].
-ANOTHER_PLACE_M = 100_000.0  #: A log farther from a map than this is of another location [m].
+ANOTHER_PLACE_M = 100_000.0  #: A log farther from a map than this is at another location [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +35,11 @@ class Provenance:
     files: tuple[str, ...] = ()
     crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` where none is named.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
-    #: ``"ellipsoidal"`` or ``"orthometric"``; the former empty where none was given.
+    #: ``"ellipsoidal"`` or ``"orthometric"``; the height datum is empty if none was given.
     height_datum_asked: str = ""
     height_datum_used: str = "ellipsoidal"
-    geoid: str = ""  #: Geoid model that turned orthometric into ellipsoidal heights; empty where none was needed.
-    notes: tuple[str, ...] = ()  #: Remarks that every result computed with this map must carry.
+    geoid: str = ""  #: Geoid model used to convert orthometric to ellipsoidal heights; empty where none was needed.
+    notes: tuple[str, ...] = ()  #: Notes that every result computed with this map must contain.
 
 
 class TrackFields(TypedDict, total=False):
@@ -154,7 +154,7 @@ class Track(NotebookTable):
 
 
 def section_spans(track: Track) -> list[tuple[float, float]]:
-    """Return the chainages of the beginning and the end of each section; falling where a section is run backwards."""
+    """Return the chainages of each section's beginning and end; decreasing if the section is passed backwards."""
     ends = [0.0, *track.chainage_m[np.flatnonzero(np.diff(track.section, append=len(track.sections)))].tolist()]
     backwards = [f"{source} {BACKWARDS}" in track.provenance.notes for source in track.sections]
     spans = zip(ends[:-1], ends[1:], backwards, strict=True)
@@ -167,15 +167,15 @@ def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
 
 
 def _jumps(length_m: Floats, change_m: Floats) -> Masks:
-    """Flag segments whose change of the kilometrage is not their length, any shape."""
+    """Flag segments whose change of kilometrage differs from their length, any shape."""
     return np.asarray(np.abs(np.abs(change_m) - length_m) > KILOMETRAGE_BREAK_M + 0.05 * length_m)
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """Interpolate the kilometrage at chainages of any shape; NaN where the nearer point has none, and for NaN.
+    """Interpolate the kilometrage at chainages of any shape; NaN if the nearer point has none, and for NaN.
 
-    Linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is extrapolated in its
-    own direction, never interpolated across the jump.
+    It is linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is extrapolated
+    in its own direction, never interpolated across the jump.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2

@@ -1,4 +1,4 @@
-"""Trajectory of an antenna, a polyline in ECEF to which its position is constrained, and nearest points of it."""
+"""Trajectory of an antenna, a polyline in ECEF to which its position is constrained, and nearest-point search."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from railfix.core.geodesy import axes_at
 from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
-_FIRST_CANDIDATES = 6  #: Samples examined in the first round; four times as many for positions not yet proven.
-_CHUNK = 2_000_000  #: Positions times candidates processed at once.
+#: Samples examined in the first round; four times as many for positions without a proven nearest point.
+_FIRST_CANDIDATES = 6
+_CHUNK = 2_000_000  #: Number of positions times candidates processed at once.
 
 
 def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
@@ -71,7 +72,7 @@ class NearestOnPolyline:
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Find the best among the segments of the nearest samples, and whether no other can be better."""
+        """Find the best of the nearest samples' segments, and whether no other segment can be better."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
@@ -82,19 +83,19 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Return the nearest of some segments (n, C) to each point (n, 3), the position on it and the distance."""
+    """Return the nearest of given segments (n, C) to each point (n, 3), the position on it and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
-    # independent of the order of the tree that has named the segments
+    # independent of the order in which the tree returns the segments
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
     row, column = np.arange(len(points_m)), place.argmin(axis=1)
     return segment[row, column], share[row, column], best
 
 
-#: A line continues where its end comes this close to another part of it [m]: no other track is as near.
+#: Largest distance of a line's end from another part at which the line is closed [m]: no other track is as near.
 _CLOSED_M: Final = 3.0
-_SAME_WAY: Final = 0.9  #: In the same direction: cosine of the angle between them.
-_END_M: Final = 100.0  #: Positions this near along the line are the end itself [m].
+_SAME_WAY: Final = 0.9  #: Cosine of the largest angle between parts in the same direction.
+_END_M: Final = 100.0  #: Positions within this distance along the line belong to the end itself [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
@@ -105,7 +106,7 @@ def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Arc length of the nearest other part of the line to one of its ends, in the same direction; NaN without."""
+    """Return the arc length of the nearest other part to an end of the line, in the same direction; NaN without one."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -128,27 +129,29 @@ class Trajectory(FrozenArrays, NotebookTable):
     Right is positive across the path, in the direction of rising chainage.
     """
 
-    name: str  #: Positions of the antenna, or of the track used as its path.
+    name: str  #: Name of the antenna, or of the track used as its path.
     ecef_m: Floats  #: Shape (V, 3).
     chainage_m: Floats  #: Chainage of the track at the reference point, strictly rising, shape (V,).
-    kilometrage_m: Floats  #: Kilometrage there; NaN where the map has none; shape (V,).
-    cant_m: Floats  #: Cant of the track there; NaN where the map has none; shape (V,).
+    kilometrage_m: Floats  #: Kilometrage at the reference point; NaN where the map has none; shape (V,).
+    cant_m: Floats  #: Cant of the track at the reference point; NaN where the map has none; shape (V,).
     #: Roll of the car body, positive to the right; 0 where the track is used as the path; shape (V,).
     roll_deg: Floats
     reference: str = "antenna"  #: Point of the vehicle to which `chainage_m` refers.
-    #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising: it relates the
-    #: positions of two antennas of one vehicle. None without a vehicle; shape (V,).
+    #: Chainage of the middle between the bogies with the antenna at the point, strictly rising; it relates the
+    #: positions of a vehicle's two antennas. None without a vehicle; shape (V,).
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
-    antenna_ahead_m: float = 0.0  #: Antenna ahead of the middle between the bogies, toward the vehicle's front.
-    #: Front end of the vehicle ahead of the middle between its bogies, and its rear end behind it; None where unknown.
+    #: Distance of the antenna ahead of the middle between the bogies, toward the vehicle's front.
+    antenna_ahead_m: float = 0.0
+    #: Distances of the vehicle's front end ahead of the middle between its bogies, and of its rear end behind the
+    #: middle; None where unknown.
     front_end_m: float | None = None
     rear_end_m: float | None = None
     #: Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map, included in the solution.
     sigma_height_m: float = SIGMA_HEIGHT_M
-    notes: tuple[str, ...] = ()  #: Remarks that every result must carry.
+    notes: tuple[str, ...] = ()  #: Notes that every result must contain.
 
     def __post_init__(self) -> None:
         points = len(self.ecef_m)
@@ -170,7 +173,7 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @classmethod
     def from_antenna_path(cls, track: Track) -> Trajectory:
-        """Create a trajectory from a map of the antenna's own path, as of a survey; `notes` records it.
+        """Create a trajectory from a map of the antenna's own path, as from a survey; `notes` records this.
 
         The antenna of a train is above the track and swings out in curves: `antenna_trajectory` computes its path.
         """
@@ -205,7 +208,7 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @cached_property
     def turn_m(self) -> float:
-        """Once round a closed line [m]; infinite for others."""
+        """Length of one turn of a closed line [m]; infinite for an open line."""
         before, after = self.joins_m
         turns = (self.arc_m[-1] - after, before - self.arc_m[0])
         return float(np.nan_to_num(np.fmin(*turns), nan=np.inf))
@@ -264,8 +267,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
         """Find the segment of each arc length, any shape, and the distance along it [m].
 
-        A point shared by two segments belongs to the later one. Before the start it is the first, with a negative
-        distance; beyond the end and for NaN the last, with NaN for NaN.
+        A point shared by two segments belongs to the later one. Before the start the first segment is returned, with a
+        negative distance; beyond the end and for NaN the last segment, with a NaN distance for NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)
@@ -285,13 +288,13 @@ class Trajectory(FrozenArrays, NotebookTable):
         return self._interpolate(arc_m, self.chainage_m)
 
     def body_at(self, arc_m: ArrayLike) -> Floats:
-        """Chainage of the vehicle's middle for arc lengths of the antenna [m]; NaN without vehicle or off the path."""
+        """Return chainages of the vehicle's middle at antenna arc lengths; NaN without vehicle or off the path [m]."""
         if self.body_chainage_m is None:
             return np.full(np.shape(arc_m), np.nan)
         return self._interpolate(arc_m, self.body_chainage_m)
 
     def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
-        """Arc length of the antenna for chainages of the vehicle's middle [m]; NaN without vehicle or off the path."""
+        """Return antenna arc lengths at chainages of the vehicle's middle; NaN without vehicle or off the path [m]."""
         if self.body_chainage_m is None:
             return np.full(np.shape(body_chainage_m), np.nan)
         return np.interp(
@@ -313,8 +316,8 @@ class Trajectory(FrozenArrays, NotebookTable):
         """Find the nearest point of the trajectory to each position (n, 3): its arc length and its distance, shapes
         (n,) [m].
 
-        Exact over all segments: a k-d tree gives the candidates, and a bound excludes all others. Of two equally near
-        points the one of smaller arc length; NaN where the position is NaN.
+        The search is exact over all segments: a k-d tree gives the candidates, and a bound excludes all others. Of two
+        equally near points the one with the smaller arc length is returned; NaN where the position is NaN.
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where no segment was found
@@ -328,9 +331,9 @@ class Passes(NamedTuple):
     #: Distance of the position along the segment's straight line from its start, and of the segment's nearest point.
     along_m: Floats
     foot_m: Floats
-    offset_m: Floats  #: From that point to the position, shape (P, 3).
-    lowest: Masks  #: No neighbouring segment comes nearer: the line passes the position here.
-    again: Masks  #: As near as the previous segment: at the point between the two.
+    offset_m: Floats  #: Vector from that point to the position, shape (P, 3).
+    lowest: Masks  #: Whether no neighbouring segment is nearer: the line passes the position here.
+    again: Masks  #: Whether the previous segment is equally near, at the point between the two.
 
 
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:

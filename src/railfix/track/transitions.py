@@ -1,4 +1,4 @@
-"""Transition curves in plan that are given by ordinates over the tangent: cubic parabolas and the half-sine.
+"""Transition curves in plan defined by ordinates over the tangent: cubic parabolas and the half-sine.
 
 With x along the tangent from the straight end, X the length on the tangent and R the radius at the other end:
 
@@ -21,13 +21,13 @@ from railfix.core.arrays import Floats
 Shape = Literal["cubic", "half-sine"]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _PIECES: Final = 16  #: Pieces of the quadrature of the length; 12 nodes each are exact to rounding.
-_ROUNDS: Final = 30  #: Steps of the fixed points below, which converge within ten.
+_ROUNDS: Final = 30  #: Number of the fixed-point iterations below, which converge within ten.
 _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: y R / X^2 at the end of a half-sine.
 
 
 @dataclass(frozen=True, kw_only=True)
 class OrdinateElement:
-    """One transition between straight and curve, with ordinates over the tangent at its straight end."""
+    """Transition between straight and curve, with ordinates over the tangent at its straight end."""
 
     #: First point, easting and northing.
     x_m: float
@@ -52,7 +52,7 @@ class OrdinateElement:
 
     @cached_property
     def _knots(self) -> tuple[Floats, Floats]:
-        """Abscissae on the tangent and the lengths of the curve to them."""
+        """Abscissae on the tangent and the curve lengths up to them."""
         x = np.linspace(0.0, self.tangent_m, _PIECES + 1)
         return x, np.concatenate([[0.0], np.cumsum(self._length_between(x[:-1], x[1:]))])
 
@@ -112,7 +112,7 @@ class OrdinateElement:
 def cubic_of_length(
     *, x_m: float, y_m: float, direction_rad: float, first: float, last: float, length_m: float, variant: str
 ) -> OrdinateElement:
-    """Return a cubic parabola of a length of the curve: ``"length"`` (IFC), ``"tangent"`` or ``"corrected"``."""
+    """Return a cubic parabola of a given curve length: ``"length"`` (IFC), ``"tangent"`` or ``"corrected"``."""
     into = first == 0.0
     curvature = last if into else -first
     tangent = length_m

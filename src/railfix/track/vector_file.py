@@ -1,6 +1,6 @@
 """Lines of map files of geographic information systems, including OpenStreetMap, read through GDAL by `pyogrio`.
 
-OpenStreetMap's ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
+OpenStreetMap ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
 write the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class
 (`fclass` of Geofabrik's shapefiles), and the id in a dozen forms.
 """
@@ -29,7 +29,7 @@ from railfix.track.georeference import georeference
 from railfix.track.heights import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 
-#: Standard deviation in plan of a track of OpenStreetMap, drawn from aerial pictures, if its file has none [m].
+#: Standard deviation in plan of an OpenStreetMap track, drawn from aerial images, if its file states none [m].
 SIGMA_M: Final = 2.0
 ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Origin of a segment, in its metadata.
 #: Values of the tag railway that are tracks on which trains run.
@@ -40,21 +40,23 @@ _OTHERS: Final = (
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
     "turntable", "yard",
 )  # fmt: skip
-#: Columns of the id of a feature; those that only exporters of OpenStreetMap write come first.
+#: Columns of a feature's id; columns that only OpenStreetMap exporters write are first.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
 _ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
-CROSSING: Final = "x"  #: Begins the id of a node at which tracks cross without a connection.
+CROSSING: Final = "x"  #: Prefix of the id of a node at which tracks cross without a connection.
 _LEFT_OUT: Final = "@left out"  #: Reason for leaving out a way, besides its tags.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """A way of an own file: id, tags, points of shape (n, 2), longitude and latitude [deg], and the ids of its nodes,
-    empty where the file has none; those at which tracks cross without a connection begin with `CROSSING`.
+    """Way of an OpenStreetMap file: id, tags, points of shape (n, 2), longitude and latitude [deg], and node ids.
+
+    Node ids are empty if the file has none; ids of nodes at which tracks cross without a connection begin with
+    `CROSSING`.
     """
 
     row: dict[str, Any]
@@ -83,7 +85,7 @@ def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
-    """Return whether a feature is one of OpenStreetMap, by its id or kind."""
+    """Return whether a feature is from OpenStreetMap, by its id or kind."""
     names = (str(row.get(key) or "") for key in ("@id", "id"))
     of_id = any(row.get(key) is not None for key in _IDS[:4])
     of_kind = any(row.get(key) in ("way", "relation") for key in _KINDS)
@@ -91,7 +93,7 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Return why a feature is not a track: for OpenStreetMap those not tagged as active railways; empty for tracks."""
+    """Return why a feature is not a track: for OpenStreetMap if not tagged as an active railway; empty for tracks."""
     if row.get(_LEFT_OUT):
         return str(row[_LEFT_OUT])
     railway = get_tags(row).get("railway")
@@ -125,7 +127,7 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Segments of a file, the first with a note on its lines that are not tracks; InputFileError where none is left."""
+    """Return a file's segments, the first with a note on lines that are not tracks; InputFileError if none is left."""
     left_out = ", ".join(f"{n} {why}" for why, n in reasons.items())
     note = f"{path}: lines left out that are no tracks: {left_out}"
     if not segments:
@@ -198,7 +200,7 @@ def _ways(
     nodes: Mapping[str, tuple[float, float]],
     crossings: Set[str],
 ) -> list[Way]:
-    """Ways with their points, in parts where some points are outside the extract; ways without two points are left out.
+    """Return ways with their points, in parts if points are outside the extract; ways without two points are left out.
 
     InputFileError: no way has two points.
     """
@@ -224,7 +226,7 @@ _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: C
 
 
 def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
-    """Read CRS, properties and geometries of all features of a kind ("LineString", "none": any), an entry a layer."""
+    """Read CRS, properties and geometries of features of a kind ("LineString", "none": any), one entry per layer."""
     with needs_extra(f"{path}: {KIND_WORDS[find_kind(path)]}"):
         import pyogrio
         import shapely
@@ -242,7 +244,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
             if blob is None and geometry != "none":
                 continue
             size = len(values[0]) if len(values) else 0
-            with np.errstate(invalid="ignore"):  # of NaN, which is rejected later
+            with np.errstate(invalid="ignore"):  # NaN is rejected later
                 shapes = np.full(size, None) if blob is None else np.asarray(shapely.from_wkb(blob), dtype=object)
             usable = [k for k, s in enumerate(shapes) if geometry == "none" or (s and s.geom_type.endswith(geometry))]
             fields = [str(name) for name in meta["fields"]]
@@ -255,7 +257,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
 
 
 def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a map file as segments; CRS, height datum and geoid are for files that name none."""
+    """Read the lines of a map file as segments; CRS, height datum and geoid apply to files that name none."""
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()

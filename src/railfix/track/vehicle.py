@@ -55,7 +55,7 @@ class Vehicle(Settings):
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
     #: Length over the ends (buffers or couplers); None where unknown.
     length_m: float | None = Field(default=None, gt=0.0, le=1000.0)
-    #: Front end ahead of the middle between the bogies; None: half of `length_m`.
+    #: Distance of the front end ahead of the middle between the bogies; None: half of `length_m`.
     front_end_m: float | None = Field(default=None, ge=0.0, le=1000.0)
     antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)  #: Offsets by name.
 
@@ -68,7 +68,7 @@ class Vehicle(Settings):
     def ends_m(self) -> tuple[float | None, float | None]:
         """Distances of the front end ahead of the middle between the bogies, and of the rear end behind it [m].
 
-        None where they are unknown.
+        The values are None where unknown.
         """
         if self.length_m is None:
             return self.front_end_m, None
@@ -85,7 +85,7 @@ class Vehicle(Settings):
 def read_vehicle(path: FilePath) -> Vehicle:
     """Read a vehicle file (TOML).
 
-    InputFileError: no such file, or not TOML. SettingsError: a key is unknown, missing or out of range.
+    InputFileError: the file does not exist or is not TOML. SettingsError: a key is unknown, missing or out of range.
     """
     return load_settings(Vehicle, path, what="a vehicle file")
 
@@ -126,7 +126,7 @@ class _VehicleLine:
 
     @property
     def open_ends(self) -> tuple[bool, bool]:
-        """Whether the line does not continue before its start, after its end."""
+        """Return whether the line is open at its start, and at its end."""
         return bool(np.isnan(self.joins[0])), bool(np.isnan(self.joins[1]))
 
     def at(self, chainage: Floats) -> Floats:
@@ -147,7 +147,7 @@ class _VehicleLine:
         return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
-        """Return the roll by cant, shape (n,) [rad]; beyond an open end that of the end."""
+        """Return the roll by cant, shape (n,) [rad]; beyond an open end the roll at the end."""
         before, after = self.joins
         last = self.chainage[-1]
         open_start, open_end = self.open_ends
@@ -248,7 +248,7 @@ def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> F
 
 
 def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
-    """Choose chainages of the body's middle: the points of the track, and more where the path bends between them."""
+    """Choose chainages of the body's middle: at the track's points, and more where the path bends between them."""
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
     if not last - first > 0.0:
@@ -301,7 +301,7 @@ def antenna_trajectory(
     rolls by ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean
     of the two (P1 3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the
     vertical rotated by the roll. The path begins and ends where a bogie reaches the end of the track; on a closed
-    track where the body's middle does, so that it is closed too.
+    track, where the body's middle reaches its end, so that the path is closed too.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""XML files of alignments (LandXML) and track centrelines of railML 3, and topology of the ERA RINF as RDF.
+"""XML files of alignments (LandXML) and railML 3 track centrelines, and ERA RINF topology as RDF.
 
-Its ontology (http://data.europa.eu/949/, version 3) has each `LinearElement` with its geometry (GeoSPARQL, WKT) and a
-`NetRelation` for each pair of ends that meet, as railML 3 has.
+The RINF ontology (http://data.europa.eu/949/, version 3) has each `LinearElement` with its geometry (GeoSPARQL, WKT)
+and a `NetRelation` for each pair of ends that meet, as in railML 3.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Relation:
-    """Connection of two net elements as railML 3 and RailTopoModel have it."""
+    """Connection of two net elements as in railML 3 and RailTopoModel."""
 
     #: Names of the elements.
     first: str
@@ -36,11 +36,11 @@ class Relation:
     #: 0 for the start of the element, 1 for its end.
     first_end: int
     second_end: int
-    navigable: bool  #: Whether trains pass from one to the other.
+    navigable: bool  #: Whether trains can pass from one element to the other.
 
 
 def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a LandXML or railML 3 file as segments; InputFileError when it is neither, or has no line."""
+    """Read the lines of a LandXML or railML 3 file as segments; InputFileError if it is neither, or has no line."""
     root = read_root(path)
     kind = tag(root)
     if kind == "LandXML":
@@ -121,13 +121,13 @@ _ERA: Final = "http://data.europa.eu/949/"
 _GEO: Final = "http://www.opengis.net/ont/geosparql#"
 _LABEL: Final = "http://www.w3.org/2000/01/rdf-schema#label"
 _TYPE: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type"
-#: A line in WKT, with the CRS that GeoSPARQL puts before it.
+#: WKT line, preceded by its CRS in GeoSPARQL.
 _WKT: Final = re.compile(r"\s*(?:<(?P<crs>[^>]+)>)?\s*LINESTRING\s*Z?\s*\((?P<points>[^)]*)\)\s*", re.IGNORECASE)
 _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the linear elements that have a geometry as segments; InputFileError where none exists."""
+    """Read the linear elements with a geometry as segments; InputFileError if there are none."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [
@@ -152,7 +152,7 @@ def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def read_rinf_relations(path: FilePath) -> list[Relation]:
-    """Read the net relations of the register; navigability None joins two ends that no train passes between."""
+    """Read the net relations of the register; a navigability of None joins two ends without a passage for trains."""
     graph, relations = _graph(path), []
     for item in _all(graph, "NetRelation"):
         found = {key: _values(graph, item, _ERA + key) for key in (
@@ -190,7 +190,7 @@ def _parse(path: str, _: str) -> Graph:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of rdflib's own classes
             return Graph().parse(data=data, format=name)
-    except Exception as error:  # noqa: BLE001 - each of rdflib's parsers has its own
+    except Exception as error:  # noqa: BLE001 - each rdflib parser raises its own errors
         raise InputFileError(path, f"this is no {name} ({str(error).splitlines()[0]})") from None
 
 
@@ -207,6 +207,6 @@ def _values(graph: Graph, subject: Any, predicate: str) -> list[Any]:
 
 
 def _name(graph: Graph, subject: Any) -> str:
-    """Label of a resource, otherwise the last part of its address."""
+    """Return the label of a resource, otherwise the last part of its address."""
     labels = _values(graph, subject, _LABEL)
     return str(labels[0]) if labels else re.split(r"[/#]", str(subject))[-1]

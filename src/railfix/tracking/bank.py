@@ -22,7 +22,7 @@ from railfix.tracking.limits import TrackingLimits
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Time from a constellation fault to the alert of users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: Sources whose probabilities sum to less than this fraction of the risk need no sub-filter.
+#: A kind needs no sub-filters if the probabilities of so many sources of it sum to less than this fraction of the risk.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
 #: Risk of the speed bound as a fraction of the risk of the position level.

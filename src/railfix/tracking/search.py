@@ -258,7 +258,7 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
-    # A hypothesis less probable than a new one at its position has drifted from the position implied by codes.
+    # A hypothesis less probable than a new one has drifted from the position at which codes would start it.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)

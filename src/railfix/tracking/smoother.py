@@ -140,7 +140,7 @@ def smooth_steps(
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return the vector and matrix for another set of satellites; satellites no longer in the state are dropped."""
+    """Return the vector and matrix for another set of satellites; 0 for satellites no longer in the later state."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

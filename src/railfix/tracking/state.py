@@ -29,7 +29,7 @@ class Monitors:
     #: Mean of the position shifts that codes imply over the last epochs, in standard deviations, and its variance.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0
-    #: Log ratio of the variance of map lengths to its limit, at least 0.
+    #: Log ratio of the variance of map lengths to the assumed one, at least 0.
     map_log_variance: float = 0.0
     #: Cumulative sum of the contradictions of the velocity, along and across (`railfix.kernels.tracking.monitors`).
     contradiction: float = 0.0

@@ -318,7 +318,7 @@ def _state(
     place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
     rotated = np.stack(_rotate_axes(EARTH_ROTATION_RATE * since[..., None], place))
     own = seconds(time - nodes[begin]) + offset_s
-    difference = since[:, None] - since[None]  # difference of each node from the others of its window
+    difference = since[:, None] - since[None]  # difference of each node from the other nodes of its window
     difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
     weight, slope = _lagrange_at_zero(since[:, which] - own, difference.prod(axis=1)[:, which])
     chosen = rotated[:, :, which, column]

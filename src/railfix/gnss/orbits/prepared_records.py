@@ -1,11 +1,11 @@
 """Selection of the navigation record of a satellite at an epoch; lookups and orbit elements, computed once and cached.
 
 The newest record transmitted before the epoch is selected. A record without a transmission time counts as transmitted
-half-way between its own reference time and that of the previous record. Where the newest record is outside its validity
+half-way between its own and the previous record's reference time. Where the newest record is outside its validity
 (expired while an older one is still valid, or transmitted long before its validity begins), or where all records were
 transmitted after the epoch (a file that begins later than the log), the record with the nearest reference time is
-selected if it is valid, and flagged if it had not been transmitted yet. Health is that of the selected record: an older
-healthy record does not override it.
+selected if it is valid, and flagged if it had not been transmitted yet. Health is taken from the selected record: an
+older healthy record does not override it.
 """
 
 from __future__ import annotations

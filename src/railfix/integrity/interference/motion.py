@@ -89,7 +89,7 @@ class MotionSigns:
 
 
 class MotionFit(NamedTuple):
-    """Fits of the ranges of T epochs of one antenna, without other data."""
+    """Fits of the ranges of T epochs, whatever their antenna, without other data."""
 
     fixes: Fix
     part_sigmas: Floats  #: Field of `MotionSigns`.

@@ -63,7 +63,8 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     Satellites flagged as wrong are fitted too, since a time-tag error makes satellites appear wrong. Where the error is
     significant, or a position is in doubt, the line is used as a constraint. The standard deviation is infinite unless
     redundant rows agree and the cost is clearly lower than without a time-tag error and without the flagged satellites.
-    The cost is the sum of squares of all codes and of the line, each clipped at `_AGREES`.
+    The cost is the sum of squares of the normalised residuals of all codes and of the line, each residual clipped at
+    `_AGREES`.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)

@@ -35,7 +35,7 @@ class WheelSamples(RowArrays):
     distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start.
     #: Largest distance that the wheel may have rolled below its minimum speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Distance rolled without slip or gap.
+    #: Number of the part, a distance rolled without slip or gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 

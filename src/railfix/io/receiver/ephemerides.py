@@ -2,7 +2,7 @@
 
 A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
 B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` combines the subframes of a piece of a stream with
-those left by earlier pieces, so that records do not depend on how a stream is cut.
+those left by earlier pieces, so that records do not depend on the division of a stream.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame in which its strings 1 to 4 come.
-_EPOCH_BEFORE_S: Final = 5.0  #: Longest time from the last epoch to the string that counts as received then.
+_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which its strings 1 to 4 are sent.
+_EPOCH_BEFORE_S: Final = 5.0  #: Longest time from the last epoch to a string that counts as received at that epoch.
 #: Time from one GLONASS frame to the next.
 _FRAME_S: Final = 30.0
 
@@ -78,7 +78,7 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides that a piece completes, and the new state; `time` is before, `after` after each."""
+    """Return the ephemerides completed by a piece, and the new state; `time` is before each, `after` after each."""
     builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     pages, counts = decode_pages(subframes)
@@ -128,7 +128,7 @@ def assemble_navigation(parts: Assembled, *, sources: tuple[str, ...] = ()) -> N
 
 
 class _EphemerisBuilder:
-    """Latest subframes of all satellites, and the records they complete."""
+    """Latest subframes of all satellites, and the records completed by them."""
 
     def __init__(self, state: Unfinished) -> None:
         self.latest, self.issued, self.waiting = dict(state.latest), dict(state.issued), dict(state.waiting)
@@ -160,11 +160,11 @@ class _EphemerisBuilder:
         return records, Unfinished(latest=self.latest, issued=self.issued, waiting=self.waiting)
 
     def add(self, satellite: str, number: int, values: Values, time: np.datetime64, after: np.datetime64) -> None:
-        """Take one subframe between two epochs; a record it completes is appended."""
+        """Add one subframe between two epochs; a record that it completes is appended."""
         letter = satellite[0]
         if letter == "R":
             self.waiting.pop(satellite, None)
-            if number == 1:  # strings before it are of another frame
+            if number == 1:  # strings before it belong to another frame
                 for k in (2, 3, 4):
                     self.latest.pop((satellite, k), None)
         self.latest[satellite, number] = {**values, "received": float(time.astype(np.int64))}
@@ -299,7 +299,7 @@ class _EphemerisBuilder:
         if self.needs_date(satellite, time):
             return None
         # All strings are of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1
-        # may have come before the receiver's first epoch, so that its time of reception is not known; where epochs are
+        # may have come before the receiver's first epoch, so that its time of reception is unknown; where epochs are
         # lost or rare, the first one after all strings shows that no later frame can have begun.
         began = frame_time(parts[0], time)
         if within is None:

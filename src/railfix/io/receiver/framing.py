@@ -18,7 +18,7 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.checksums import crc24q
 from railfix.core.files import FilePath, open_stream
 
-#: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
+#: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers send less than 16 KiB.
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
@@ -42,8 +42,8 @@ class Frames:
     #: to the frame); shape (N,).
     start: Indices
     end: Indices
-    frame_start: Indices  #: First byte of the frame, its sync included; shape (N,).
-    consumed: int  #: Bytes of the buffer that are dealt with; the rest may be the start of a frame.
+    frame_start: Indices  #: Offset of the first byte of the frame, sync included; shape (N,).
+    consumed: int  #: Number of processed bytes of the buffer; the rest may be the start of a frame.
     skipped_bytes: int  #: Bytes outside frames among these.
     bad_checksums: int  #: Complete candidates (sync and length plausible) outside frames whose checksum failed.
 
@@ -126,7 +126,7 @@ def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
 
 
 def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
-    """Return the valid candidates, earliest first, that do not lie inside one accepted before."""
+    """Return the valid candidates, earliest first, that do not lie inside a previously accepted one."""
     accepted, free = [], 0
     for k in np.flatnonzero(valid).tolist():
         if start[k] >= free:
@@ -219,7 +219,7 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     valid[complete] = (sums[stop] ^ sums[first]) == (_HEX[data[stop + 1]] << 4 | _HEX[data[stop + 2]])
     line_end = end + 3 + (_at(data, end + 3) == ord("\r"))
     frame_end = line_end + (_at(data, line_end) == ord("\n"))
-    if not at_end:  # a sentence whose line may continue waits for the rest of it
+    if not at_end:  # a sentence whose line may continue waits for the rest of the line
         frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
@@ -285,7 +285,7 @@ def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class Subframes(RowArrays):
-    """Raw navigation words as UBX has them, N rows in the order of the stream."""
+    """Raw navigation words in the layout of UBX, N rows in the order of the stream."""
 
     satellite: Strings
     signal: Integers  #: Signal number (UBX sigId; other formats are translated to it); shape (N,).
@@ -313,13 +313,13 @@ SBAS_L5, BCNAV1_PAGE = -5, -6
 
 @dataclass(frozen=True, kw_only=True)
 class SbasFrames:
-    """SBAS messages as a receiver passes them on, N of them; parity and preamble not checked here."""
+    """N SBAS messages as output by a receiver; parity and preamble are not checked here."""
 
     #: 1 ns after the receiver's epoch before the message; NaT before the receiver knew the time; shape (N,).
     time: Datetimes
 
     prn: Integers
-    octets: Bytes  #: The 250 bits from the first preamble bit on, zero behind; shape (N, 32).
+    octets: Bytes  #: The 250 bits from the first preamble bit on, then zeros; shape (N, 32).
     on_l5: Masks  #: Sent on L5, not on L1; shape (N,).
 
     def __len__(self) -> int:

@@ -40,8 +40,8 @@ RF_STATUS: Final = 4092
 RECEIVER_STATUS: Final = 4014
 
 JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
-#: u-blox states that count: jamming is critical, spoofing is affirmed. State 2 (warning, indicated) was sent for 571 of
-#: 581 s of a recording without interference.
+#: u-blox states that are used: jamming is critical, spoofing is affirmed. State 2 (warning, indicated) was sent for 571
+#: of 581 s of a recording without interference.
 _CERTAIN: Final = 3
 #: Septentrio: a band with interference that is not cancelled.
 _NOT_MITIGATED: Final = 8
@@ -53,12 +53,12 @@ _NO_GAIN: Final = -128
 #: u-blox SEC-SIGLOG: bytes of an event, and how long a single trigger counts [s].
 _EVENT: Final = 8
 _TRIGGERED_S: Final = 10
-_SIMULATED: Final = 0  #: Kind of detection that is used; those of jamming begin with a warning, as in that recording.
+_SIMULATED: Final = 0  #: Kind of detection that is used; jamming detections begin with a warning, as in that recording.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Indicators:
-    """Last indicators of each kind of message so far: alarm bits, and the gain, NaN where none has it."""
+    """Last indicators of each kind of message so far: alarm bits, and the gain, NaN where no message has it."""
 
     alarm: Mapping[int, int] = field(default_factory=dict)
     gain: float = np.nan
@@ -99,7 +99,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _mon_rf(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming of any band, and the gain of the first."""
+    """Return the jamming state of any band, and the gain of the first band."""
     if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
         return None
     blocks = data[4:].reshape(-1, _BLOCK)
@@ -108,14 +108,14 @@ def _mon_rf(data: Bytes) -> tuple[int, float] | None:
 
 
 def _mon_hw(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming and gain of receivers up to the M8."""
+    """Return the jamming state and gain of receivers up to the M8."""
     if len(data) != _MON_HW_BYTES:
         return None
     return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
 
 
 def _sec_sig(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming and spoofing, each where its detection is on."""
+    """Return the jamming and spoofing states, each where its detection is on."""
     if len(data) >= 12 and data[0] == 1:
         jamming, spoofing = int(data[4]), int(data[8])
     elif len(data) >= 4 and data[0] == 2:
@@ -129,7 +129,7 @@ def _sec_sig(data: Bytes) -> tuple[int, float] | None:
 def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
     """Simulated signals that the log has begun and not ended, by the newest event, are spoofing.
 
-    Abnormal signals, contradictions of an inertial unit and abrupt changes do not count: tunnels make them.
+    Abnormal signals, contradictions of an inertial unit and abrupt changes are not used: tunnels cause them.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
@@ -140,7 +140,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the interference that is not cancelled; signals that mislead or are not authentic."""
+    """Return the uncancelled interference, and misleading or unauthentic signals."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -230,7 +230,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:
         unfinished = rtcm.find_unfinished_epoch(frames)
-        if unfinished is not None:  # the rest of its messages is still to come: kept for the next block
+        if unfinished is not None:  # the rest of its messages is in the next block, for which it is kept
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
     channels = rtcm.glonass_channels(frames, state.glonass_channels)
     msm, msm_places = rtcm.msm_measurements(frames, state.time, channels)
@@ -286,7 +286,7 @@ def _of_old_kinds(frames: Frames) -> dict[str, int]:
 
 
 def _places(frames: Frames, kind: str) -> Integers:
-    """Offsets of the messages of one kind with observations in the stream."""
+    """Offsets in the stream of the messages of one kind with observations."""
     chosen = {
         _RAWX: frames.of("ubx", ubx.RXM_RAWX),
         _MEAS_EPOCH: frames.of("sbf", sbf.MEAS_EPOCH),
@@ -316,14 +316,14 @@ class _Dated(NamedTuple):
     times: Datetimes
 
     def last_before(self, places: Integers, before: np.datetime64) -> Datetimes:
-        """Time of the last one before each offset of the stream; `before` for offsets before the first one here."""
+        """Time of the last epoch before each offset of the stream; `before` for offsets before the first epoch here."""
         if not len(self.times):
             return np.full(len(places), before, dtype="datetime64[ns]")
         index = np.searchsorted(self.places, places) - 1
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
     def first_after(self, places: Integers) -> Datetimes:
-        """Return the time of the first one after each offset of the stream; NaT where there is none."""
+        """Return the time of the first epoch after each offset of the stream; NaT where there is none."""
         times = np.append(self.times, np.datetime64("NaT", "ns"))
         return np.asarray(times[np.searchsorted(self.places, places)])
 
@@ -377,7 +377,7 @@ def scan_pieces(
                 return
 
 
-#: Date and ephemerides that are farther apart belong to different weeks.
+#: Date and ephemerides farther apart than this belong to different weeks.
 _SAME_WEEK: Final = np.timedelta64(5, "D")
 
 

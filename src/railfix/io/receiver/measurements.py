@@ -39,7 +39,7 @@ class Measurements:
     cn0_dbhz: Floats
     lock_s: Floats  #: Time that the phase has been tracked without a break (at least), shape (N,).
     half_cycle: Masks  #: Half a cycle is unresolved, shape (N,).
-    polarity: Integers  #: A change means a jump of half a cycle, shape (N,).
+    polarity: Integers  #: A change indicates a jump of half a cycle, shape (N,).
     glonass_channel: Integers  #: Frequency channel where the satellite is of GLONASS, shape (N,).
     leap_seconds: int | None = None
     receiver: str = ""
@@ -106,7 +106,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
 
 
 def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
-    """Return the values of the accepted epochs; those of a log without them."""
+    """Return the values of the accepted epochs; default values for a log without them."""
     kind = np.float64 if np.isnan(absent) else np.uint8
     return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
@@ -131,7 +131,7 @@ def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
 
 
 def slips(lock_s: Floats, polarity: Floats) -> Masks:
-    """Flag phases not continuous (T, M): lock time 0 or less than before, or changed polarity; NaN without phase."""
+    """Flag discontinuous phases (T, M): lock time 0 or less than before, or changed polarity; NaN without phase."""
     present = ~np.isnan(lock_s)
     epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
     last = np.concatenate([np.full((1, lock_s.shape[1]), -1), np.maximum.accumulate(epochs, axis=0)[:-1]])
@@ -179,7 +179,7 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-#: A record, and the key that distinguishes it from the satellite's next one.
+#: A record, and the key that distinguishes it from the satellite's next record.
 Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
@@ -287,7 +287,7 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
-    """Return when the GLONASS frame of a string 1 began, GPS time."""
+    """Return the start time of the GLONASS frame of a string 1, GPS time."""
     utc = gpst_to_utc(time)
     return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 
@@ -299,7 +299,7 @@ def _frame_s(values: Values) -> float:
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
     """Return the week of toe, and toc.
 
-    The broadcast week is that of the transmission: as it ends, toe is in the next one. RTCM 3 has no time of
+    The broadcast week is the week of transmission: at its end, toe is in the next week. RTCM 3 has no time of
     transmission; it is replaced by the time of week of `time`, when the message was received.
     """
     sent_s = values.get("tow_s", values["toe_sow_s"] if np.isnat(time) else float(to_week(time)[1]))

@@ -177,7 +177,7 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "tow_s": (16, 18.0, "u"),
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
-BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health; others are not known.
+BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health; others are unknown.
 #: Bits of subframes 2 and 3 of B-CNAV1 in each of the pages that a frame is passed on as, after PRN, number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)

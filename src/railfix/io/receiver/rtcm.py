@@ -45,7 +45,7 @@ _LAYOUT: Final = {
     7: (20, 2.0**-29, 24, 2.0**-31, 10, 10, 0.0625, True),
 }
 MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
-#: Count of messages that no week can be resolved for.
+#: Name of the count of messages whose week cannot be resolved.
 UNDATED: Final = "RTCM 3 observations without a date"
 IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
 _BEIDOU_LATE_S: Final = 14  #: GPS time is ahead of BeiDou time [s].
@@ -365,7 +365,7 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
-#: GPS week of the first log with MSM (July 2011, RTCM 10403.1 amendment 5): no earlier week is meant.
+#: GPS week of the first log with MSM (July 2011, RTCM 10403.1 amendment 5): an earlier week is impossible.
 _FIRST_MSM_WEEK: Final = 1642
 
 

@@ -179,7 +179,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, in
 
 
 def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
-    """Return measurements of sub-blocks: those of the first type absolute, those of the second as offsets from them."""
+    """Return measurements of sub-blocks: the first type is absolute, the second type is relative to the first."""
     own = place == master
     first = gather_structures(frames.data, master, _FIRST)
     other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first

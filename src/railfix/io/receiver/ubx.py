@@ -37,7 +37,7 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
 #: Data bits of a word of LNAV that its parity bits D25 to D30 sum, and which of these sum bit 29 of the word before.
 _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
 _LNAV_WITH_D29: Final = (0, 2, 5)
-#: Last GPS week that a log may have: 2079. A date beyond it would put every later epoch out of order.
+#: Last plausible GPS week of a log: 2079. A later date would put every following epoch out of order.
 _LAST_WEEK: Final = 5200
 #: Codes [m], phases [cycles] and Dopplers [Hz] from here on are invalid; RINEX has no field for them.
 _LARGEST: Final = 1e10
@@ -131,7 +131,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
 
 
 def sfrbx_subframes(frames: Frames) -> Subframes:
-    """Return the subframes of all RXM-SFRBX messages; L1 C/A ones of wrong parity are counted."""
+    """Return the subframes of all RXM-SFRBX messages; L1 C/A subframes with wrong parity are counted."""
     chosen, header = frames.structures("ubx", [RXM_SFRBX], _SFRBX_HEADER)
     whole = frames.end[chosen] - frames.start[chosen] == 8 + 4 * header["count"].astype(np.int64)
     chosen, header = chosen[whole], header[whole]
@@ -153,9 +153,9 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
 
 
 def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> Masks:
-    """Return whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV).
+    """Return whether the parity of all ten words of LNAV subframes is correct, shape (N,) (IS-GPS-200, table 20-XIV).
 
-    u-blox inverts a word whose predecessor ends in 1; the bit before is then the exclusive or of its last two.
+    u-blox inverts a word whose predecessor ends in 1; the previous bit is then the exclusive or of its last two bits.
     """
     data, parity = words >> np.uint32(6) & np.uint32(0xFFFFFF), words & np.uint32(63)
     before = np.zeros_like(parity)

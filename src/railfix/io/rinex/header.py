@@ -25,7 +25,7 @@ ALL: Final = ""  #: Key of the types of a RINEX 2 file, which hold for all const
 #: Longest header; a longer file without END OF HEADER is no RINEX file.
 _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
-#: Names of time systems that programs write otherwise.
+#: Alternative names of time systems written by some programs.
 _OTHER_NAMES: Final = {"GPST": "GPS", "BDS": "BDT", "GLONASS": "GLO", "GALILEO": "GAL", "QZSS": "QZS"}
 
 

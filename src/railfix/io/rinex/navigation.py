@@ -165,7 +165,7 @@ class _Block:
     name: str
     message: str
     text: list[str]
-    last: bool = False  #: Whether it is the last one of the file, which may be cut.
+    last: bool = False  #: Whether it is the last record of the file, which may be cut.
 
 
 def _read_file(path: FilePath, content: NavigationContent) -> None:

@@ -142,7 +142,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     beidou = system == "C"
     gps_like = np.isin(system, ["G", "J"])
     integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
-    # The field of IODC is the second group delay of Galileo and BeiDou; AODC of BeiDou has the position of the fit
+    # The field of IODC is the second group delay of Galileo and BeiDou; BeiDou's AODC is in the field of the fit
     # interval.
     cnv = ~np.isnan(column["iodc"])
     iodc = np.select(

@@ -21,7 +21,7 @@ from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_targ
 
 UNKNOWN_S: Final = 0.9999e9  #: Values for an unknown transmission time, and for fields of CNV1 that the records lack.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
-#: Messages of Keplerian records that a version has.
+#: Messages of Keplerian records by version.
 _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
     "3.04": ("LNAV", "INAV", "FNAV", "D1", "D2"),
     "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
@@ -145,7 +145,7 @@ def _field(values: Floats) -> Strings:
 
 
 def _records(satellite: Strings, time: Datetimes, numbers: Floats) -> Strings:
-    """Format records: satellite, time, three clock fields, then four a line, blank ones at its end omitted."""
+    """Format records: satellite, time, three clock fields, then four per line, trailing blank fields omitted."""
     text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(numbers.T):
         if i >= 3 and i % 4 == 3:

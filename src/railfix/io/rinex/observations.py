@@ -35,10 +35,10 @@ from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, spli
 
 #: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: A longer line is not RINEX, not even one that a failing recorder filled with zeros.
+#: A longer line is not RINEX, not even a line filled with zeros by a failing recorder.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
-_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems are GPS time.
+_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: All other time systems are GPS time.
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
@@ -120,7 +120,7 @@ class BlockReader:
             first, count = int(table.line[k]) + 1, int(table.count[k])
             after = self._event(lines[first : first + count], after)
             if after.reading != header.reading:
-                taken = first + count  # the lines after it have other types: decode those before it again
+                taken = first + count  # the lines after it have other types: decode the lines before it again
                 trial = self._log.fresh()
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
                 break
@@ -198,7 +198,7 @@ def scan_observations(
     `railfix.read_observations`.
 
     The first piece is short (`in_pieces`). Each piece has the channels that occur in it; concatenated they are the log.
-    Memory use is that of a piece and one block of text. `progress` is called repeatedly with the fraction of the files
+    Memory use is one piece and one block of text. `progress` is called repeatedly with the fraction of the files
     that has been read, 0 to 1.
     """
     if epochs < 1:

@@ -25,7 +25,7 @@ from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Line
 
 Words = NDArray[np.uint64]
 
-FIELD_WIDTH: Final = 16  #: Characters of one field.
+FIELD_WIDTH: Final = 16  #: Number of characters per field.
 #: Blank characters that must follow the last character of a block, so that loads may run over it.
 PADDING: Final = 2048
 
@@ -48,7 +48,7 @@ class Fields:
 
     value: Floats  #: NaN where blank, and where `bad`.
     lock: Bytes  #: Loss-of-lock digit, 0 where blank.
-    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is not a digit.
+    bad: Masks  #: Whether the field is neither blank nor a number, or one of its two indicators is not a digit.
 
 
 def join_fields(parts: Sequence[Fields]) -> Fields:
@@ -208,7 +208,7 @@ def _is_any(letter: Bytes, letters: Iterable[str]) -> Masks:
 
 
 def _number(key: Integers) -> tuple[Integers, Integers]:
-    """Return the different small numbers in ascending order, and which of them each one is."""
+    """Return the distinct small numbers in ascending order, and the index of each number among them."""
     occurs = np.zeros(int(key.max(initial=0)) + 1, dtype=np.bool_)
     occurs[key] = True
     return np.flatnonzero(occurs), (np.cumsum(occurs) - 1)[key]

@@ -130,7 +130,7 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
 ) -> tuple[EpochHeads, int]:
-    """Find the complete epochs and events of a block, and the lines they take; not `at_end`, the last one waits."""
+    """Find the complete epochs and events of a block, and their lines; unless `at_end`, the last one is deferred."""
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
     return _find_unmarked(lines, lines_per_satellite=lines_per_satellite, at_end=at_end, log=log)
@@ -216,7 +216,7 @@ def _is_record(lines: Lines, line: int) -> bool:
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
-    """Find epochs of RINEX 2 by the point of their seconds, which no line of observations has in that column."""
+    """Find epochs of RINEX 2 by the decimal point of their seconds, which no observation line has in that column."""
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]

@@ -84,7 +84,7 @@ class TrackStatus(IntEnum):
     #: One position, but 3-D positions of the last minutes are beside or above the line, or another track of the network
     #: is more probable than `track_risk`.
     MAP_OFFSET = 7
-    #: One position, but within the last 20 s its distance from the other antenna's was wrong by more than 5 m, or the
+    #: One position, but within the last 20 s its distance from the other antenna's was wrong by more than 5 m, or their
     #: speeds differed by more than 1.5 m/s, and by more than four standard deviations.
     ANTENNAS_DISAGREE = 8
     #: One position, but measurements, the velocity or a sub-filter contradict it: its error is not bounded.

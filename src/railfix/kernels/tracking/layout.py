@@ -99,7 +99,7 @@ class Given(NamedTuple):
     vertex: Records  #: `VERTEX`; shape (V,).
     line: Records  #: `LINE`; shape (1,).
     parameters: Records  #: Fields of `TrackingLimits` and the risk budget of the level; shape (1,).
-    start_variance: Floats  #: Standard deviation of each unknown before any measurement; shape (N,).
+    start_variance: Floats  #: Variance of each unknown before any measurement; shape (N,).
 
 
 class State(NamedTuple):
@@ -135,7 +135,7 @@ class Trace(NamedTuple):
 class Rows(NamedTuple):
     """Measurements of one epoch in their order: M rows of four kinds."""
 
-    #: Number of rows of each kind.
+    #: Rows of each kind.
     code: slice
     phase: slice
     doppler: slice

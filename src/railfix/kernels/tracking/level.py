@@ -24,7 +24,7 @@ from railfix.kernels.tracking.subfilters import find_other
 class Alternatives(NamedTuple):
     """Alternative positions of the train with their probabilities; shapes (A,)."""
 
-    along_m: Floats  #: Distance along the line; 0 beyond `start_separation_m`, where it has no term of its own.
+    along_m: Floats  #: Distance along the line; 0 beyond `start_separation_m`, further than a level may reach.
     straight_m: Floats  #: Straight distance.
     forward_m: Floats  #: Component of the straight distance along the line at the alternative.
     sigma_m: Floats

@@ -250,7 +250,7 @@ def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> N
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write position, speed, level and status; `status` is the status without doubt and other others."""
+    """Write position, speed, level and status; `status` is the status without doubt and other branches."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])

@@ -24,20 +24,20 @@ from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
 FREE_AMBIGUITY_M: Final = 1e4  #: Sigma of an ambiguity against its first value [m]: loose prior for conditioning.
-FORGET_S: Final = 600.0  #: An arc not observed for this long starts again.
+FORGET_S: Final = 600.0  #: An arc not observed for this long is restarted.
 
 
 class PhaseLimits(Settings):
     """Limits of the float ambiguities."""
 
-    clocks: PhaseClocks = "own"  #: Clock of the phases: their own, or that of the codes (P4).
-    #: [m/sqrt(s)] Random walk of an ambiguity: what ionosphere, satellite orbit and clock, and multipath move a phase
-    #: against the others. Without it, phases that drift by centimetres while satellites move by hundredths of a radian
-    #: bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities
-    #: constant.
+    clocks: PhaseClocks = "own"  #: Clock of the phases: separate, or shared with the codes (P4).
+    #: [m/sqrt(s)] Random walk of an ambiguity: changes of ionosphere, satellite orbit and clock, and multipath in a
+    #: phase relative to the other phases. Without it, phases that drift by centimetres while satellites move by
+    #: hundredths of a radian bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0
+    #: holds ambiguities constant.
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Steps of the walk.
-    #: Correlation time of code errors: epochs nearer to each other than this give the ambiguities no new information.
+    #: Correlation time of code errors: epochs closer together than this add no information on the ambiguities.
     #: The variance of the ambiguities is multiplied by correlation / interval, up to that of codes alone. The positions
     #: do not change. 0 for white noise, such as simulated noise.
     correlation_s: float = Field(default=20.0, ge=0)
@@ -73,7 +73,7 @@ class ArcAmbiguities:
     #: ambiguities are known up to a common constant: the mean of the corrections to their first values is zero, and the
     #: covariance refers to that mean; shape (A,).
     ambiguity_m: Floats
-    covariance_m2: Floats  #: From noise alone, without the map error; shape (A, A).
+    covariance_m2: Floats  #: Covariance of noise alone, without the map error; shape (A, A).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -82,7 +82,7 @@ class PhasePositions(NotebookTable):
 
     #: Along the trajectory, within its ends; NaN without an initial position or enough satellites; shape (T,).
     arc_m: Floats
-    #: Standard deviation with the map's error, and of noise alone; shape (T,).
+    #: Standard deviation including the map error, and from noise alone; shape (T,).
     sigma_m: Floats
     noise_sigma_m: Floats
     clock_m: Floats  #: Receiver clock of each group; NaN without a position; shape (T, G).
@@ -96,7 +96,7 @@ class PhasePositions(NotebookTable):
     n_codes: Integers
     n_phases: Integers
     n_fixed: Integers  #: Differences of ambiguities fixed to whole cycles, shape (T,).
-    #: Probability that one of these is wrong, or of the best candidates; NaN without any; shape (T,).
+    #: Probability that one of these, or of the best candidates, is wrong; NaN without any; shape (T,).
     integer_risk: Floats
     #: All arcs of a run, or those that continue after the last epoch (`phase_positions`); None in results, row by row.
     arcs: ArcAmbiguities | None
@@ -173,12 +173,12 @@ _SHARES: Final = (1.0, 0.75, 0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class Fixed:
-    """Ambiguities of A arcs with those differences fixed that are certain enough."""
+    """Ambiguities of A arcs, with the sufficiently certain differences fixed."""
 
     value_m: Floats  #: Ambiguities, and their responses to a map 1 m off across and in height; shape (A, 3).
     covariance_m2: Floats  #: Covariance of noise alone, shape (A, A).
     count: int  #: Differences fixed; 0: the float ambiguities are returned.
-    #: Probability that one of them is wrong, or of the best ones where none is fixed; NaN without any difference.
+    #: Probability that one of them, or of the best ones where none is fixed, is wrong; NaN without any difference.
     risk: float
 
 
@@ -229,7 +229,7 @@ def fix_integers(
 
 
 def _differences(strength: Floats, group: Integers) -> tuple[Indices, Indices]:
-    """Return arcs and those that they are differenced with, the strongest first."""
+    """Return arcs and their reference arcs for differencing, the strongest first."""
     first, second = [], []
     for each in np.unique(group[group >= 0]).tolist():
         own = np.flatnonzero(group == each)

@@ -3,10 +3,11 @@
 The phase's change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or
 without Dopplers with the change of the code, less the median of the channels, so that a clock step is no slip. A clock
 step is common to all channels of an epoch; codes follow the time tags, so that the true interval is the tags' less the
-step seen in the codes; phases step with the codes or run on, then by whole milliseconds, which `Slips.phase_m` adds.
+step seen in the codes; phases step with the codes, or continue and then differ by whole milliseconds, which
+`Slips.phase_m` adds.
 
 The mean of code less phase over the arc so far, added to the phase, is a code with less noise. The ionosphere makes
-it drift by twice the change of its delay, which the window limits: at 1 mm/s one of 100 s leaves up to 0.2 m.
+it drift by twice the change of its delay, which the window limits: at 1 mm/s a window of 100 s leaves up to 0.2 m.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
-#: A common change of the codes from which on the interval is corrected for it [m]; below, it is noise.
+#: Least common change of the codes for which the interval is corrected [m]; smaller changes are noise.
 _CLOCK_STEP_M: Final = 1e4
 _COMMON: Final = 3  #: Channels required for a median to represent the clock.
 
 
 class SlipReason(IntFlag):
-    """Why the phase of an epoch and channel restarts. 0 = joined to the previous epoch."""
+    """Reasons why the phase of an epoch and channel restarts; 0 = joined to the previous epoch."""
 
     JOINED = 0
-    NO_PHASE = 1 << 0  #: No phase at this epoch: nothing begins.
-    FIRST = 1 << 1  #: A phase, but none of this channel at the previous epoch.
+    NO_PHASE = 1 << 0  #: No phase at this epoch: no arc begins.
+    FIRST = 1 << 1  #: A phase, but no phase of this channel at the previous epoch.
     LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator.
     HALF_CYCLE = 1 << 3  #: Its bit 1 (half-cycle ambiguity) differs from the previous epoch.
-    GAP = 1 << 4  #: The epoch before is longer ago than the limit.
+    GAP = 1 << 4  #: The interval since the previous epoch exceeds the limit.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
     DOPPLER = 1 << 6  #: The phase's change disagrees with the Dopplers.
     CODE = 1 << 7  #: The phase's change disagrees with the code, where there are no Dopplers.
@@ -57,12 +58,12 @@ class CycleSlipLimits(Settings):
 
     #: Longest interval that is bridged: the interval of a station's log, 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Limit of the phase against its Doppler, constant and by the interval. On real receivers at 1 Hz the median of the
-    #: metric is 0.01 to 0.04 m.
+    #: Limit of the phase change against its Doppler, constant and in proportion to the interval. On real
+    #: receivers at 1 Hz the median of the metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
     doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
-    code_m: float = Field(default=10.0, gt=0)  #: Limit of code less phase where Dopplers are absent or less sharp.
+    code_m: float = Field(default=10.0, gt=0)  #: Limit of code less phase where Dopplers are absent or less precise.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +82,7 @@ class CycleSlipState:
 
 @dataclass(frozen=True, kw_only=True)
 class Slips:
-    """Phases and where their arcs begin, T epochs by M channels."""
+    """Phases and the starts of their arcs, T epochs by M channels."""
 
     slip: Masks  #: True where there is a phase that may not be joined to the previous epoch, shape (T, M).
     reason: Integers  #: `SlipReason` bits, shape (T, M).
@@ -226,12 +227,12 @@ def linear_recursion(gain: Floats, drive: Floats) -> Floats:
 class SmoothingLimits(Settings):
     """Limits of the smoothing."""
 
-    #: Time constant: each code of an arc counts the same until the arc is this old, from then on older ones fade
-    #: (DO-229D 2.1.4.1.5 takes 100 s, for the ionosphere's drift).
+    #: Time constant: all codes of an arc have equal weight until the arc is this old; from then on older codes lose
+    #: weight (DO-229D 2.1.4.1.5: 100 s, because of the ionosphere's drift).
     window_s: float = Field(default=100.0, gt=0)
     #: "own": the codes' mean change against their phases is a clock: subtracted before and added after averaging. For
     #: telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
-    #: against 50 m with "shared"); other receivers did not lose by it.
+    #: against 50 m with "shared"); other receivers were no worse with it.
     clocks: Literal["own", "shared"] = "own"
 
 
@@ -241,11 +242,11 @@ class SmoothingState:
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
-    #: First code less phase of the running arc; NaN where none runs; shape (M,).
+    #: First code less phase of the current arc; NaN without an arc; shape (M,).
     base_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Smoothed code less phase, less `base_m`; shape (M,).
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Codes of the running arc, shape (M,).
+    #: Number of codes of the current arc, shape (M,).
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: Last code less phase, for `clocks="own"`; shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
@@ -281,7 +282,7 @@ def smooth_codes(
 
     Weight of the n-th code of an arc: the greater of 1/n and dt / window. A phase times its
     wavelength is of the order of 1e8 m, where a double steps by 1.5e-8 m; the recursion runs on
-    code less phase less its first value on the arc, which is metres, so nothing builds up.
+    code less phase less its first value on the arc, which is metres, so that rounding errors do not accumulate.
 
     Parameters
     ----------
@@ -312,7 +313,7 @@ def smooth_codes(
         return code_m, state
     has_phase = np.isfinite(phase_m)
     has = has_phase & np.isfinite(code_m)
-    # An arc ends with its phase: without one, nothing runs into the next epoch.
+    # An arc ends with its phase: without a phase, no arc continues into the next epoch.
     begins = slip | ~has_phase
     codes = np.cumsum(has, axis=0)
     before = _hold((codes - has).astype(np.float64), begins, -count0.astype(np.float64))

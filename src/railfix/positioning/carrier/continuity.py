@@ -1,8 +1,8 @@
 """Phase jumps on the line from the change of the phases between two epochs, and numbers of arcs without a slip.
 
 Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every further
-satellite is a check, precise to a centimetre. Where they disagree, the worst channels are rejected one by one until the
-others agree. The number of an arc, unique in a run, is the channel's five letters and its count of arcs.
+satellite is a check, precise to a centimetre. Where the satellites disagree, the worst channels are rejected one by one
+until the others agree. The number of an arc, unique in a run, is the channel's five letters and its count of arcs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class ArcState:
 
 
 def channel_code(satellite: str, signal: str) -> int:
-    """Return a channel's letters as one number: ``G05`` on ``1C``."""
+    """Return a channel's letters as a number: ``G05`` on ``1C``."""
     return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
 
 
@@ -99,12 +99,12 @@ class ContinuityLimits(Settings):
     drift_mps: float = Field(default=0.008, gt=0)
     #: Standard deviation across and up of a sudden change of position (map points).
     aside_m: float = Field(default=0.02, gt=0)
-    #: The same as fractions of the distance moved: a position error of 5 m turns the line by 0.017 on a curve of 300 m
-    #: radius, and by 0.0025 on a vertical curve of 2000 m.
+    #: Standard deviations as fractions of the distance moved: a position error of 5 m turns the line by 0.017 on a
+    #: curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
-    sigmas: float = Field(default=4.5, gt=0)  #: Standard deviations of the channel's residual that reject it.
-    #: Largest number of channels rejected; where more would be, no channel continues.
+    sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
+    #: Largest number of channels rejected; if more would be rejected, no channel continues.
     max_rejected: int = Field(default=8, ge=0)
     max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
 
@@ -122,10 +122,10 @@ class ContinuityState:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackJumps:
-    """Verdict on the change of each phase into its epoch, T epochs by M channels."""
+    """Test result for the change of each phase into its epoch, T epochs by M channels."""
 
     jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
-    metric_m: Floats  #: Change of phase less that of the remaining channels; NaN where not tested; shape (T, M).
+    metric_m: Floats  #: Change of phase less the change of the remaining channels; NaN where not tested; shape (T, M).
     judged: Masks  #: Shape (T, M).
     moved_m: (
         Floats  #: Distance along the line since the previous epoch, from the phases; NaN where not known; shape (T,).
@@ -219,7 +219,7 @@ def _reject_jumps(
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
     """Reject the worst channels one by one until the others agree; without redundancy all are kept.
 
-    Returns the mask of those kept, residuals of all, step along the line, its variance, and where the rest agrees.
+    Returns the mask of kept channels, residuals of all, step along the line, its variance, and where the rest agrees.
     """
     design = np.where(judged[..., None], design, 0.0)
     change = np.where(judged, change, 0.0)
@@ -260,7 +260,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
     residual = change - np.matmul(design, x[..., None])[..., 0]
     spread = np.einsum("tmi,tij,tmj->tm", design, inverse, design)
     own = sigma[:, None] ** 2
-    # A channel that no other checks has no residual variance: it cannot be tested.
+    # A channel that no other channel checks has no residual variance: it cannot be tested.
     checked = np.where(kept, own - spread, own + spread)
     size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
     return _ContinuityFit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])

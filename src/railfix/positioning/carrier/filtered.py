@@ -1,4 +1,4 @@
-"""Positions along the line from code and phase, each epoch from the past alone.
+"""Positions along the line from code and phase, each epoch from itself and earlier epochs only.
 
 The state between epochs is the normal matrix of the running arcs' ambiguities; at multiples of a hop process noise is
 added to the ambiguities. Where an arc begins, the previous arc of its channel is eliminated, so that the state never
@@ -45,7 +45,7 @@ SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together; it bounds the
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """Information of the epochs so far on A running arcs."""
+    """Information of the epochs so far on A active arcs."""
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -59,7 +59,7 @@ class Memory:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseState:
-    """One memory a pass of linearisation; none before the first epoch."""
+    """One memory per linearisation pass; none before the first epoch."""
 
     memories: tuple[Memory, ...] = ()
 
@@ -82,10 +82,10 @@ def phase_positions(
     ranges : Ranges
         Corrected codes with their weights, satellites, clocks, ties between clocks.
     phases : Phases
-        Arcs named by `number_arcs`: of one channel only the newest runs.
+        Arcs named by `number_arcs`: only the newest arc of a channel is active.
     trajectory : Trajectory
     arc_m_start : ndarray, shape (T,) [m]
-        Where each epoch starts from (the constrained position of codes alone); NaN leaves it out.
+        Initial position of each epoch (the constrained position from codes alone); an epoch with NaN is left out.
     state : PhaseState, optional
     limits : PhaseLimits, optional
 
@@ -93,7 +93,7 @@ def phase_positions(
     -------
     PhasePositions
     PhaseState
-        Any cutting into chunks gives the same, to 1e-9 m.
+        Division into chunks does not change the result, to 1e-9 m.
     """
     limits = limits or PhaseLimits()
     memories = state.memories if state and state.memories else (Memory(),) * limits.passes

@@ -6,10 +6,10 @@ Per epoch t and channel i, around a position on the line::
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
 
 with d along the section, m1 and m2 the map's error across the track and in height, b_g the clock of the constellation.
-P4 writes b = b_g (`clocks="shared"`); telephones do not keep that, and a clock of the phases' own leaves the N known up
-to a constant common to all. With ``L`` the normal matrix of an epoch's own unknowns and ``C`` their coupling to the N,
-the epoch adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). Residual ionospheric errors
-are absorbed by N at the arc's begin and drift by twice their change.
+P4 writes b = b_g (`clocks="shared"`); telephones do not satisfy this; with a separate phase clock the N are known up to
+a common constant. With ``L`` the normal matrix of an epoch's own unknowns and ``C`` their coupling to the N, the epoch
+adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). Residual ionospheric errors are absorbed
+by N at the arc's begin and drift by twice their change.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LEAST_TIE_M: Final = 1e-2  #: Least sigma of a tie between clocks [m].
 
 @dataclass(frozen=True, kw_only=True)
 class IntegerChannels:
-    """Which channels have ambiguities that differ by whole cycles."""
+    """Channels whose ambiguities differ by whole cycles."""
 
     wavelength_m: Floats  #: Shape (M,).
     group: Integers  #: Index of channels with one clock and signal; -1 for those without integers; shape (M,).
@@ -45,11 +45,11 @@ class Phases:
 
     #: Phase times wavelength, corrected like the code (`corrected_phase_m`); any value where the weight is 0; (T, M).
     phase_m: Floats
-    #: 1/sigma^2, 0 for unused ones; otherwise `Ranges.sat_ecef_m` is the satellite; shape (T, M) [1/m^2].
+    #: 1/sigma^2, 0 for unused phases; otherwise `Ranges.sat_ecef_m` is the satellite; shape (T, M) [1/m^2].
     weight: Floats
-    #: Equal within an unbroken stretch of one channel's phase, and different elsewhere; shape (T, M).
+    #: Number of the arc: constant within an unbroken stretch of one channel's phase, different elsewhere; shape (T, M).
     arc_id: Integers
-    integers: IntegerChannels | None = None  #: None: all ambiguities are real numbers.
+    integers: IntegerChannels | None = None  #: None: all ambiguities are real-valued.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """Return the phases of some epochs."""
@@ -65,7 +65,7 @@ def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats
     phase_m : ndarray, shape (T, M) [m]
         `Slips.phase_m`.
     sat_clock_m : ndarray, shape (T, M) [m]
-        c times the satellite clock. Group delays are of the code, and constant on an arc.
+        c times the satellite clock. Group delays affect the code, and are constant on an arc.
     ionosphere_m, troposphere_m : ndarray, shape (T, M) [m]
         Delays of the code: the phase is advanced by the ionosphere.
     """
@@ -79,7 +79,7 @@ class Linearised:
     #: Shape (T, M, P).
     code_design: Floats
     phase_design: Floats
-    groups: int  #: Clocks of the codes; a clock of the phases comes after them.
+    groups: int  #: Number of code clocks; a phase clock comes after them.
     #: Shape (T, M) [1/m^2].
     code_weight: Floats
     phase_weight: Floats
@@ -208,10 +208,10 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnUnknowns:
-    """Each epoch's own unknowns, given the ambiguities."""
+    """Solution for each epoch's own unknowns, given the ambiguities."""
 
     step_m: Floats  #: Distance along the line from the point of linearisation, shape (T,).
-    #: From noise alone, and with the map's error; shape (T,).
+    #: Standard deviation from noise alone, and including the map error; shape (T,).
     noise_sigma_m: Floats
     sigma_m: Floats
     clock_m: Floats  #: Shape (T, G).

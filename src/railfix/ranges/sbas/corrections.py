@@ -49,10 +49,10 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return the PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
+    """Return the PRN with the most usable fast corrections, the smallest of equal PRNs, and a sentence on the choice.
 
-    The choice uses all messages: make it on recorded messages before the positioning begins. Live messages cannot
-    be judged in advance; there the PRN is given.
+    The choice uses all messages: make it on recorded messages before positioning begins. For live messages the PRN must
+    be given.
     """
     limits, scores = limits or SbasLimits(), []
     for number in messages.prns:
@@ -70,9 +70,9 @@ def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[
 class SbasCorrections:
     """Corrections by one GEO's messages at any epochs; the tables are built once, then searched.
 
-    A message counts from the moment it had been received (`SbasMessages.time`), never before. Results are independent
-    of the other epochs or satellites of a call, and of messages received later. Messages of other PRNs than `prn`,
-    which is chosen beforehand (`best_prn`), are left out; `notes` on their origin precede those of the corrections.
+    A message is used from its time of reception on (`SbasMessages.time`), never before. Results are independent of the
+    other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn`, which is
+    chosen beforehand (`best_prn`), are left out; `notes` on their origin precede those of the corrections.
     """
 
     def __init__(

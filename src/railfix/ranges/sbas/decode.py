@@ -56,7 +56,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
     },
     "type 6": {"iodf": BitField(14, 2, number=4), "udrei": BitField(22, 4, number=SLOTS)},
     "type 7": {"latency_s": BitField(14, 4, 1.0), "iodp": BitField(18, 2), "indicator": BitField(22, 4, number=SLOTS)},
-    # How errors grow (table A-9).
+    # Growth of errors (table A-9).
     "type 10": {
         "range_rate_m": BitField(14, 10, 0.002),
         "long_term_step_m": BitField(24, 10, 0.002),

@@ -6,11 +6,11 @@ ionosphere-free ranges of L1 C/A and L5, E1 and E5a, where biases between the si
 of B1C and B2a, less the group delays of B-CNAV1. GLONASS has slots, but is corrected on L1OC and L3OC, which are not
 read.
 
-The standard was not at hand. Layouts are those of cssrlib (sbas.py), least values and degradation those of MAAST
-(L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots those of both and of Wireshark (packet-sbas_l5.c). An hour
-of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that slot and fraction of the rate have 8 and 4 bits, as in cssrlib,
-and that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group
-delays differ by metres: they are not in its corrections.
+The standard was not available. Layouts are taken from cssrlib (sbas.py), least values and degradation from MAAST
+(L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots from both and from Wireshark (packet-sbas_l5.c). An hour of
+SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that slot and fraction of the rate have 8 and 4 bits, as in cssrlib, and
+that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays
+differ by metres: they are not in its corrections.
 
 Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), serve a note alone.
 Layouts and scales are those that cssrlib and MAAST (L5_decodeMT39.m, 40, 47) share. Messages of SouthPAN of three days
@@ -41,7 +41,7 @@ from railfix.ranges.sbas.standard import first_that_holds, system_name
 
 AUGMENTED: Final = 92  #: Satellites of one mask.
 FIRST: Final = 53  #: The first ones are in type 35, the others in type 36.
-DO_NOT_USE: Final = 15  #: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
+DO_NOT_USE: Final = 15  #: Indicators without a sigma: "not monitored" is left out of type 32, 15 means "do not use".
 #: Sigma by indicator 0 to 14: least value and step [m].
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
@@ -137,7 +137,7 @@ SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_s
 
 
 def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
-    """Return the standard deviation that ionosphere-free ranges keep of the ionosphere [m] (ED-259A)."""
+    """Return the residual ionospheric standard deviation of ionosphere-free ranges [m] (ED-259A)."""
     return np.asarray(40.0 / (261.0 + elevation_deg**2) + 0.018)
 
 
@@ -260,7 +260,7 @@ class DfmcService:
         return np.where(age <= longest_s, row, -1)
 
     def _slots(self, name: str, mask: Integers) -> tuple[Masks, Integers]:
-        """Return whether a satellite is in the mask in force, and its rank among those that are."""
+        """Return whether a satellite is in the mask in force, and its rank among the satellites of the mask."""
         slot = SLOT_OF.get(name, 0)
         if not slot or not len(self._time[31]):
             return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
@@ -376,7 +376,7 @@ class SbasOrbits:
         return np.where(self.usable[:, None], position, np.nan)
 
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on the last orbit with a position, none without one."""
+        """Return a sentence on the last orbit with a position, none if no orbit has a position."""
         last = zip(self.prn[self.usable][-1:], self.position_ecef_m(self.reference)[self.usable][-1:], strict=True)
         return tuple(
             f"PRN {prn} is, by its own messages, at {float(geodetic_from_ecef(place)[1]):.1f} degrees east, "

@@ -40,7 +40,7 @@ _RINEX_SHIFT_S: Final = 1.0
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One message as written: nanoseconds since 1980-01-06 in GPS time, PRN, type (-1 unsaid), hexadecimal digits."""
+    """One message as written: nanoseconds since 1980-01-06 in GPS time, PRN, type (-1: none), hexadecimal digits."""
 
     line: int
     time_ns: int
@@ -73,7 +73,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
 
 
 def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iterator[RawMessage | InputFileError]:
-    """Yield every message of a file in its order; a broken one as the error that describes it."""
+    """Yield every message of a file in its order; a broken message as the error that describes it."""
     if kind == "rinex":
         yield from _parse_rinex(path, lines, band)
         return
@@ -115,7 +115,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
     if end is None:
         raise InputFileError(path, "the header has no END OF HEADER; the file is cut, give the whole one")
     rest = [(i, text) for i, text in enumerate(lines[end + 1 :], start=end + 2) if text.strip()]
-    at, broken = 0, False  # after a broken record or line all is passed over up to the next head
+    at, broken = 0, False  # after a broken record or line everything up to the next header is skipped
     while at < len(rest):
         number, text = rest[at]
         at += 1

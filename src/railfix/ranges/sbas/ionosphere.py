@@ -61,7 +61,7 @@ def _band(band: int) -> list[tuple[int, int]]:
 
 
 def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.generic]) -> Integers:
-    """Return the number of grid points; coordinates are multiples of 5 degrees, longitudes of any turn."""
+    """Return the numbers of grid points; coordinates are multiples of 5 degrees, longitudes modulo 360."""
     row = np.rint((np.asarray(latitude_deg, dtype=np.float64) + 90.0) / 5.0).astype(np.int64)
     column = np.rint((np.asarray(longitude_deg, dtype=np.float64) + 180.0) / 5.0).astype(np.int64) % COLUMNS
     return row * COLUMNS + column
@@ -130,7 +130,7 @@ class GridTables:
         return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
-        """Return whether points are in the newest mask of a band of theirs that has not timed out."""
+        """Return whether points are in the newest mask of one of their bands that has not timed out."""
         inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)

@@ -1,4 +1,4 @@
-"""SBAS messages as they were received, with their preambles and 24-bit parity."""
+"""SBAS messages as received, with their preambles and 24-bit parity."""
 
 from __future__ import annotations
 
@@ -71,14 +71,14 @@ def message_type(bits: Bytes, band: Band = "L1") -> Integers:
 class SbasMessages(RowArrays, NotebookTable):
     """Messages that passed every check, N rows in the order of their reception."""
 
-    #: GPS time at which the message had been received completely: from here on it may be used; shape (N,).
+    #: GPS time at which the message was completely received: from then on it may be used; shape (N,).
     time: Datetimes
     prn: Integers  #: Shape (N,).
     type: Integers  #: 0 to 63, shape (N,).
-    #: The message from its first preamble bit, eight bits a byte; parity from bit 226 on where the source carries it,
-    #: zero behind; shape (N, 32).
+    #: The message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains
+    #: it, then zeros; shape (N, 32).
     bits: Bytes
-    parity_bits: Integers  #: How many bits of parity the source carried, and were checked: 24, 6 or 0; shape (N,).
+    parity_bits: Integers  #: Parity bits in the source, which were checked: 24, 6 or 0; shape (N,).
     source: Integers  #: Row of `sources`, shape (N,).
     line: Integers  #: 1-based line of the file, shape (N,).
     sources: tuple[str, ...] = ()  #: Files.
@@ -95,7 +95,7 @@ class SbasMessages(RowArrays, NotebookTable):
 
     @property
     def prns(self) -> tuple[int, ...]:
-        """PRNs that sent anything, rising."""
+        """PRNs that sent any message, rising."""
         return tuple(int(prn) for prn in np.unique(self.prn))
 
     def describe_choice(self, prn: int) -> str:

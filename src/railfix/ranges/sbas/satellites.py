@@ -28,7 +28,7 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 class FastInForce:
     """Fast corrections in force, all (T, K)."""
 
-    #: No fast correction; too old, or of an inactive mask; no type 7; a rate is needed and not available.
+    #: In this order: no fast correction; too old, or of an inactive mask; no type 7; a required rate is missing.
     missing: Masks
     timed_out: Masks
     no_factor: Masks
@@ -192,7 +192,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the covariance in force, and where the GEO sends some and this satellite has none."""
+    """Return the row of the covariance in force, and where the GEO sends covariances but none for this satellite."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):

@@ -55,7 +55,7 @@ class SbasSource:
 
 @dataclass(frozen=True, kw_only=True)
 class DfmcSource:
-    """SBAS on L5 (EUROCAE ED-259A), for ionosphere-free codes; the models serve the screens, and cancel."""
+    """SBAS on L5 (EUROCAE ED-259A), for ionosphere-free codes; the modelled delays serve the screens, and cancel."""
 
     models: BroadcastSource
     service: DfmcService

@@ -92,7 +92,7 @@ STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for thi
 #: No message older than this counts, however long type 6 renews a fast correction: the longest time-out but for regions
 #: of service [s].
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
-#: Types that matter for another such time, to messages that came after them: stops and masks.
+#: Types that affect later messages for a further period of that length: stops and masks.
 LEANT_ON: Final = (0, 1, 18)
 INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 
@@ -104,7 +104,8 @@ class SbasLimits(Settings):
     mode: Literal["precision", "en_route"] = "precision"
     type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops its sender for 60 s, or has fast corrections.
     range_rate: Literal["mops", "off"] = "mops"  #: Fast corrections change with their rate (DO-229D, A.4.4.3).
-    #: Without degradation data a satellite is rejected, or has 8 m more (DO-229D, J.2.2) and the shortest time-out.
+    #: Without degradation data a satellite is rejected, or its sigma is increased by 8 m (DO-229D, J.2.2) with the
+    #: shortest time-out.
     incomplete: Literal["reject", "inflate"] = "reject"
     #: Largest UDREI used; None is 11 for precision approach and 13 en route.
     max_udrei: int | None = Field(default=None, ge=0, le=13)
@@ -123,7 +124,7 @@ class SbasLimits(Settings):
 
 
 class SatelliteState(IntEnum):
-    """Whether a satellite may be used; the first reason that applies, in this order."""
+    """Whether a satellite may be used, or the first reason that applies, in this order."""
 
     OK = 0
     GEO_STOPPED = 1  #: Type 0 was received within the last 60 s.
@@ -137,19 +138,19 @@ class SatelliteState(IntEnum):
     NO_LONG_TERM = 9
     IODE_MISMATCH = 10  #: No navigation record has the issue of data of the long-term correction.
     NO_DEGRADATION = 11  #: Degradation data (types 7, 10; 28 where it is sent) are missing.
-    NO_RANGE_RATE = 12  #: Two fast corrections that give a rate are not there.
+    NO_RANGE_RATE = 12  #: Two fast corrections that determine a rate are missing.
 
 
 class IonosphereState(IntEnum):
-    """Whether the delay at a pierce point is known, and why not."""
+    """Whether the delay at a pierce point is known, or the reason why not."""
 
     OK = 0
     GEO_STOPPED = 1
     NO_GRID = 2  #: The mask has no cell of grid points around the pierce point.
-    DO_NOT_USE = 3  #: A grid point that is needed must not be used.
-    NOT_MONITORED = 4  #: A grid point that is needed is not monitored, or was never sent.
+    DO_NOT_USE = 3  #: A required grid point is marked "do not use".
+    NOT_MONITORED = 4  #: A required grid point is not monitored, or was never sent.
     TIMED_OUT = 5
-    NO_DEGRADATION = 6  #: The delay is there; without type 10 it has no sigma.
+    NO_DEGRADATION = 6  #: The delay is known, but has no sigma without type 10.
 
 
 def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: int) -> Integers:
@@ -167,7 +168,7 @@ class SatelliteCorrections(FrozenArrays):
     """
 
     state: Integers  #: `SatelliteState`, shape (T, K).
-    fast_m: Floats  #: To be added to the code; the range-rate part is in it; shape (T, K).
+    fast_m: Floats  #: To be added to the code, range-rate part included; shape (T, K).
     rate_mps: Floats  #: Range-rate correction, shape (T, K).
     position_m: Floats  #: Shape (T, K, 3).
     clock_s: Floats  #: Shape (T, K).
@@ -211,4 +212,4 @@ class IonosphereDelays(FrozenArrays):
     #: Pierce point, shape (T, K).
     latitude_deg: Floats
     longitude_deg: Floats
-    points: Integers  #: Grid points it was interpolated from: 4, 3, or 0; shape (T, K).
+    points: Integers  #: Number of grid points used in the interpolation: 4, 3, or 0; shape (T, K).

@@ -84,7 +84,7 @@ class Series:
         return np.where(known, at, -1).astype(np.int64)
 
     def received(self, row: Integers) -> Datetimes:
-        """Return the reception of rows; long ago for -1."""
+        """Return the time of reception of rows; a time long ago for -1."""
         return np.where(row >= 0, self.time[row], LONG_AGO)
 
     def in_force(self, row: Integers, time: Datetimes, stop: Datetimes, limit_s: float) -> Masks:
@@ -94,7 +94,7 @@ class Series:
 
 
 class Stops:
-    """When type 0 stopped the GEO."""
+    """Times at which type 0 stopped the GEO."""
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:
         stops = messages.type == 0

@@ -1,4 +1,4 @@
-"""Code, phase and C/N0 of an early-late receiver that several paths reach at once; diffraction, antenna pattern.
+"""Code, phase and C/N0 of an early-late receiver with several signal paths; diffraction, antenna pattern.
 
 The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))`` with the sums of all paths in the early, late
 and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14), with the triangle of
@@ -19,7 +19,7 @@ from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSet
 
 Singles = NDArray[np.float32]
 
-#: Iterations: three suffice for errors of a few hundredths of a chip, a wide spacing needs more.
+#: Iterations: three suffice for errors of a few hundredths of a chip; a wide spacing requires more.
 _ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12
 _NARROW_CHIPS: Final = 0.2  #: Up to this spacing the correlator is narrow [chips].
@@ -34,7 +34,7 @@ class TrackedCode:
     phase_m: Floats
     rate_mps: Floats  #: Correlation time of the phase, at constant amplitudes of the paths.
     gain_db: Floats  #: Amplitude of the prompt correlator relative to the unobstructed direct signal.
-    main: Indices  #: Path that the loops lock to.
+    main: Indices  #: Path to which the loops lock.
 
 
 def track_paths(
@@ -153,7 +153,7 @@ def roughness_loss(roughness_m: Floats, cosine: Floats, wavelength_m: Floats) ->
 
 
 def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Floats]:
-    """Amplitudes, right-handed and left-handed, that a smooth dielectric wall reflects of a right-handed circular wave.
+    """Right-handed and left-handed amplitudes of a right-handed circular wave reflected by a smooth dielectric wall.
 
     ``G_perp = (c - r) / (c + r)``, ``G_par = (e c - r) / (e c + r)`` with c the cosine of incidence from the wall's
     normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); ``|G_par + G_perp| / 2`` right-handed,

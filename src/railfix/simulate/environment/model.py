@@ -66,7 +66,7 @@ class Conductor:
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:
-        """Field that the conductor removes from the direct signal, by obstructed fraction and cosine, shape (N,)."""
+        """Field removed from the direct signal by the conductor, by obstructed fraction and cosine, shape (N,)."""
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
         toward = (self.p * self.ray_p + self.q * self.ray_q) / plane
@@ -84,7 +84,7 @@ class Conductor:
 
         A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
         bistatic angle b; extra path rho c (1 - cos(phi)), c the part of the ray perpendicular to the conductor and
-        phi its angle to it. Half the power has the antenna's polarisation.
+        phi its angle to it. Half of the scattered power has the antenna's polarisation.
         """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
@@ -189,20 +189,20 @@ class Electrification:
         return rows
 
 
-#: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
+#: Chip length over C/A's, by constellation and band; all other signals have C/A's (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle.
 _NO_FIELD: Final = 0.01  #: Weaker fields are neglected.
 PLATFORM_M: Final = 1.1  #: Height of a station's platforms over the rails [m].
 _HARMONICS: Final = 4  #: Harmonics of the gain ripple over azimuth.
 _BLOCK: Final = 8192  #: Signals computed at once, so that their arrays stay in the processor's cache.
-_LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation that is computed [deg].
+_LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation for which signals are computed [deg].
 
 
 class Environment:
     """Multipath and blockage along a line.
 
-    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its rise to the zenith. The same seed
+    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its increase to the zenith. The same seed
     gives the same structures and, where they are drawn, the same sections.
     """
 

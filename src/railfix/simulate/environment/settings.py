@@ -78,7 +78,7 @@ class RowSettings(ScenarioSettings):
     #: Amplitude reflection coefficient, the antenna's polarisation included (0 nothing, 1 all).
     reflection: Between = (0.2, 0.7)
     roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
-    yaw_deg: AngleBetween = (-4.0, 4.0)  #: Rotation of the wall out of the line's direction.
+    yaw_deg: AngleBetween = (-4.0, 4.0)  #: Yaw of the wall relative to the line's direction.
 
     @field_validator("distance_m", "length_m", "reflection", "yaw_deg")
     @classmethod
@@ -95,7 +95,7 @@ class RoofSettings(ScenarioSettings):
     """Level roofs along the line: over platforms, or across the tracks (bridges, concourses)."""
 
     sides: Sides = "both"
-    #: Edges from the track's axis; an inner edge at 0 covers the track.
+    #: Distances of the edges from the track's axis; an inner edge at 0 covers the track.
     inner_m: NotNegative = 1.8
     outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)
     height_m: Positive = 6.0  #: Over the rails.
@@ -118,7 +118,7 @@ class SectionSettings(ScenarioSettings):
     #: Chainages.
     from_m: Finite
     to_m: Finite
-    kind: Kind  #: One of `KINDS`; the rows and roofs are those of the kind unless given here.
+    kind: Kind  #: One of `KINDS`; rows and roofs are the kind's unless given here.
     rows: tuple[RowSettings, ...] | None = None
     roofs: tuple[RoofSettings, ...] | None = None
 
@@ -140,12 +140,13 @@ class CorrelatorSettings(ScenarioSettings):
 class AntennaSettings(ScenarioSettings):
     """Polarisation of the antenna and material of the walls, which a wall's `reflection` then multiplies."""
 
-    #: Gain for left-handed below that for right-handed signals, at the zenith and at the horizon.
+    #: Gain for left-handed signals below the gain for right-handed signals, at the zenith and at the horizon.
     cross_polar_zenith_db: NotNegative = 15.0
     cross_polar_horizon_db: NotNegative = 4.0
     #: Relative permittivity of the walls: about 6 for concrete and glass.
     wall_permittivity: float = Field(default=6.0, gt=1.0)
-    #: Gain variation over azimuth at the horizon, less by the cosine of the elevation above it; each antenna its own.
+    #: Gain variation over azimuth at the horizon, reduced by the cosine of the elevation above it; independent for each
+    #: antenna.
     ripple_sigma_db: NotNegative = 0.0
 
 
@@ -158,7 +159,7 @@ class SideStreetSettings(ScenarioSettings):
     #: Distance of the mouth from the track's axis, and length of the street's walls.
     front_m: Between = (12.0, 25.0)
     depth_m: Between = (20.0, 80.0)
-    #: Height of the walls that reflect, and of those across the street, over the rails.
+    #: Height of the reflecting walls, and of the walls across the street, over the rails.
     height_m: Between = (15.0, 60.0)
     opposite_m: Between = (5.0, 40.0)
     reflection: Between = (0.3, 1.0)  #: As `RowSettings`.
@@ -194,8 +195,8 @@ class NeighbourSettings(ScenarioSettings):
     #: Length of a vehicle, and spacing from front to front.
     length_m: Positive = 100.0
     spacing_m: Positive = 5000.0
-    speed_mps: Finite = -20.0  #: Toward rising chainage.
-    reflection: Share = 0.8  #: Amplitude that their sides reflect.
+    speed_mps: Finite = -20.0  #: Speed toward rising chainage.
+    reflection: Share = 0.8  #: Amplitude reflection coefficient of their sides.
 
 
 class RoofEquipment(ScenarioSettings):

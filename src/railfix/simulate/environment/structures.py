@@ -74,7 +74,7 @@ def draw_sections(
 ) -> tuple[SectionSettings, ...]:
     """Return sections with exactly the given fractions of a line, which add up to 1, in random order from 0 to its end.
 
-    `section_length_m` is the approximate range of their lengths; a small fraction gives one shorter section.
+    `section_length_m` is the approximate range of their lengths; a small fraction gives a single shorter section.
     """
     rng = np.random.default_rng([seed, 7101])
     low, high = section_length_m
@@ -109,7 +109,7 @@ class Strips:
     start_m: Floats
     end_m: Floats
     border_m: Floats  #: Chainage from which the structure is the nearest, as `side * reach_m + chainage`; shape (n,).
-    reach_m: float  #: More than all chainages.
+    reach_m: float  #: Larger than all chainages.
     value: dict[str, Floats]  #: Properties, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
@@ -208,7 +208,7 @@ def _row(row: RowSettings, low: float, high: float, rng: np.random.Generator) ->
 
 
 def _strips(sides: list[list[list[float]]], names: tuple[str, ...], reach: float) -> Strips:
-    """Return the arrays of both sides; an empty side gets a structure without extent far behind the line."""
+    """Return the arrays of both sides; an empty side gets a structure of zero length far behind the line."""
     absent = [-0.3 * reach, -0.3 * reach, *([1.0] * (len(names) - 1)), 0.0]
     tables = [np.array([absent, *side]) for side in sides]
     borders = []

@@ -45,7 +45,7 @@ def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:
 
 
 def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
-    """Return the index of the wall that a horizontal ray meets, found first by the distance of the wall abeam."""
+    """Return the index of the wall that a horizontal ray meets, starting from the distance of the wall abeam."""
     distance = row.value["distance_m"]
     slant = along / lateral
     wall = row.nearest(side, x0)
@@ -129,7 +129,7 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     """Return the amplitude left by the level roofs of a row, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     least = np.maximum(rays.z, 0.02)
-    # Roofs of one row are nearly always at one height: the one overhead gives the first guess.
+    # Roofs of one row are nearly always at one height: the roof overhead gives the first guess.
     roof = row.nearest(side, rays.chainage_m)
     for _ in range(2):
         far = (row.value["height_m"][roof] - rays.height_m) / least
@@ -231,7 +231,7 @@ def street_reflections(
             rows = np.flatnonzero((rays.y > 0.0) == (side == 1))
             reach = float(street.front_m.min()) * along[rows] / lateral[rows]
             chainage = rays.chainage_m[rows]
-            # The wall ahead is at the far edge of its street, the wall behind at the near one.
+            # The wall ahead is at the far edge of its street, the wall behind at the near edge.
             forward = np.searchsorted(street.end_m, chainage + reach) + k
             backward = np.searchsorted(street.start_m, chainage - reach) - 1 - k
             number = np.where(ahead[rows] > 0.0, forward, backward)

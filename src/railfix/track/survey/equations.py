@@ -14,8 +14,8 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the bend of the line against the reference line at a point [m]; larger at corners, where moving
-#: the line sideways bends it, by this much for a turn of one radian, squared.
+#: Standard deviation of the bend of the line relative to the reference line at a point [m]; larger by this much for a
+#: squared turn of 1 rad at corners, where a lateral shift bends the line.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 
@@ -42,13 +42,13 @@ class Equations:
     value: Floats  #: Shape (n * size,).
     size: int
     share: Floats  #: Weight of an observation as a fraction of an independent one; 1 where not given; shape (n,).
-    robust: bool = True  #: Whether outliers lose their weight.
+    robust: bool = True  #: Whether outliers are down-weighted.
     scaled: bool = False  #: Whether the standard deviations are scaled by the residuals.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunColumns:
-    """Columns of the unknowns of one run: rows, offset, clocks of the rows, offsets of clocks, clocks of the steps."""
+    """Columns of one run's unknowns: rows, offset, clocks of the rows, clock offsets, clocks of the steps."""
 
     row: Indices
     offset: int
@@ -73,12 +73,12 @@ class RunColumns:
 
     @property
     def end(self) -> int:
-        """First column after those of the run."""
+        """First column after the run's columns."""
         return self.offset + 3 + len(self.clock) + len(self.further) + len(self.step)
 
 
 def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -> sp.csr_array:
-    """Sparse matrix: each part is a column of every observation, shape (n,), and its coefficients, shape (n, size)."""
+    """Return the sparse matrix; a part is the observations' columns, shape (n,), and coefficients, shape (n, size)."""
     count = len(parts[0][0])
     row = np.arange(count * size)
     rows = np.concatenate([row for _ in parts])
@@ -108,7 +108,7 @@ def position_equations(
 def code_equations(
     signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> Equations:
-    """Codes: coordinates, offset of the run, a clock an epoch, and a constant offset of each further constellation."""
+    """Return the equations of codes: coordinates, run offset, clock per epoch, offset per further constellation."""
     row, sigma = signals.row, signals.sigma_m
     distance, sight = range_with_rotation(signals.sat_ecef_m, near[row] + origin)
     white = (-sight / sigma[:, None])[:, None, :]
@@ -128,7 +128,7 @@ def code_equations(
 def change_equations(
     signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> list[Equations]:  # fmt: skip
-    """Return changes of ranges, phases and Dopplers (for lost phases): both rows' coordinates, a clock a step."""
+    """Return changes of ranges, phases and Dopplers (for lost phases): both rows' coordinates, a clock per step."""
     step, sigma = signals.step, signals.change_sigma_m
     before, sight_before = range_with_rotation(signals.before_ecef_m, near[step] + origin)
     after, sight_after = range_with_rotation(signals.after_ecef_m, near[step + 1] + origin)
@@ -147,7 +147,7 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Return the median of the group of each value: the residual clock without it is small."""
+    """Return the median of each value's group; the residual clock without this median is small."""
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
     middle = np.minimum((first[:-1] + first[1:]) // 2, len(value) - 1)
@@ -157,7 +157,7 @@ def _group_medians(value: Floats, group: Indices) -> Floats:
 def motion_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, limits: SurveyLimits, unknowns: int
 ) -> Equations:  # fmt: skip
-    """Return the equations of even motion: the velocity changes little between neighbouring steps."""
+    """Return the equations of smooth motion: the velocity changes little between neighbouring steps."""
     dt = np.diff(run.seconds)
     rows = np.arange(1, len(run) - 1)
     mean = 0.5 * (dt[:-1] + dt[1:])
@@ -175,7 +175,7 @@ def motion_equations(
 
 
 def offset_equations(run: SurveyRun, columns: RunColumns, axes: Floats, unknowns: int) -> Equations:
-    """Return the equations of the offset of a run: zero within the errors that its positions share."""
+    """Return the equations of the offset of a run: zero within the common error of its positions."""
     plan, height = run.common_sigma_m
     white = (axes / np.array([plan, plan, height])[:, None])[None]
     parts = _point(np.array([columns.offset]), white)
@@ -188,7 +188,7 @@ def tie_equations(
     line: ReferenceLine, ties: Ties, runs: Sequence[RunColumns], start: int, origin: Floats, limits: SurveyLimits,
     unknowns: int,
 ) -> Equations:  # fmt: skip
-    """Passes across and above: a run is on the line; its distance from it is correlated over some length."""
+    """Return the equations of passes, across and above: a run is on the line within an error correlated along it."""
     share = np.full(len(ties.point), min(1.0, limits.spacing_m / max(limits.correlation_m, 1e-9)))
     white = np.stack([line.across[ties.point], line.up[ties.point]], axis=1) / limits.apart_m
     first = np.array([columns.row[0] for columns in runs])[ties.run]
@@ -204,7 +204,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Return the equations of an even line: it bends as the reference line does."""
+    """Return the equations of a smooth line, which bends as the reference line does."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]

@@ -33,16 +33,15 @@ from railfix.track.survey.passes import (
 from railfix.track.survey.runs import SurveyLimits, SurveyRun
 from railfix.track.track import Provenance, Track
 
-#: Rounds of reweighting at most, and the change of a solution that ends them [m].
+#: Largest number of reweighting rounds, and the change of the solution that ends them [m].
 _ADJUSTMENT_ROUNDS: Final = 15
 _SETTLED_M: Final = 0.02
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Scales of the stated standard deviations that residuals may indicate; they do not indicate errors that satellites
-#: share.
+#: Limits of the scale of stated standard deviations by residuals, which do not show errors common to satellites.
 _SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
-#: Points of the line whose standard deviation is computed at most, others are interpolated, and columns at a time.
+#: Largest number of points with computed standard deviations, others are interpolated; and columns at a time.
 _SIGMAS: Final = 200
 _COLUMNS: Final = 20
 
@@ -57,7 +56,7 @@ class Adjusted:
     line_sigma_m: Floats
     #: Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any; shape (n,).
     weight: tuple[Floats, ...]
-    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run against those stated.
+    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run relative to the stated value.
 
 
 def adjust(
@@ -70,7 +69,7 @@ def adjust(
     limits: SurveyLimits | None = None,
     sigmas: Literal["none", "line"] = "none",
 ) -> Adjusted:
-    """Adjust the positions of all runs, with the line where passes are known; `repeats` of a row count as one."""
+    """Adjust the positions of all runs, with the line if passes are known; `repeats` of a row count as one."""
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
     columns: list[RunColumns] = []
@@ -107,7 +106,7 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Return each row's fraction of an independent position, by time and distance since the last, shape (n,)."""
+    """Return each row's fraction of an independent position, by time and distance since the last row, shape (n,)."""
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
@@ -194,12 +193,12 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
     return np.asarray(np.bincount(rows, weights=weight, minlength=len(run)) / np.maximum(count, 1))
 
 
-_ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes are found again.
-#: The directions are on separate tracks where they are apart by more than this many standard deviations of a run's
-#: offset: three of the difference of two.
+_ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes are searched again.
+#: The two directions are on separate tracks if their distance exceeds this many standard deviations of a run's offset:
+#: three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Way over which a change of direction is searched for [m].
-_END_POINTS: Final = 8  #: Points that show the direction at an end of the line.
+_TURN_M: Final = 40.0  #: Distance over which a change of direction is searched for [m].
+_END_POINTS: Final = 8  #: Number of points that determine the direction at an end of the line.
 _OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that represents the whole map.
 
 
@@ -207,19 +206,19 @@ _OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line
 class Survey:
     """A surveyed line."""
 
-    track: Track  #: Its standard deviations are the 95th percentiles of those along it.
+    track: Track  #: Its standard deviations are 95th percentiles along the line.
     #: Standard deviations of each point across the line and in height, shape (V,).
     sigma_plan_m: Floats
     sigma_height_m: Floats
     passes: Integers  #: Number of passes at each point, shape (V,).
     runs_ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, shape (n, 3).
-    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run against those stated.
+    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run relative to the stated value.
     beside_m: float  #: Length of the runs off the line.
     closed: bool
 
 
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
-    """Adjust runs to the map of one line, individually, then as passes. ValueError: they never move, or are apart."""
+    """Adjust runs to the map of one line, individually, then as passes. ValueError: runs never move, or are apart."""
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)
     axes = axes_at(origin)
@@ -274,16 +273,16 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
 
 
 def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
-    """Return the standard deviations in plan and height of what all positions of a single run share, shape (2,) [m].
+    """Return the sigmas in plan and height of the error common to all positions of a single run, shape (2,) [m].
 
-    In addition to `SurveyRun.common_sigma_m`, which is twice as large where no other run shows it: the sigmas that
-    single runs of low-cost receivers had without were half of their errors.
+    It is in addition to `SurveyRun.common_sigma_m`, and doubles it if no other run shows the common error: without it
+    the sigmas of single runs of low-cost receivers were half of their errors.
     """
     return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
 
 def _interpolate_positions(run: SurveyRun) -> Floats:
-    """Return positions with those that lack interpolated in time, shape (n, 3) [m]."""
+    """Return positions with missing ones interpolated in time, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
     return np.stack([np.interp(run.seconds, run.seconds[known], run.ecef_m[known, i]) for i in range(3)], axis=1)
 
@@ -308,7 +307,7 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return points of an open line without the points at its ends that are noise of standing runs."""
+    """Return the points of an open line without the noise of standing runs at its ends."""
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
@@ -323,7 +322,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return points that lead on from the last by half a spacing or more: standing runs add others by noise."""
+    """Return points that advance from the last by half a spacing or more: noise of standing runs adds others."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
@@ -337,7 +336,7 @@ def _points_ahead(plan_m: Floats) -> Indices:
 
 
 def _points_of_line(course: Course, ties: Ties) -> tuple[Indices, Integers]:
-    """Points of the line that a pass crosses, a closed one ending where it began, and the number of passes of each."""
+    """Return the points of the line crossed by passes (a closed line ends where it began), and the passes at each."""
     count = np.bincount(ties.point, minlength=len(course))
     kept = np.flatnonzero(count > 0)
     closed = course.closed and len(kept) == len(course)
@@ -360,7 +359,7 @@ def _notes(
     beside: float,
     apart: float,
 ) -> tuple[str, ...]:
-    """Return sentences on the runs and the line of them."""
+    """Return sentences on the runs and their line."""
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
     length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())

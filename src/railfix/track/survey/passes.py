@@ -1,6 +1,4 @@
-"""The line that the passes of several runs share: its course without repetitions, and the position of each
-pass on it.
-"""
+"""Common line of several runs: its course without repetitions, and the position of each pass on the line."""
 
 from __future__ import annotations
 
@@ -15,17 +13,17 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
-_SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.
-#: Parts of a leg nearer than this many widths (`same_line_m`) along it are no repetition of each other.
+_SAME_WAY: Final = 0.7  #: Cosine of the largest angle between two passes of one line.
+#: Parts of a leg nearer than this many widths (`same_line_m`) along the leg are no repetition of each other.
 _APART_WIDTHS: Final = 3.0
 _MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
-_SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
-#: Longest gap without rows [s]; a longer one is bridged over at most a distance [m], and only where the run continues
-#: in its direction: cosine of the largest angle.
+_SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is smoothed [m].
+#: Longest gap without rows [s]; a longer gap is bridged up to a distance [m], and only if the run continues in its
+#: direction, within an angle of this cosine.
 _GAP_S: Final = 10.0
 BRIDGED_M: Final = 500.0
 _GOES_ON: Final = 0.9
-_NEIGHBOURS: Final = 24  #: Neighbouring vertices that a point is compared with.
+_NEIGHBOURS: Final = 24  #: Number of neighbouring vertices that a point is compared with.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +96,7 @@ def directions(point_m: Floats, *, closed: bool = False) -> Floats:
 
 
 def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
-    """Divide a run where it turns back or was not observed; rows nearer than the spacing to the last are left out."""
+    """Divide a run where it turns back or was not observed; omit rows nearer than the spacing to the last row."""
     spacing_m = limits.spacing_m
     rows = [0]
     for k in range(1, len(point_m)):
@@ -132,7 +130,7 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
 
 
 def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
-    """Return whether a run goes on in its direction over the gap before a point."""
+    """Return whether a run continues in its direction over the gap before a point."""
     if not 0 < after < len(plan_m) - 1:
         return False
     gap = plan_m[after] - plan_m[after - 1]
@@ -193,7 +191,7 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return one turn of a closed line: from point `start` to `end`, the same point; the gap is distributed."""
+    """Return one turn of a closed line: from point `start` to the equal point `end`; the misclosure is distributed."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
@@ -208,7 +206,7 @@ def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Cou
 
 
 def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) -> Course | None:
-    """Return the course with the part of a leg that leads beyond one of its ends, None where none does."""
+    """Return the course extended by the part of a leg beyond one of its ends, None if there is none."""
     place, sign, _ = match_points(course, points, width_m)
     least = int(_APART_WIDTHS * width_m / spacing_m)
     near_end = 2.0 * width_m / spacing_m
@@ -273,7 +271,7 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
 
 
 def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:
-    """Find the pieces of all legs that lie on the course, and the length that does not [m]."""
+    """Find the pieces of all legs that are on the course, and the length off the course [m]."""
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     passes: list[Pass] = []
     beside = 0.0
@@ -337,7 +335,7 @@ def without_other_track(
 
 @dataclass(frozen=True, kw_only=True)
 class Ties:
-    """Where runs pass the points of the line, m ties."""
+    """Ties of runs to the points of the line, m ties."""
 
     run: Indices  #: Shape (m,).
     row: Indices  #: Rows of the run about the point, shape (m, 4).

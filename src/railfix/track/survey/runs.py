@@ -16,13 +16,13 @@ from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 
-#: Standard deviation of the error that all positions of a run share, by their quality (RTKLIB), plan and height [m]:
-#: orbits, ionosphere and reference frame, which averaging over the run does not reduce.
+#: Standard deviation of the common error of all positions of a run, by their quality (RTKLIB), plan and height [m]:
+#: orbits, ionosphere and reference frame, not reduced by averaging over the run.
 COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
-#: Standard deviation of the change of the vertical velocity in a second. Road vehicles: 0.02 to 0.07.
+#: Standard deviation of the change of the vertical velocity in one second; 0.02 to 0.07 for road vehicles.
 CLIMB_MPS2: Final = 0.05
 
 
@@ -30,13 +30,13 @@ class SurveyLimits(Settings):
     """Assumptions of a survey."""
 
     interval_s: float = Field(default=1.0, gt=0)  #: Least time between the positions used; faster logs are thinned.
-    #: Correlation of position errors in time at standstill and in distance: positions within it count as one.
+    #: Correlation of position errors, in time at standstill and in distance; positions within it count as one.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)
-    #: Standard deviation of the change of the horizontal velocity in a second, east and north: over five seconds, as
-    #: curves and braking last, three road vehicles' changes are 1.2 to 1.8 times the root of the time.
+    #: Standard deviation of the change of the horizontal velocity in one second, east and north: over five seconds, the
+    #: duration of curves and braking, the changes of three road vehicles are 1.2 to 1.8 times the root of the time.
     acceleration_mps2: float = Field(default=1.5, gt=0)
-    freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors: outliers lose their weight.
+    freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors, which down-weight outliers.
     same_line_m: float = option(
         "Passes nearer to each other than this, in the same or the opposite direction, are on one line.",
         20.0,
@@ -85,9 +85,9 @@ class SurveyRun(FrozenArrays):
     time: Datetimes  #: Shape (n,).
     ecef_m: Floats  #: NaN without a position, shape (n, 3).
     sigma_m: Floats  #: Standard deviations east, north, up; shape (n, 3).
-    #: Observations behind the positions: used instead of them, with several epochs at a time.
+    #: Observations behind the positions: used instead of the positions, with several epochs at a time.
     signals: RunSignals | None = None
-    #: Standard deviation, plan and height, of the error that all positions share.
+    #: Standard deviation, plan and height, of the common error of all positions.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
 
 
 def rows_apart(time: Datetimes, interval_s: float) -> Indices:
-    """Select rows at least an interval apart, to a twentieth of it."""
+    """Select rows at least an interval apart, with a tolerance of a twentieth of the interval."""
     since = seconds(time - time[0]) if len(time) else np.zeros(0)
     kept: list[int] = []
     for k, at in enumerate(since.tolist()):
