@@ -78,7 +78,7 @@ def campaign(
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
-    Exit codes are those of `railfix --help`; 5 where some runs have failed, 7 where all have failed.
+    Exit codes are listed in `railfix --help`; 5 where some runs have failed, 7 where all have failed.
     """
     with open_executor(workers, scheduler) as (executor, lost):
         prepare_kernels()
@@ -110,7 +110,7 @@ def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: floa
     sys.stderr.flush()
 
 
-#: Signals that end a worker process: Ctrl-C, and that of the pool whose other worker has ended.
+#: Signals that end a worker process: Ctrl-C, and the signal of the pool when another worker has ended.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -201,7 +201,7 @@ def benchmark(
 
     Example: `railfix benchmark cases --out benchmark`
 
-    Exit codes are those of `railfix --help`; 5 where some cases have failed, 7 where all have failed.
+    Exit codes are listed in `railfix --help`; 5 where some cases have failed, 7 where all have failed.
     """
     config, _ = resolve_settings(choices)
     show_benchmark(folder, config, out=out, workers=workers)
@@ -245,7 +245,7 @@ def ablate(
 
     For each choice: the rate of epochs with coordinates and of status ok, satellites used, the median
     standard deviation along the line; with `--truth` also the errors along the line (over 50 m counts as
-    a wrong position), of all epochs with coordinates and of those that are ok, of epochs without satellites, and the
+    a wrong position), of all epochs with coordinates, of ok epochs, of epochs without satellites, and the
     95th percentile of the error over its stated sigma. `ablation.csv` in DIR has all figures, with the conventional
     position; `ablation.json` has the record.
 
@@ -255,7 +255,7 @@ def ablate(
 
         railfix ablate ... --tachometer pulses.csv --inertial imu.csv --filter track --out sources
 
-    Exit codes are those of `railfix --help`.
+    Exit codes are listed in `railfix --help`.
     """
     settings, asked = resolve_settings(choices)
     inputs = inputs.replaced(config=choices.config)

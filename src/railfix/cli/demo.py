@@ -57,7 +57,7 @@ def demo(
 
     Example: `railfix demo --out first-look`
 
-    Exit codes are those of `railfix --help`; with `--real`, 3 also where the drive cannot be downloaded.
+    Exit codes are listed in `railfix --help`; with `--real`, 3 also where the drive cannot be downloaded.
     """
     if real:
         from railfix.cli.campaign import show_benchmark

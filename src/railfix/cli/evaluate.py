@@ -112,7 +112,7 @@ def evaluate(
 
         railfix evaluate gps gps-qzs --reference auto --label GPS --label GPS+QZS
 
-    Exit codes as `railfix --help` says.
+    Exit codes are listed in `railfix --help`.
     """
     if unknown := [name for name in inputs.table if name not in TABLES]:
         raise SettingsError(f"--table {unknown[0]}: no such table; known are {', '.join(TABLES)}")
@@ -179,7 +179,7 @@ def reference(
         railfix reference --rtk rtk.pos --track line.csv --vehicle car.toml \
             --front front.obs --nav brdc.nav --pulses tacho.csv --out reference
 
-    Exit codes are those of `railfix --help`; 7 where there are fewer than two good fixes.
+    Exit codes are listed in `railfix --help`; 7 where there are fewer than two good fixes.
     """
     asked = settings.model_dump(mode="json", exclude_unset=True)
     show_reference(reference_files(inputs, settings, out=out, options=options, asked=asked))
@@ -216,7 +216,7 @@ def error_model(
 ) -> None:
     """Model the errors of corrected pseudoranges: multipath of the line and receiver noise.
 
-    Each RUN is positioned once more with its own settings. The error of a pseudorange is its residual after the
+    Each RUN is positioned again with its own settings. The error of a pseudorange is its residual after the
     distance from the reference and the receiver clock are subtracted, and with `--base` also the residual of a
     nearby reference station to the same satellite. Without `--base` the model includes the orbit, clock and atmospheric
     errors of the days recorded: it is wider, and valid for such days.
@@ -227,7 +227,7 @@ def error_model(
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
-    Exit codes are those of `railfix --help`; 5 where run, reference and station do not match.
+    Exit codes are listed in `railfix --help`; 5 where run, reference and station do not match.
     """
     reference = beside.reference
     if len(reference) != len(runs):
@@ -320,7 +320,7 @@ def cn0_curve(
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 
-    Exit codes are those of `railfix --help`; 5 where the position or the navigation files do not match the log.
+    Exit codes are listed in `railfix --help`; 5 where the position or the navigation files do not match the log.
     """
     fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else parse_position(position, "--position")

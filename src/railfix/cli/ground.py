@@ -87,7 +87,7 @@ def monitor(
 
     Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
-    Exit codes are those of `railfix --help`; 5 where the logs have no satellite or no epoch in common.
+    Exit codes are listed in `railfix --help`; 5 where the logs have no satellite or no epoch in common.
     """
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
@@ -109,7 +109,7 @@ def monitor(
 
 
 def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits, times: MonitorLimits) -> None:
-    """Judge logs, or streams until they end or for a time; rows go to a file and orders are printed as they come."""
+    """Monitor logs, or streams until they end or for a time; write rows to a file and print orders as they occur."""
     import asyncio
     import time
 
@@ -207,7 +207,7 @@ def keys(
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
-    Exit codes are those of `railfix --help`; 8 where all certificates exist already.
+    Exit codes are listed in `railfix --help`; 8 where all certificates exist already.
     """
     from cryptography.x509 import load_pem_x509_certificate
 
@@ -250,7 +250,7 @@ def demo(choices: DemoChoices) -> None:
 
     Example: `railfix ground demo --hold 60`
 
-    Exit codes as `railfix --help` says.
+    Exit codes are listed in `railfix --help`.
     """
     import asyncio
     import secrets
@@ -324,7 +324,7 @@ def centre(
 
     Example: `railfix ground centre line.toml --password secret.txt`
 
-    Exit codes are those of `railfix --help`; 143 after SIGTERM.
+    Exit codes are listed in `railfix --help`; 143 after SIGTERM.
     """
     import asyncio
     import secrets
@@ -384,7 +384,7 @@ def train(
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes are those of `railfix --help`; also 0 where no authority came, which is reported on standard error.
+    Exit codes are listed in `railfix --help`; also 0 where no authority came, which is reported on standard error.
     """
     import asyncio
 

@@ -49,7 +49,7 @@ def locate(
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 
-    Exit codes are those of `railfix --help`; 7 where no epoch has a position.
+    Exit codes are listed in `railfix --help`; 7 where no epoch has a position.
     """
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -82,7 +82,7 @@ def which_track(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Decide which track a train at rest stands on, or report that it is undecided.
+    """Decide on which track a train at rest is, or report that it is undecided.
 
     Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
     codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
@@ -91,7 +91,7 @@ def which_track(
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
-    Exit codes are those of `railfix --help`; 5 where the train moves or no track is near.
+    Exit codes are listed in `railfix --help`; 5 where the train moves or no track is near.
     """
     check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -148,7 +148,7 @@ def convert(
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
 
-    Exit codes are those of `railfix --help`; 3 where a log contains nothing that was requested.
+    Exit codes are listed in `railfix --help`; 3 where a log contains nothing that was requested.
     """
     if out is None and nav_out is None:
         raise SettingsError("nothing to write: give --out for observations, --nav-out for ephemerides, or both")
@@ -189,7 +189,7 @@ def export(
 
     Example: `railfix export results --out positions.gpkg`
 
-    Exit codes are those of `railfix --help`; 4 where a package is not installed, 7 where no epoch has a position.
+    Exit codes are listed in `railfix --help`; 4 where a package is not installed, 7 where no epoch has a position.
     """
     tables = list_position_tables(run)
     if filtered and tables and "train" not in tables:

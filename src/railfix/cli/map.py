@@ -71,7 +71,7 @@ def check(
 
     Example: `railfix map check line.csv --out report`
 
-    Exit codes are those of `railfix --help`; 6 where the track map has errors.
+    Exit codes are listed in `railfix --help`; 6 where the track map has errors.
     """
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
@@ -124,9 +124,9 @@ def features(
 ) -> None:
     """List the features of a line: the positions where its gradient or curvature changes.
 
-    A train that measures the same change knows its position (`railfix.motion.features`). Changes are computed over 15
-    m, about the distance of two bogies. With `--run` the features are those that several runs measured consistently:
-    their positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
+    A train that measures the same change can determine its position (`railfix.motion.features`). Changes are computed
+    over 15 m, about the distance of two bogies. With `--run` the features are the changes that several runs measured
+    consistently: their positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
 
     Example:
 
@@ -134,7 +134,7 @@ def features(
 
         railfix map features line.csv --run results-1 --run results-2
 
-    Exit codes are those of `railfix --help`; 3 also where a run has no measurements.
+    Exit codes are listed in `railfix --help`; 3 also where a run has no measurements.
     """
     import polars as pl
 
@@ -220,7 +220,7 @@ def from_positions_command(
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 
-    Exit codes are those of `railfix --help`; 3 also where the positions form no line.
+    Exit codes are listed in `railfix --help`; 3 also where the positions form no line.
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")

@@ -120,7 +120,7 @@ def network(
 
     Example: `railfix map network tracks.gpkg --out network.png`
 
-    Exit codes are those of `railfix --help`; 6 where the network has gaps, kinks, or connections that do not meet.
+    Exit codes are listed in `railfix --help`; 6 where the network has gaps, kinks, or connections that do not meet.
     """
     check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
     tracks = _network(maps, reading, connecting)
@@ -168,7 +168,7 @@ def route(
 
     Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
 
-    Exit codes are those of `railfix --help`; 5 where no route connects two positions.
+    Exit codes are listed in `railfix --help`; 5 where no route connects two positions.
     """
     files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=files)
@@ -249,7 +249,7 @@ def match_command(
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
 
-    Exit codes as `railfix --help` says.
+    Exit codes are listed in `railfix --help`.
     """
     picture, page = options.picture, options.page
     check_outputs((out, "csv"), (picture, "picture"), (page, "page"), overwrite=overwrite, inputs=[*maps, log])

@@ -253,7 +253,7 @@ class Choices(Settings):
 
 
 def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the settings of the file overridden by those of the command line, and those that were given explicitly."""
+    """Return the file's settings overridden by the command line's, and the settings that were given explicitly."""
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:

@@ -67,14 +67,14 @@ def report(
     It begins with one sentence, five key figures, the plan of the line coloured by error, and the error over chainage
     compared with the conventional one. Below, folded: figures of merit, counts, protection levels, settings and inputs,
     each table with a CSV download. Then the charts of each antenna: errors, protection levels, intervals and, with
-    `railfix run --observations`, sky, C/N0 and screens. The page lists what it leaves out and why. Errors need
+    `railfix run --observations`, sky, C/N0 and screens. The page lists omitted parts with the reasons. Errors need
     `--reference`.
 
     The page contains everything it shows: it opens without a network and can be sent and printed.
 
     Example: `railfix report results --reference truth.csv --out report.html`
 
-    Exit codes are those of `railfix --help`; 4 where the number of references does not match the runs, 5 where a
+    Exit codes are listed in `railfix --help`; 4 where the number of references does not match the runs, 5 where a
     reference is of another time.
     """
     in_runs = [
@@ -117,14 +117,14 @@ def explain(
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page with the sky as well.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain one epoch: its position, every satellite with its outcome, and what set sigma, level and status.
+    """Explain one epoch: its position, every satellite with its outcome, and the causes of sigma, level and status.
 
-    For each satellite that was used it prints how far the position of the single epoch would move along the line
-    without it. The epoch nearest to the time is taken, a minute away at most.
+    For each used satellite it prints the shift of the single-epoch position along the line without it. The epoch
+    nearest to the time is taken, a minute away at most.
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
-    Exit codes are those of `railfix --help`; 4 where the time or the antenna does not exist, 5 where no epoch is near
+    Exit codes are listed in `railfix --help`; 4 where the time or the antenna does not exist, 5 where no epoch is near
     the time.
     """
     inputs = sorted(run.iterdir()) if run.is_dir() else []
@@ -152,7 +152,7 @@ def plot_screens(
 
     Example: `railfix plot-screens results --out results/screens`
 
-    Exit codes as `railfix --help` says.
+    Exit codes are listed in `railfix --help`.
     """
     with OutputFolder(out, overwrite=overwriting(overwrite)) as folder:
         with reading_table(run / "observations.parquet"):

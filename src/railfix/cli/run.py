@@ -47,11 +47,11 @@ def run(
       position: chainage, its standard deviation, coordinates, and the conventional position for
       comparison
     - `train.csv` and `train.parquet`: positions of the filter along the track over all epochs so far,
-      with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also by
-      what was measured later
+      with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also by later
+      measurements
     - `tracks.csv` and `tracks.parquet` (TRACK a network of tracks in one file): every track near each position with
       its probability; the route is found from the log, and alternatives are named
-    - `track.csv`: the track as it was used, where it is not that of its file (route of a network, other heights or
+    - `track.csv`: the track as used, where it differs from its file (route of a network, other heights or
       frame)
     - `observations.parquet` (with `--observations`): one row per epoch, satellite and signal
     - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and
@@ -65,7 +65,7 @@ def run(
         railfix run --front front.obs --rear rear.obs --nav brdc.nav \
             --track line.csv --vehicle car.toml --out results
 
-    Exit codes as `railfix --help` says.
+    Exit codes are listed in `railfix --help`.
     """
     settings, asked = resolve_settings(choices)
     inputs = inputs.replaced(config=choices.config)
@@ -98,8 +98,8 @@ def live(
     r"""Position a train from its receivers' streams, one message a period.
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
-    the moment they are complete, SBAS messages with `--sbas stream`. The positions are those of `railfix run` on the
-    same epochs, with sensors on board too. A period without input has a message. Connections that break are opened
+    the moment they are complete, SBAS messages with `--sbas stream`. The positions equal those of `railfix run` on the
+    same epochs, with sensors on board too. A period without input has a message, too. Connections that break are opened
     again. The program ends when its files end, or on SIGINT or SIGTERM; SIGHUP has no effect but a message.
 
     Example:
@@ -107,7 +107,7 @@ def live(
         railfix live --front tcp://127.0.0.1:3001 --rear tcp://127.0.0.1:3002 --track line.csv \
             --vehicle car.toml --send json@- --send cbor@udp://127.0.0.1:4000
 
-    Exit codes are those of `railfix --help`; 9 where two channels disagree, 143 after SIGTERM.
+    Exit codes are listed in `railfix --help`; 9 where two channels disagree, 143 after SIGTERM.
     """
     import asyncio
 

@@ -75,7 +75,7 @@ def simulate(
 
     Example: `railfix simulate demo --out simulated`
 
-    Exit codes are those of `railfix --help`; 5 where the navigation file does not cover the scenario's time.
+    Exit codes are listed in `railfix --help`; 5 where the navigation file does not cover the scenario's time.
     """
     if list_shipped:
         for name in list_scenarios():

@@ -35,7 +35,7 @@ class RailfixError(Exception):
 
 
 class RailfixWarning(UserWarning):
-    """A limitation of a result that the caller may not know: the command line prints it as a note."""
+    """A limitation of a result that the caller may be unaware of: the command line prints it as a note."""
 
 
 def warn_of(notes: Iterable[str]) -> None:

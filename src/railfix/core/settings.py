@@ -107,7 +107,7 @@ def option(
     """Return a field of a `Settings` model that is an option of the command line as well; required without `default`.
 
     `name` is ``--field-name`` unless given; a field with two words (`Literal`) and a default becomes a switch where it
-    has a name. `panel` is the heading in the help text; `limits` are those of `pydantic.Field`.
+    has a name. `panel` is the heading in the help text; `limits` are passed to `pydantic.Field`.
     """
     extra: Any = {"option": name, "metavar": metavar, "panel": panel}
     return Field(default, description=text, json_schema_extra=extra, **limits)

@@ -54,6 +54,6 @@ def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputErro
 
 
 def check_path(path: object, *, what: str = "a path") -> None:
-    """Raise SettingsError where a value is not a path; `what` names what was expected."""
+    """Raise SettingsError where a value is not a path; `what` names the expected item."""
     if not isinstance(path, str | os.PathLike):
         raise SettingsError(f"{what} was expected, got {type(path).__name__}")

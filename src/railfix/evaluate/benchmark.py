@@ -165,7 +165,7 @@ _OF_STANFORD: Final = (
     "alarm_limit_m", "judged", "nominal", "misleading", "hazardously_misleading", "unavailable",
     "unavailable_misleading", "availability", "continuity_15_s",
 )  # fmt: skip
-#: Columns of the table with their meaning; those of `railfix evaluate` are its figures.
+#: Columns of the table with their meaning; columns of `railfix evaluate` are its figures.
 BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     "case": "name of the folder",
     "held_out": "no test reads the case, no setting was chosen with it",

@@ -296,7 +296,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return runs with short distinct names, which include the table where it is not that of single epochs."""
+    """Return runs with short distinct names, which include the table where it is not the single-epoch table."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
@@ -317,7 +317,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return every grouping of every run; for several runs also those of each configuration."""
+    """Return every grouping of every run; for several runs also the groupings of each configuration."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]

@@ -86,7 +86,7 @@ def along_track_error(
 
     The distance along the line. Where the map passes the reference point more than once (laps, a road's two
     carriageways) the pass nearest to the position counts, as the ranges of one epoch cannot distinguish them. Where the
-    line comes back near itself (a crossing), the straight distance between the two points counts if it is shorter. On a
+    line returns near itself (a crossing), the straight distance between the two points counts if it is shorter. On a
     line that passes every point once neither rule has an effect, except for the chord of a curve.
 
     `arc_m` are the positions along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
@@ -142,7 +142,7 @@ _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Files that replace those of ``run.json``, and options for reading the track (except `reading.reference`)."""
+    """Files that replace the files of ``run.json``, and options for reading the track (except `reading.reference`)."""
 
     track: tuple[Path, ...] = option("Track that replaces the one in run.json.", (), metavar="TRACK", panel=INPUTS)
     vehicle: Path | None = option("Vehicle that replaces the one in run.json.", None, metavar="TOML", panel=INPUTS)
@@ -241,7 +241,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
 def _note_of_passes(
     antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
 ) -> tuple[str, ...]:
-    """Note the number of errors to another pass of the line than that of the reference's own nearest point."""
+    """Note the number of errors to another pass of the line than the pass of the reference's nearest point."""
     known = np.isfinite(error_m)
     nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
     others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())
@@ -318,7 +318,7 @@ def find_trajectory(
 
 
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
-    """Return options for reading the track: the given ones, then those of the file, then those in ``run.json``."""
+    """Return options for reading the track: the given options, then the file's, then the options in ``run.json``."""
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):
         return [given]

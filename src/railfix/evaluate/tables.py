@@ -351,7 +351,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
 
 def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str, str]]]:
-    """Return all tables except that of epochs, by name, with the meaning of their columns."""
+    """Return all tables except the table of epochs, by name, with the meaning of their columns."""
     tables: dict[str, tuple[pl.DataFrame | None, Mapping[str, str]]] = {
         "figures": (evaluation.figures, FIGURE_COLUMNS),
         "intervals": (evaluation.intervals, INTERVAL_COLUMNS),

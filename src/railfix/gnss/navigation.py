@@ -1,7 +1,7 @@
 """Broadcast and precise ephemerides as read-only arrays.
 
 One row of a record table is one navigation message of one satellite. All times are GPS time.
-Units are those of the interface documents (SI, radians). Absent is NaN (NaT for times).
+Units follow the interface documents (SI, radians). Absent is NaN (NaT for times).
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ class Authority(Settings):
     report: Number
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
-    stopped: bool  #: The train is ordered to stop.
+    stopped: bool  #: Whether the train is ordered to stop.
     #: The train is requested to accept this end instead of a farther end, if it can stop before it.
     shortens: bool = False
     session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Identifier of the on-board start that `report` belongs to.

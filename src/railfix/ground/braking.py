@@ -43,7 +43,7 @@ class Target(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Gradients as steps: uphill positive, from one position to the next; level before the first."""
+    """Stepwise gradients, uphill positive, each from its position to the next; level before the first position."""
 
     from_m: Sequence[float] = ()
     gradient: Sequence[float] = ()

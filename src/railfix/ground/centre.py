@@ -134,13 +134,13 @@ class TrainRecord:
 
     train: int
     state: TrainState = TrainState.UNKNOWN
-    sequence: int = -1  #: Newest sequence number received, -1 without one.
+    sequence: int = -1  #: Newest sequence number received, -1 before the first.
     session: int = 0  #: On-board start that the number belongs to.
     retired: tuple[int, ...] = ()  #: Earlier on-board starts, whose late messages are ignored.
-    counted_s: float | None = None  #: Centre's clock when that number arrived.
+    counted_s: float | None = None  #: Centre's clock at the arrival of this number.
     rejected: str | None = None  #: Reason why the newest report was rejected.
     message: TrainMessage | None = None  #: Newest report with a position.
-    heard_s: float = 0.0  #: Centre's clock (monotonic) when that report arrived.
+    heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of this report.
     measured_s: float = 0.0  #: Centre's clock at the instant for which its position is valid.
     shown_m: float | None = None  #: Displayed position of the front.
     #: Reported less simulated position at the last resynchronisation, positive in running direction.

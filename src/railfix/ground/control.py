@@ -83,7 +83,7 @@ class ControlCentre:
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Trains that are ordered to stop.
     #: Access to the store; in a thread where the centre is a process.
     commits: Commits = field(default_factory=Commits)
-    #: Requests the detection of points from the field; `Supervision.set_detected` takes the answer.
+    #: Requests the detection of points from the field; `Supervision.set_detected` processes the answer.
     ask: Callable[[PointName], None] = lambda _: None
     #: Suspicions in the newest report of each train.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)

@@ -1,6 +1,6 @@
 """Demonstration of the ground side: two trains on a line with a passing loop, disturbed links, a satellite fault.
 
-The centre is that of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the simulated traffic.
+It uses the centre of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the simulated traffic.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ class LinkedTraffic(Traffic):
 
     links: dict[int, TrainLinks]
     control: ControlCentre
-    verdicts: list[tuple[TriangleVerdict, int]]  #: Fixes of the triangle, one per second.
+    verdicts: list[tuple[TriangleVerdict, int]]  #: Verdicts of the triangle, one per second.
     rest_s: float | None = None  #: Time when all trains had stopped.
 
     def step(self) -> None:

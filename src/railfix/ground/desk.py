@@ -65,7 +65,7 @@ class OrderDesk:
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
-        """Return None if an order confirms the first one in time, otherwise the next step."""
+        """Return None if an order confirms the first order in time, otherwise the next step."""
         key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:

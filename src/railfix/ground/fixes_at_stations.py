@@ -243,7 +243,7 @@ class StationStreams:
         if tag_ns % 1_000_000_000 or tag <= self._done:
             return None
         for later, epochs in list(self._waiting.items()):
-            # future time tags of one receiver would displace those of the others
+            # future time tags of one receiver would displace the other receivers' epochs
             if later > tag and epochs.pop(receiver, None) is not None and not epochs:
                 del self._waiting[later]
         together = self._waiting.setdefault(tag, {})

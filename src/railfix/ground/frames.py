@@ -2,7 +2,7 @@
 
 The links below encrypt and authenticate (QUIC, TLS 1.3); the CRC is a check against faults of the layers between,
 not cryptography. A receiver uses each frame once, whichever link delivers it first, and no frame that is older than a
-used one.
+used frame.
 """
 
 from __future__ import annotations
@@ -101,10 +101,10 @@ class Echo(NamedTuple):
 class ReceiverLimits(Settings):
     """Limits of a receiver."""
 
-    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed one.
+    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed delay.
     #: Largest relative drift of the clocks; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Largest lead of a sequence number over the newest one, and its growth per second since then.
+    #: Largest lead of a sequence number over the newest number, and its growth per second since then.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=100.0, gt=0)
 

@@ -21,7 +21,7 @@ from railfix.track.network import Network
 
 #: Points: station and side, -1 at the end of lower chainage, 1 at the end of higher chainage.
 PointName = tuple[int, int]
-#: Most changes of gradient in one authority.
+#: Largest number of gradients in one authority.
 MOST_PARTS: Final = 16
 #: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single line with the points,
 #: 2 k + t is track t of station k.
@@ -145,7 +145,7 @@ class Layout(Settings):
         return last if direction > 0 else first
 
     def points(self) -> Iterator[PointName]:
-        """Return all points; the outer ones of the first and the last station do not exist."""
+        """Return all points; the outer points of the first and the last station do not exist."""
         return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
@@ -207,9 +207,9 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
     """Return the layout of a network that is one single line with passing loops.
 
     Its chainage begins at one end and follows the single line and track 1 of each station. A station is a pair of
-    tracks between the same two switches; the line is single between stations and beyond the outer ones. Points reach
-    from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the side on
-    which they drive: their track is track 1. MismatchError: the network is not such a line: several lines,
+    tracks between the same two switches; the line is single between stations and beyond the outer stations. Points
+    reach from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the
+    side on which they drive: their track is track 1. MismatchError: the network is not such a line: several lines,
     branches, stations of three tracks, loops of unequal length.
     """
     ends = network.joints.tolist()

@@ -114,7 +114,7 @@ class LinkMeter:
 
 
 LinkName = Literal["A", "B"]
-LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or only the active one.
+LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or only the active link.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -395,7 +395,7 @@ class CentreLinks:
                 protocol.send(data)
 
     async def _watch(self) -> None:
-        """End connections whose certificate has expired or is revoked meanwhile."""
+        """End connections whose certificate has since expired or been revoked."""
         while True:
             try:
                 self._revoked, self.alarm = read_revoked(self._keys), None

@@ -79,7 +79,7 @@ class OnBoard:
     stops_at_m: float | None = None
     #: Time of sending of the newest report that an authority has answered; None before the first.
     answered_s: float | None = None
-    #: Newest report from before the last change of ends, or from before this start: answers to it or to an older one
+    #: Newest report from before the last change of ends, or from before this start: answers to it or to an older report
     #: are rejected.
     before_turn: int = -1
 
@@ -108,7 +108,7 @@ class OnBoard:
         """Store the train's safe ends and speed; a single wrong position cannot accept a shorter end.
 
         A train that has rolled back brakes: earlier grants of the centre do not include it. Without a position or a
-        speed it continues from the previous one (`OnBoardLimits.placeless_s`).
+        speed it continues from the previous position (`OnBoardLimits.placeless_s`).
         """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
         if safe_front_m is None:
@@ -134,7 +134,7 @@ class OnBoard:
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:
-        """End the authority at the front: a train that was stopped by order gets a new one with its release."""
+        """End the authority at the front: a train that was stopped by order gets a new authority with its release."""
         self.end_m = self.direction * min(self.direction * self.end_m, self.direction * front_m)
         self._granted = False
 
@@ -198,7 +198,7 @@ class OnBoard:
         return not authority.shortens or agrees or self._granted
 
     def acknowledgement(self) -> dict[str, int]:
-        """Return the fields of a report on the orders that the train has: none before the first."""
+        """Return the fields of a report on the train's orders; no fields before the first order."""
         order = {} if self.order is None else {"brake_order": self.order.number}
         if self.number < 0:
             return order

@@ -24,7 +24,7 @@ Clock = Literal["live", "replay"]
 async def read_positions(
     lines: AsyncIterator[str], *, rejected: Callable[[str], None], clock: Clock = "live"
 ) -> AsyncIterator[TrainMessage]:
-    """Yield the position messages in lines; other lines are rejected with a sentence, and the next line counts.
+    """Yield the position messages in lines; other lines are rejected with a message and skipped.
 
     With the clock "replay" messages are delayed as their positions were recorded. Their times are then replaced by the
     present time, so that the centre accepts the positions as new.

@@ -37,7 +37,7 @@ WAIT_S: Final = 0.2
 ACKNOWLEDGE_S: Final = 1.5
 #: Largest number of handshakes of one peer in progress.
 MOST_HANDSHAKES: Final = 64
-#: Receive buffer for packets that arrive while the centre is busy; the default one overflows with a thousand trains
+#: Receive buffer for packets that arrive while the centre is busy; the default buffer overflows with a thousand trains
 #: after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
 _REJECTED: Final = 0x101

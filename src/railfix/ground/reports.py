@@ -179,7 +179,7 @@ def too_fast(report: PlacedReport) -> str | None:
 
 
 def older_place(report: PlacedReport) -> str | None:
-    """Return the reason if a position is older than the previous one."""
+    """Return the reason if a position is older than the previous position."""
     older = report.elapsed_s is not None and report.elapsed_s < 0.0
     return "the position is older than in the previous report" if older else None
 
@@ -336,7 +336,7 @@ def report_received(
 
 
 def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:
-    """Return the rear end confirmed by two consecutive reports, along the facing; one alone cannot move it [m]."""
+    """Return the rear end confirmed by two consecutive reports, along the facing [m]; one report cannot move it."""
     return min(facing * rear_m, facing * claimed_m)
 
 

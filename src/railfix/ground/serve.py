@@ -198,7 +198,7 @@ async def run_centre(
 
     Returns whether SIGTERM ended it, and figures of the session.
 
-    The page is at a host and port, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
+    The page is at a host and port, port 0 takes a free port; beyond loopback addresses it is served by TLS with the
     centre's certificate. `password` permits orders, and `people` has personal passwords by name. Orders have a separate
     address where one is given, otherwise the page's address. `announce` is called with each address once trains can
     connect. InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an

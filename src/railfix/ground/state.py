@@ -52,7 +52,7 @@ class TrainInterval:
     station: int  #: Station where the route ends.
     length_m: float  #: Length of the train as configured.
     standstill: bool = True
-    #: Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
+    #: Safe rear end of the newest report; the interval begins there once the next report confirms it. None where the
     #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
     line: int | None = None  #: Line of the train's reports; None before the first.
@@ -64,12 +64,12 @@ class TrainInterval:
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
     #: Number of the newest authority by which it may run, sent or named by a report; None before the first, and once a
-    #: report names an order to brake of that number or a later one: no authority in transit ends that order.
+    #: report names an order to brake of that number or later: no authority in transit ends that order.
     runs_by: int | None = None
     stop: str | None = None  #: Reason of the stop, until the train is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests it.
-    held: bool = False  #: A route was taken back: the next one is set by hand.
+    held: bool = False  #: Whether a route was taken back: the next route is set by hand.
     parted: int | None = None  #: Train that was divided from the rear of this one, until they are apart.
 
     @cached_property
@@ -107,11 +107,11 @@ ROUNDING_M: Final = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
-    """Positions of the points in the interlocking."""
+    """State of points in the interlocking."""
 
     wanted: int = 1  #: Commanded track.
     detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
-    #: The field has been given the command since `wanted` was stored.
+    #: Whether the field has received the command since `wanted` was stored.
     commanded: bool = True
     #: Trains that lock the points: None until the train's rear end has passed, then the time of release [s].
     locked: Mapping[int, float | None] = field(default_factory=dict)
@@ -152,7 +152,7 @@ def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
 
 
 def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
-    """Return the state with trains stopped; one that is stopped already keeps its reason."""
+    """Return the state with trains stopped; a train already stopped keeps its reason."""
     for number in trains:
         known = state.trains[number]
         if known.stop is None:

@@ -59,7 +59,8 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     """Return the state with the stop of one train released by hand, and the reason of a refusal.
 
     Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
-    report names its line. Its station becomes the farthest that its front has reached, on its track there.
+    report names its line. Its station becomes the farthest station that its front has reached, on the train's track
+    there.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -159,7 +160,7 @@ def ask_route_back(
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
     """Return the state after a report that may answer: the route is released where the train agrees, else kept.
 
-    For a stopped train, whose report may be wrong, no answer counts until it is released.
+    For a stopped train, whose report may be wrong, no answer is used until it is released.
     """
     known = state.trains[message.train]
     if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:

@@ -45,7 +45,7 @@ async def run_train(
     The folder `keys` has the train's own two files and ``authority.pem``. The positions are messages as written by
     `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
     (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, its `is_complete` replaces
-    that of the messages. InputFileError: when a key is not there.
+    the messages' value. InputFileError: when a key is missing.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()

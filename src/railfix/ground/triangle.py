@@ -32,7 +32,7 @@ YEAR_S: Final = 31_557_600.0
 
 
 class TriangleVerdict(IntEnum):
-    """Verdict on one set of three fixes; every one from `ONE_RECEIVER` on stops the trains."""
+    """Verdict on a set of three fixes; every verdict from `ONE_RECEIVER` on stops the trains."""
 
     #: Every fix is inside its circle, and every side within its limit.
     HEALTHY = 0
@@ -182,7 +182,7 @@ def _verdicts(
             ~present & all_fallen,
             ~present,
             (outside == 0) & small.all(axis=1),
-            # a drift passes one of its two limits first, by noise
+            # with noise, a drift exceeds one of its two limits first
             (outside == 0) & ((named >= 0) | (small.sum(axis=1) == 2)),
             (outside == 1) & own_outside,
             (outside == 3) & small.all(axis=1),
@@ -206,11 +206,11 @@ def _verdicts(
 class Order(Enum):
     """Order of the monitor to the trains, in the order they are sent."""
 
-    #: Satellite positioning is suspended: its positions are not used any more.
+    #: Suspend satellite positioning: its positions are no longer used.
     SUSPEND = "suspend satellite positioning"
-    #: Trains that depend on it stop.
+    #: Stop trains that depend on satellite positioning.
     STOP = "stop"
-    #: Satellite positioning may be used.
+    #: Resume the use of satellite positioning.
     RESUME = "resume satellite positioning"
 
 

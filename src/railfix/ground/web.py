@@ -38,7 +38,7 @@ MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
 #: A connection without a whole request for this time ends, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
-#: Connections at a time; further ones are refused. Connections of one peer without a complete request.
+#: Largest number of connections, further ones are refused; and of a peer's connections without a complete request.
 MOST_CONNECTIONS: Final = 500
 MOST_IDLE: Final = 20
 #: Name for a log-in by the password alone.

@@ -45,7 +45,7 @@ class NamedColumns:
     line: Integers  #: Shape (n,).
     cells: dict[str, pl.Series]  #: Cells of each column, stripped.
     separator: str = ","  #: Column separator; if it is not a comma, numbers may have decimal commas.
-    #: Original names of columns that were renamed to those of railfix (`with_usual_names`).
+    #: Original names of columns that were renamed to railfix's names (`with_usual_names`).
     usual: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:

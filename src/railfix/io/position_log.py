@@ -244,7 +244,7 @@ def _times(texts: list[str]) -> Datetimes:
 
 # --- RTKLIB ------------------------------------------------------------------
 
-#: Columns of a table by those of RTKLIB's solution.
+#: Columns of a table by the columns of RTKLIB's solution.
 _OF_RTKLIB: Final = {
     "latitude": "latitude_deg", "longitude": "longitude_deg", "height": "height_m", "x-ecef": "x_m", "y-ecef": "y_m",
     "z-ecef": "z_m", "Q": "quality", "sdn": "sigma_north_m", "sde": "sigma_east_m", "sdu": "sigma_up_m",

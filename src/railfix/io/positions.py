@@ -137,7 +137,7 @@ def read_positions(
     NoPositionError
         No row has a position.
     SettingsError
-        `columns` names a column that railfix does not know, or the file is no table.
+        `columns` names a column unknown to railfix, or the file is not a table.
     """
     check_path(path)
     kind = find_kind(path)

@@ -90,8 +90,8 @@ def read_reference(
     Returns
     -------
     dict of str to AntennaReference
-        Of rows with the same time the first is used. ``source`` is that of the file; otherwise "truth" for files of the
-        simulator, "rtk" for position logs.
+        Of rows with the same time the first is used. ``source`` is taken from the file; otherwise it is "truth" for
+        files of the simulator, "rtk" for position logs.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Tables of the sensors on board, CSV (also packed) or Parquet, and those of EGNSS MATE with the same columns."""
+"""Tables of the sensors on board, CSV (also packed) or Parquet, and EGNSS MATE tables with the same columns."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
 
 
 def names_of_columns(kind: str) -> list[str]:
-    """Return the names of the columns of a table, those that may be absent among them, without the time."""
+    """Return the names of the columns of a table, including columns that may be absent, without the time."""
     return [column.strip("[]") for column in COLUMNS[kind]]
 
 
@@ -131,7 +131,7 @@ def _numbers(path: FilePath, column: pl.Series, kind: str, silent: pl.Series | N
     return numbers
 
 
-#: Columns of a sensor's table by those of EGNSS MATE.
+#: Columns of a sensor's table by EGNSS MATE columns.
 _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
     "S_IMU": {
         "SPEC_FORCE_X": "force_forward_mps2", "SPEC_FORCE_Y": "force_right_mps2", "SPEC_FORCE_Z": "force_down_mps2",

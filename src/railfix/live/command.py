@@ -96,7 +96,7 @@ def _files_read(inputs: LiveInputs) -> list[Path]:
 
 
 def _check_outputs(inputs: LiveInputs) -> None:
-    """Raise OutputError where a file to be written is one that is read, or is written twice."""
+    """Raise OutputError if a file to be written is also read, or is written twice."""
     named = [parse_file_target(text) for text in inputs.send]
     written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
     for k, path in enumerate(written):

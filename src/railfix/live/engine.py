@@ -57,7 +57,7 @@ class EngineState:
     state: State
     done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
     last_tag: Mapping[str, int]  #: Last time tag of each antenna.
-    #: Number of the last message, or a higher one that no message reaches before the next state is saved.
+    #: Number of the last message, or a higher number that no message reaches before the next state is saved.
     sequence: int
     #: Direction of the train's front end along the chainage.
     running: RunningEnd = field(default_factory=lambda: RunningEnd(direction=0))
@@ -243,7 +243,7 @@ class LiveEngine:
                 f"state file: not used but for ephemerides and the sequence number: its last epoch is "
                 f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
-        # Data known from the start of this session are merged with those of the file.
+        # Data known from the start of this session are merged with the data of the file.
         known = self.processor.received.navigation
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
@@ -285,7 +285,7 @@ class LiveEngine:
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """Return the messages due, for complete pairs, epochs that waited long enough, and periods without input.
 
-        `now_ns` is on the clock that `push` was given, `sent_ns` the GPS time of sending for the message; one message
+        `now_ns` is on the clock used for `push`, `sent_ns` the GPS time of sending for the message; one message
         is then sent per period, for the newest epoch. Without it (recorded epochs, whose tags are the clock) every
         epoch has its message; at `END_NS` all waiting epochs are due, and no period without input follows.
         """

@@ -29,7 +29,7 @@ _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
 def json_bytes(output: LiveOutput) -> bytes:
-    """Return one line of JSON."""
+    """Return the output as a JSON line."""
     return to_json(output.message).encode() + b"\n"
 
 

@@ -76,7 +76,7 @@ def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
 
 
 def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the position of the train by one antenna."""
+    """Return the position of the train from one antenna."""
     antenna, track = result.antennas[name], result.fusion.get(name)
     place, status = _place_and_status(antenna, track)
     arc, sigma = float(antenna.arc_m[-1]), float(antenna.along_sigma_m[-1])
@@ -156,7 +156,7 @@ def create_message(
 
 
 def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return the fields that identify the train, and the unknown ones."""
+    """Return the fields that identify the train, and the names of unknown fields."""
     length, front = frame.length_m, frame.ends(running).front_m
     unknown = Unknown(0)
     for what, known in (

@@ -278,7 +278,7 @@ class _Session:
     def send(self, sink: Sink, output: LiveOutput) -> None:
         """Pass an output to a sink; a sink that cannot be written has ended, the others continue.
 
-        OutputError: none is left.
+        OutputError: no sink is left.
         """
         try:
             sink.send(output)

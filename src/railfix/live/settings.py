@@ -18,7 +18,7 @@ class LiveSettings(Settings):
 
     #: Period of messages, also without input (P1 2.1: 0.1 s).
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
-    #: Longest wait for the other antenna's epoch after the first one of a pair has arrived.
+    #: Longest wait for the other antenna's epoch after a pair's first epoch has arrived.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     #: Longest wait for on-board sensor samples up to an epoch; samples still missing since the previous epoch are then
     #: not used.
@@ -38,7 +38,7 @@ class LiveSettings(Settings):
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
     #: Certificates (PEM) of casters over TLS, in addition to the system's certificates.
     ntrip_certificates: Path | None = None
-    #: Messages that may wait for a slow target; further ones are dropped for it and counted.
+    #: Number of messages that may wait for a slow target; further messages to it are dropped and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
     #: Delay above the shortest observed delay at which epochs are skipped up to the present, with a log line; not for
     #: recorded epochs.

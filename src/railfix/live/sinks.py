@@ -94,7 +94,7 @@ class Outlet(Generic[Item]):
 _LARGEST_BACKLOG: Final = 1 << 20
 #: Longest wait for the answer of an MQTT broker [s].
 _ANSWER_S: Final = 10.0
-#: Longest wait for messages that a broker has not taken at the end [s].
+#: Longest wait at the end for messages that a broker has not accepted [s].
 _LEFT_S: Final = 2.0
 _HELP: Final = (
     "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, passings, TARGET -, a file, "
@@ -105,7 +105,7 @@ _HELP: Final = (
 class Sink(Protocol):
     """Receiver of outputs that never waits, and counts the outputs that its reader has missed."""
 
-    name: str  #: For counts and messages.
+    name: str  #: Name in counts and messages.
     dropped: int  #: Number of messages dropped for a slow reader.
     failed: int  #: Number of messages that the target refused.
     failure: str  #: Reason for refusing the last message; blank if it was accepted.
@@ -119,7 +119,7 @@ class Sink(Protocol):
 
 @dataclass
 class ByteTarget:
-    """A file or the standard output, unbuffered: a reader sees a message at once, and no lock is kept meanwhile."""
+    """A file or the standard output, unbuffered: a message reaches its reader at once, without holding a lock."""
 
     form: Form
     file: IO[bytes]
@@ -148,7 +148,7 @@ class UdpTarget:
     socket: socket.socket = field(default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
 
     def send(self, output: LiveOutput) -> None:
-        """Send one datagram, none where the form yields nothing."""
+        """Send one datagram, none if the form yields no bytes."""
         if data := whole_message(self.form, output):
             self.socket.sendto(data, self.address)
 
@@ -186,7 +186,7 @@ class MqttTarget:
             raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker refuses the connection ({answer})")
 
     def send(self, output: LiveOutput) -> None:
-        """Publish one message, none where the form yields nothing.
+        """Publish one message, none if the form yields no bytes.
 
         OutputError: no connection, or the broker is too slow.
         """

@@ -20,7 +20,7 @@ from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 
 Item = TypeVar("Item")
-#: The present position as a GGA sentence, empty without one.
+#: Function that returns the present position as a GGA sentence, empty without a position.
 Place = Callable[[], bytes]
 #: Sends to the other end of a connection until cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]

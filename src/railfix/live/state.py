@@ -62,7 +62,7 @@ def belongs_to(
 
 
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
-    """Write a complete state file, or keep the previous one and raise OutputError."""
+    """Write a complete state file, or keep the previous file and raise OutputError."""
     content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     part = path.with_name(f".{path.name}.part")

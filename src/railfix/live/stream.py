@@ -42,7 +42,7 @@ class ReceiverState:
     tracking: Tracking = field(default_factory=Tracking)
 
     def after_break(self) -> ReceiverState:
-        """Return the state after a break of the connection: the start of a frame whose end never comes is dropped."""
+        """Return the state after a break of the connection: the start of an incomplete frame is dropped."""
         return replace(self, stream=replace(self.stream, rest=b""))
 
 
@@ -155,7 +155,7 @@ async def arrivals(
 async def next_arrival(
     queue: asyncio.Queue[Item], pumps: Sequence[asyncio.Task[Any]], *, wait_s: float | None = None
 ) -> Item | None:
-    """Return the next item that the pumps have put; None after `wait_s`, or when one has ended by an error."""
+    """Return the next item from the pumps; None after `wait_s`, or when a pump has ended with an error."""
     if not queue.empty():
         await asyncio.sleep(0)  # signals are handled even if data arrive faster than they are processed
         return queue.get_nowait()
@@ -174,7 +174,7 @@ FOREVER: Final = np.datetime64("2200-01-01", "ns")
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
-#: Longest line; a longer one is not a row.
+#: Longest line; a longer line is not a row [bytes].
 _LINE_BYTES: Final = 4096
 
 
@@ -186,7 +186,7 @@ class Sensed:
     samples: SensorSamples = field(default_factory=SensorSamples)
     #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a complete table.
     until: np.datetime64
-    skipped: int = 0  #: Lines that are not rows, or whose time is before that of the previous row.
+    skipped: int = 0  #: Lines that are not rows, or whose time is before the previous row's.
 
     def count_unsurveyed(self, units: GroundUnits | None) -> int:
         """Count the unused ranges to ground units without surveyed positions."""
@@ -286,7 +286,7 @@ STEADY_EPOCHS: Final = 5
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs above the shortest observed one, so that the clocks need not agree."""
+    """Delay of epochs above the shortest observed delay, so that the clocks need not agree."""
 
     behind_s: float  #: With a larger delay epochs are skipped until it is a quarter of this limit; infinite: never.
     skipped: int = 0  #: Epochs skipped since the session fell behind.

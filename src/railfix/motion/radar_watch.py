@@ -22,7 +22,7 @@ _LEAST_BEFORE: Final = 5
 _MOST_BEFORE: Final = 20
 _AFTER: Final = 3
 _SILENT: Final = 2  #: Windows without a speed that are reported.
-#: Least step that is reported, and how many times the scatter of the windows.
+#: Least reported step, absolute and as a multiple of the scatter of the windows.
 _STEP: Final = 0.01
 _SCATTERS: Final = 5.0
 _LEAST_SCATTER: Final = 0.001

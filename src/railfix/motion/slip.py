@@ -6,10 +6,10 @@ has values that no line has. Two rules:
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
   slip, not its speed. It detects nothing at constant slip speed, so that most of a long slide remains in the distance.
 * ``"map"``: against the gradient of the line at the present position, with a latch: a slip ends only when the wheel has
-  returned to the speed carried by inertia and the pitch fits, or when wheel and train are at rest.
+returned to the inertial speed and the pitch fits, or when wheel and train are at rest.
 
 During a slip, speed and distance come from the accelerometer less the pitch and its offset, estimated while the wheel
-rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the position is known; with a gyro
+rolls, from `LOOK_BACK_S` before the detection. The pitch is the line's where the position is known; with a gyro
 it is the integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and
 accelerometer (P2 2.1(3)).
 """
@@ -55,16 +55,16 @@ _LATCH_MPS: Final = 0.15
 _LATCH_SHARE: Final = 0.01
 _LATCH_S: Final = 0.5
 LOOK_BACK_S: Final = 0.3  #: Time before the detection at which the inertial speed begins.
-#: After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
+#: After this time the inertial speed has expired: `carry_drift_mps2` has become 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
 SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
-_STANDING_MPS: Final = 0.5  #: A carried speed below this agrees with a stationary wheel.
+_STANDING_MPS: Final = 0.5  #: An inertial speed below this agrees with a stationary wheel.
 _PITCH_S: Final = 20.0
 _STEEPEST: Final = 0.1  #: Sine beyond which a pitch is implausible: 35 permille of line, body and mounting [1].
-_FASTEST_MPS: Final = 100.0  #: A carried speed beyond this has expired.
-#: Time for which the body swings after a stop; its pitch afterwards is that of standstill.
+_FASTEST_MPS: Final = 100.0  #: An inertial speed beyond this has expired.
+#: Time for which the body swings after a stop; its pitch afterwards is the pitch at standstill.
 _SETTLING_S: Final = 2.0
 #: Change of the pitch at standstill, duration and speed that mean rolling away.
 _ROLLING_LIMIT: Final = 0.002
@@ -93,7 +93,7 @@ class SlipResult:
     """Speed and its source at N samples."""
 
     state: Codes  #: `MotionState`, shape (N,).
-    speed_mps: Floats  #: Speed of the wheel where it rolls, otherwise carried; NaN in INIT and EXPIRED; shape (N,).
+    speed_mps: Floats  #: Speed of the wheel where it rolls, otherwise inertial; NaN in INIT and EXPIRED; shape (N,).
     #: Integral of the speed from the first sample. Each slip is corrected from its look-back on; at its end by the
     #: difference of wheel and inertia, which is assumed to have grown linearly; shape (N,).
     distance_m: Floats
@@ -288,7 +288,7 @@ class _Automaton:
         self._apart = self._carried = self._stood = 0.0
 
     def _release(self, dt: float, wheel: float, force: float, *, heard: bool) -> None:
-        """Latch: the wheel must return to the carried speed, with a pitch that fits, or stand with the train."""
+        """Latch: the wheel must return to the inertial speed, with a pitch that fits, or be at rest with the train."""
         limits = self.limits
         if self._silent >= _STANDING_S and abs(self.speed) < _STANDING_MPS:
             self._stand(force)
@@ -346,7 +346,7 @@ class _Automaton:
         self.distance += new_distance - old_distance
 
     def _quiet(self, dt: float, force: float, inertial: float) -> None:
-        """No pulse: standing, starting or stopping slowly, or rolling away."""
+        """No pulse: at rest, starting or stopping slowly, or rolling away."""
         if self.state == MotionState.NORMAL:
             self.state = MotionState.LOW_SPEED
         if self.state == MotionState.LOW_SPEED:

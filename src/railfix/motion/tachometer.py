@@ -88,7 +88,7 @@ def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
 
 
 def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
-    """Return the difference of two speeds over that of their instants [m/s2]; NaN where one is missing."""
+    """Return the difference of two speeds over the time between them [m/s2]; NaN where one is missing."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((late.speed_mps - early.speed_mps) / seconds(late.time - early.time))
 

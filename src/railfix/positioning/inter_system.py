@@ -167,7 +167,7 @@ def tie_constellations(
     states : sequence of OffsetState
         State of each receiver after the earlier epochs; the new states are returned.
     reference : str, optional
-        Letter of the clock that biases refer to; by default that of GPS, or the first one without GPS.
+        Letter of the clock that biases refer to; by default the GPS clock, or the first clock without GPS.
     parts : sequence of slice
         Epochs of each receiver.
     limits : TieLimits, optional

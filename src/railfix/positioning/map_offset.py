@@ -217,7 +217,7 @@ def means_of_windows(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and smallest offsets found (T, 2) by sums (T, 9).
 
-    See `MapOffset`; the sigmas are those of the map, and of `MapOffsetLimits`.
+    See `MapOffset`; the sigmas are taken from the map and from `MapOffsetLimits`.
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])

@@ -35,8 +35,8 @@ class NoiseScaleLimits(Settings):
     prior: float = Field(default=20.0, gt=0)
     least_epochs: float = Field(default=20.0, ge=1)  #: Fewest epochs in the window, gaps left out.
     #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
-    #: predicts, so the variance stated for an epoch combines that of its window, counted this many times, with that of
-    #: its own residuals. 4 is also the Student t of code errors on recordings.
+    #: predicts, so the variance stated for an epoch combines the window's variance, counted this many times, with the
+    #: variance of its own residuals. 4 is also the Student t of code errors on recordings.
     spread: float = Field(default=4.0, gt=0)
 
 

@@ -1,4 +1,4 @@
-"""Track on which a train at rest stands, from codes and carrier phases (P1 2.5).
+"""Track of a train at rest, from codes and carrier phases (P1 2.5).
 
 Hypotheses are a track with the facing of the train, and *none*: a parallel track that is missing from the map. At rest
 each satellite's code has a constant bias, so the covariance of the mean does not fall with the number of epochs. The
@@ -177,7 +177,7 @@ class TrackPosterior:
 
     names: tuple[str, ...]  #: Names of the tracks, then `NONE`.
     probability: Floats  #: Shape (tracks + 1,).
-    with_rising: Floats  #: Probability that the train stands on the track and faces its direction, shape (tracks,).
+    with_rising: Floats  #: Probability that the train is on the track and faces its direction, shape (tracks,).
     fits: bool  #: Whether the codes agree with the error model.
     #: Distance of the code position from each track, in its standard deviations; shape (tracks + 1,), NaN for `NONE`.
     misfit_sigmas: Floats
@@ -199,7 +199,7 @@ def track_posterior(
     prior: Mapping[str, float] | None = None,
     phases: Sequence[MeanPhases] = (),
 ) -> TrackPosterior:
-    """Compute the probability that a train at rest stands on each track, or on none.
+    """Compute the probability that a train at rest is on each track, or on none.
 
     `arms_m`: position of each antenna along the train, positive to its front; `prior`: weights of the mapped tracks by
     name, 0 for tracks not named; `phases`: phases of each antenna with a base station; empty without one.

@@ -123,7 +123,7 @@ def combine_codes(
     known = both & (information > 0.0)
     mean[known] = before[np.nonzero(known)[0], size + at[known]] / information[known]
     scale, of_scale = _noise_scale(time, difference - mean, variance, known, own, ages)
-    # errors constant over a time C: the mean over a time T is that of 1 + T / C samples
+    # errors constant over a time C: the mean over a time T has 1 + T / C independent samples
     of_mean = scale[:, None] / (information + 1.0 / np.where(known, variance, 1.0))
     lever = second.ratio - 1.0
     delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2

@@ -104,8 +104,8 @@ def _delays(
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
     """Return a signal's group delay, its standard deviation and whether it is unhealthy, by record, shape (n,) [m].
 
-    GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a missing delay is replaced by
-    that of the satellite's record of another message with the nearest reference time.
+    GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a missing delay is taken from
+    the satellite's record of another message with the nearest reference time.
     """
     records = navigation.kepler
     clock = "ionosphere_free" if navigation.precise is not None else "broadcast"

@@ -221,7 +221,7 @@ def reference_files(
 
 
 def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
-    """Read all files except those of the line."""
+    """Read all files except the track files."""
     logs: dict[str, PositionLog] = {
         name: read_positions(path, **options.columns.arguments) for name, path in inputs.positions.items()
     }

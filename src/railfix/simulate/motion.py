@@ -35,14 +35,14 @@ class Motion:
     """Pieces of constant jerk (without a limit of the jerk: of constant acceleration); the last one continues."""
 
     time_s: Floats  #: Start of each piece, rising from 0; shape (P,).
-    #: Values at the start of the piece; signs are those of rising chainage; shape (P,).
+    #: Values at the start of the piece, positive toward rising chainage; shape (P,).
     chainage_m: Floats
     speed_mps: Floats
     acceleration_mps2: Floats
     jerk_mps3: Floats | float = 0.0  #: Shape (P,) [m/s^3].
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the chainage [m] and speed [m/s] at times; before 0 the train stands."""
+        """Return the chainage [m] and speed [m/s] at times; before 0 the train is at rest."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.maximum(np.searchsorted(self.time_s, time, side="right") - 1, 0)
         since = np.maximum(time - self.time_s[piece], 0.0)
@@ -243,7 +243,7 @@ def antenna_truth(
 ) -> AntennaTruth:
     """True position of an antenna at n positions of the vehicle's middle, midway between the bogies' chainages.
 
-    `offset_m`: along, across to the right, above the rail tops. Sway is the lean to the right beyond that of the cant,
+    `offset_m`: along, across to the right, above the rail tops. Sway is the lean to the right in addition to the cant,
     pitch the rotation beyond the gradient, about the point between the bogies at the rail tops, positive where the
     front rises; each of shape (n,) or one number [rad].
     """
@@ -300,7 +300,7 @@ class BodyMotion:
         self._pitch = RandomFunction.periodic(rng, sigma=float(pitch), period=vehicle.pitch_period_s)
 
     def roll_rad(self, time_s: Floats, speed_mps: Floats) -> Floats:
-        """Lean to the right [rad] at times and speeds; none while the train stands."""
+        """Lean to the right [rad] at times and speeds; none while the train is at rest."""
         return self._roll.at(time_s) * np.minimum(np.abs(speed_mps) / FULL_SPEED_MPS, 1.0)
 
     def pitch_rad(self, time_s: Floats, speed_mps: Floats) -> Floats | None:

@@ -25,7 +25,7 @@ from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
-#: Groups of settings for which the README lists only those that are not at their default.
+#: Groups of settings for which the README lists only non-default settings.
 _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
 
 
@@ -129,7 +129,7 @@ def _list_effects(scenario: Scenario) -> str:
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:
-    """Return settings by their names; of the longer groups only those that are not at their default."""
+    """Return settings by their names; of the longer groups only non-default settings."""
     usual = Scenario(sensors=None).describe()
     table = {}
     for name, value in scenario.describe().items():
@@ -149,7 +149,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
 
     `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point abeam the antenna, on the track map's chainage),
     `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage), `acceleration_mps2` (along the
-    line, positive toward rising chainage), `environment` (kind of section, "open" outside all). The position is that of
+    line, positive toward rising chainage), `environment` (kind of section, "open" outside all). The position refers to
     the true instant, which is the tag less the receiver clock's bias.
     """
     line, time = simulation.line, simulation.time()

@@ -163,7 +163,7 @@ class Service:
         return int(name[1:]) if name[0] == "G" else 0
 
     def _instant(self, second: float) -> Floats:
-        """Time of the corrections sent at a second; before the start of the run its errors are those of the start."""
+        """Time of the corrections sent at a second; before the start of the run the errors at the start are used."""
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:

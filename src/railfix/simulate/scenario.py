@@ -113,7 +113,7 @@ class SkySettings(ScenarioSettings):
     """Satellites and atmosphere."""
 
     #: Letters out of G (30 satellites in 6 planes), J (3 inclined, 1 over the equator), E (24 in 3 planes), C (24 in 3
-    #: planes and 3 inclined geosynchronous; no GEO); or those of the file.
+    #: planes and 3 inclined geosynchronous; no GEO); or the constellations of the file.
     systems: str = "GJE"
     #: A RINEX navigation file instead of the simulated satellites; in a scenario file relative to that file.
     nav: str | None = None

@@ -1,6 +1,6 @@
 """Scenario files: TOML of one run, the settings of `Scenario` by their names, or a recipe of several runs.
 
-``duration_s = "run"`` lasts until the train stands at its last stop. A recipe names a base, another file in its folder
+``duration_s = "run"`` lasts until the end of the last stop. A recipe names a base, another file in its folder
 or a shipped one, and for each run the differences::
 
     description = "two runs"

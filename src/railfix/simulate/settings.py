@@ -161,12 +161,12 @@ class InterSystemSettings(ScenarioSettings):
 
     offset_m: Finite = 0.0  #: At the start of the run.
     drift_mps: Finite = 0.0
-    #: Bias of the rear receiver less that of the front receiver, for common and separate clocks.
+    #: Bias of the rear receiver less the front receiver's, for common and separate clocks.
     rear_difference_m: Finite = 0.0
 
 
 class NoiseSettings(ScenarioSettings):
-    """Time-correlated receiver noise; the sigmas are those of `ReceiverSettings`."""
+    """Time-correlated receiver noise; the sigmas are set in `ReceiverSettings`."""
 
     code_correlated_share: Share = 0.0  #: Fraction of the code noise's variance, in [0, 1], that is correlated in time.
     #: Its correlation time: a code loop of noise bandwidth B has 1 / (4 B), 1 s at 0.25 Hz.
@@ -223,7 +223,7 @@ class DrawnSlips(ScenarioSettings):
     slip_chance: Share = 0.0
     slide_chance: Share = 0.0
     ratio: Share = 0.3  #: Largest ratio, see `SlipInterval`; uniform between a fifth of it and all.
-    #: Longest duration; drawn uniformly between a fifth of it and all of it, at most that of the acceleration.
+    #: Longest duration; drawn uniformly between a fifth of it and all of it, at most the duration of the acceleration.
     duration_s: Positive = 3.0
 
 

@@ -1,6 +1,6 @@
 """Coordinate reference systems of maps: their relation to the Earth, and coordinates in degrees of their frames.
 
-Definitions are those of the EPSG dataset (https://epsg.org). Motions relative to a plate are used for notes only.
+Definitions are from the EPSG dataset (https://epsg.org). Motions relative to a plate are used for notes only.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def find_operation(crs: str) -> Transformer | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operations:
-    """PROJ's operations between two systems over a box: usable ones, best first, and ones with missing grids."""
+    """PROJ's operations between two systems over a box: usable, best first, and with missing grids."""
 
     usable: tuple[Transformer, ...]
     lacking: tuple[Any, ...] = ()

@@ -1,8 +1,8 @@
 """Elements of an alignment in plan, profile and cant, as in design files (IFC, LandXML), and their segments.
 
-The direction is the integral of the curvature in closed form, the position that of the direction by Gauss-Legendre
-quadrature. Lengths are in plan, directions counter-clockwise from the x axis (easting), curvature positive to
-the left, as in IFC 4.3 and LandXML.
+The direction is the integral of the curvature in closed form, the position is the integral of the direction by
+Gauss-Legendre quadrature. Lengths are in plan, directions counter-clockwise from the x axis (easting), curvature
+positive to the left, as in IFC 4.3 and LandXML.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _PIECE_RAD: Final = 0.5  #: Longest piece of one quadrature [rad of direction]; 
 _CHORD_M: Final = 0.01
 _LONGEST_M: Final = 25.0
 _CLOTHOID_POINTS: Final = 2001  #: Points of a profile clothoid, between which it is linear within 1 um.
-_JOINT_M: Final = 0.01  #: Elements that begin farther than this from the end of the previous one are reported [m].
+_JOINT_M: Final = 0.01  #: Elements that begin farther than this from the previous element's end are reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,7 +314,7 @@ def segment_of_design(
     xy /= unit
     curvature = points.curvature
     if grid is None and is_within(crs, xy[:, ::-1]) and not is_within(crs, xy):
-        # northing before easting turns the plane over, so a curve to the left in the file is one to the right
+        # northing before easting turns the plane over, so a curve to the left in the file is a curve to the right
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
     source, heights = f"{path} ({name})", None

@@ -145,7 +145,7 @@ def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
 def in_map_frame(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Transform positions, or NaN, from the frame of the satellites to a map's frame: the inverse of `points_at`."""
+    """Transform positions, or NaN, from the satellites' frame to a map's frame by subtracting the shift."""
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")

@@ -1,6 +1,6 @@
 """Coordinates of a map in degrees of a modern frame, with the transformation and its accuracy.
 
-Operations are those of PROJ (https://proj.org) whose area of use contains the map and whose grids are installed; a
+Operations are PROJ operations (https://proj.org) whose area of use contains the map and whose grids are installed; a
 ballpark operation, which does not change the datum, is never used.
 """
 
@@ -206,7 +206,7 @@ def _choose_operation(crs: str, box: Box) -> _Chosen | str:
 
 
 def _targets(crs: str, box: Box) -> Iterable[str]:
-    """Return the modern frames that a map may be transformed to: those of its region, then WGS 84."""
+    """Return the modern frames that a map may be transformed to: the frames of its region, then WGS 84."""
     if get_geodetic_frame(crs).name == TRANSIT:  # the frames with a known transformation to a realisation of the ITRF
         return ("EPSG:7902",)
     if find_crs(crs).is_bound:  # +towgs84
@@ -259,7 +259,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """South, north, west and east of the area of use of a CRS's frame, with the margin; an empty area without one."""
+    """Return south, north, west and east of the area of use of a CRS's frame, with the margin, or empty."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)

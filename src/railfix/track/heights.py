@@ -145,7 +145,7 @@ def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
 
 
 def _is_file(geoid: str) -> bool:
-    """Return whether a text is the path of a file; False for texts that are too long for one."""
+    """Return whether a text is the path of a file; False for texts that are too long for a path."""
     try:
         return Path(geoid).is_file()
     except OSError:

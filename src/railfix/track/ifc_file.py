@@ -233,7 +233,7 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return placements from an object to the world; InputFileError where one is not local."""
+    """Return placements from an object to the world; InputFileError if a placement is not local."""
     found: list[Any] = []
     while reference is not None and reference not in found:
         entity = step.at(reference, what="ObjectPlacement")

@@ -43,8 +43,9 @@ class ThinningLimits(Settings):
     """Limits for the selection of positions as points of a map."""
 
     spacing_m: float = Field(default=5.0, gt=0)  #: Smallest distance between consecutive points.
-    #: Where positions between two points deviate from their chord by more, the furthest becomes a point too (P1 4.1(3):
-    #: chords within 0.30 m of the curve). Requires times, to distinguish a bend from noise while stationary.
+    #: Where positions between two points deviate from their chord by more, the farthest position becomes a point, too
+    #: (P1 4.1(3): chords within 0.30 m of the curve). Requires times, to distinguish a bend from noise while
+    #: stationary.
     chord_m: float = Field(default=0.30, gt=0)
     #: Below this horizontal speed over `_STANDING_WINDOW_S` the antenna is stationary and its positions are noise or
     #: drift. Requires times; 0 keeps all.
@@ -190,7 +191,7 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 
 
 def _goes_on(points: Floats, direction: Floats) -> Masks:
-    """Return whether the path before and after each inner point goes on in the direction between its neighbours.
+    """Return whether the path before and after each inner point continues in the direction between its neighbours.
 
     The next position or the one after it is used, since the next may be an outlier as well.
     """
@@ -269,7 +270,7 @@ def from_positions(
     sigma_plan_m: float = SIGMA_PLAN_M,
     sigma_height_m: float = SIGMA_HEIGHT_M,
 ) -> Track:
-    """Create a track from positions (n, 3) [m] in the order of travel, thinned and without stationary ones.
+    """Create a track from positions (n, 3) [m] in the order of travel, thinned and without stationary positions.
 
     `time` is NaT where unknown; `usable` drops rows; `spacing_m` is used without `limits`. The notes of the
     track record that it is the path of the antenna, and its gaps and reversals. ValueError: fewer than two points are

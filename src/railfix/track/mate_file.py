@@ -42,7 +42,7 @@ def read_edges(path: Path, reading: MapReading) -> list[Segment]:
 
 
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
-    """Return the points of one track edge; cant in millimetres; without a radius, or with 0, it is straight."""
+    """Return the points of one track edge; cant is in millimetres; a missing or zero radius is straight track."""
     values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
     for name in _NUMBERS[:3]:
         if not np.isfinite(values[name]).all():

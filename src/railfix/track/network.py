@@ -90,7 +90,7 @@ class Network(NotebookTable):
 
     @cached_property
     def first_point(self) -> Indices:
-        """Index of each track's first point in `points_m`, and one past the last, shape (tracks + 1,)."""
+        """Index of each track's first point in `points_m`, and the end of the last track, shape (tracks + 1,)."""
         return np.concatenate([[0], np.cumsum([len(t.latitude_deg) for t in self.tracks])]).astype(np.intp)
 
     @cached_property
@@ -177,7 +177,7 @@ class Network(NotebookTable):
 
     @property
     def frame(self) -> str:
-        """Geographic CRS of the coordinates; MismatchError when the tracks are in different ones."""
+        """Geographic CRS of the coordinates; MismatchError if the tracks are in different frames."""
         return one_frame(self.tracks)
 
     @cached_property
@@ -287,7 +287,7 @@ class Network(NotebookTable):
         return kilometrage
 
     def find_index(self, name: str) -> int:
-        """Return the number of a track by name, a way of OpenStreetMap also by its id; SettingsError without one."""
+        """Return the number of a track by name, an OpenStreetMap way also by its id; SettingsError without a track."""
         drawn = [k for k, track in enumerate(self.tracks) if "origin" in track.metadata]
         by_id = [k for k in drawn if self.tracks[k].metadata.get("name", "").startswith(f"{name} ")]
         if name not in self.names and len(by_id) == 1:
@@ -336,7 +336,7 @@ class Network(NotebookTable):
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the tracks of the shortest route that passes the given tracks in order; None without one."""
+        """Return the tracks of the shortest route that passes the given tracks in order; None without a route."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         routes = {4 * wanted[0] + end: (0.0, [4 * wanted[0] + end]) for end in (1, 3)}
         for stop in wanted[1:]:

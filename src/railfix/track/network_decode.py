@@ -61,7 +61,7 @@ COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
 #: Balls of the urn of one horizontal axis, and of the vertical one: a quarter of them is the variance in steps.
 _BALLS: Final = 12
 _BALLS_UP: Final = 8
-_BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, where heights do not count.
+_BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, if heights are not used.
 
 
 @dataclass(frozen=True, kw_only=True)

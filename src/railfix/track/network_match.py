@@ -57,7 +57,7 @@ _APART_UP_M: Final = 1.0  #: Least height difference of two tracks near each oth
 class PlanLog(RowArrays):
     """Positions in plan, n rows, NaT or NaN where unknown; `sigma_m` is per axis; heights may be None or NaN.
 
-    Heights are those of an antenna `antenna_up_m` above the rails, None if unknown [m].
+    Heights are at an antenna `antenna_up_m` above the rails, None if unknown [m].
     """
 
     path: str
@@ -71,7 +71,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return positions transformed from the satellites' frame to the network's; MismatchError if far from it."""
+        """Return positions moved from the satellites' frame to the network's; MismatchError if impossible."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -240,7 +240,7 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Find tracks near each position, and farther ones where it is far from all."""
+    """Find tracks near each position, and farther tracks if it is far from all."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -252,7 +252,7 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 
 
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
-    """Return whether a position far from all tracks is wrong: both neighbours in `_WRONG_S` are near a track."""
+    """Return whether a position far from all tracks is wrong: in `_WRONG_S` positions on both sides are near tracks."""
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):
         return np.zeros(len(time), dtype=np.bool_)

@@ -199,7 +199,7 @@ _GAP_M: Final = 5.0  #: Ends nearer than this without a connection are a gap [m]
 _JOINT_M: Final = 0.5  #: Connected ends farther apart than this do not meet [m].
 #: Largest change of direction over a navigable connection [deg]; a switch of 1:4.5 turns 12.5 deg over its length.
 _KINK_DEG: Final = 15.0
-#: Least spacing of parallel tracks [m]: a smaller one leaves no clearance between vehicles.
+#: Least spacing of parallel tracks [m]: a smaller spacing leaves no clearance between vehicles.
 _LEAST_SPACING_M: Final = 2.5
 #: Tracks may be nearer than this within this distance of their ends, where they join in a switch [m].
 _SWITCH_M: Final = 80.0
@@ -264,7 +264,7 @@ def _finding(network: Network, kind: str, tracks: Sequence[int], point: int, sen
 
 
 def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFinding]:
-    """Yield ends without a connection that are near another such end."""
+    """Yield gaps between two ends without a connection, and all other ends without a connection as dead ends."""
     if not loose:
         return
     ends, outward = end_points(network)
@@ -285,7 +285,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
 
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
-    """Yield connections whose ends do not meet, and navigable ones with a kink."""
+    """Yield connections whose ends do not meet, and navigable connections with a kink."""
     ends, outward = end_points(network)
     for link in network.links:
         first, second, tracks = (link.first, link.first_end), (link.second, link.second_end), (link.first, link.second)

@@ -28,7 +28,7 @@ _STEPS = 15
 @dataclass(frozen=True, kw_only=True)
 class Filled:
     """Positions of all rows, shapes (n,); `track` is -1 without a position or route; `bound_m` is the largest
-    distance of a train on this route from a filled position [m], infinite before and after known ones.
+    distance of a train on this route from a filled position [m], infinite before and after known positions.
     """
 
     track: Indices
@@ -192,7 +192,7 @@ def _once(network: Network, route: list[int]) -> list[list[int]]:
 
 
 def _joints(network: Network, route: list[int]) -> list[int]:
-    """Return the joint before each track of a route, and the one after the last."""
+    """Return the joint before each track of a route, and the joint after the last track."""
     joint, entry = network.joints, 0
     found: list[int] = []
     for track, after in pairwise([*route, route[-1]]):

@@ -113,7 +113,7 @@ def error_note(quality: TrackQuality) -> tuple[str, ...]:
     )
 
 
-#: Severity and sentence of each fault; ``{value}`` is the worst one, ``{limit}`` its limit.
+#: Severity and sentence of each fault; ``{value}`` is the worst value, ``{limit}`` its limit.
 _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "duplicate": ("warning", "the same point twice or more, which other commands read once"),
     "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),

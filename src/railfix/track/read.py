@@ -1,4 +1,4 @@
-"""Reading of a track map from one or several files."""
+"""Read a track map from one or several files."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with an accuracy in plan that includes the transformation from its datum."""
+    """Return a segment with a given accuracy in plan, which includes the transformation from its datum."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

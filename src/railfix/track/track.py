@@ -1,7 +1,7 @@
 """3-D centreline of a railway line with curve attributes (P1 2.2(1), 4.1(3)).
 
 Right is positive: seen in the direction of rising chainage, a curve to the right has a positive radius. Cant is the
-height of the outer rail above the inner one. The height of a point is at the middle between the rail tops.
+height of the outer rail above the inner rail. The height of a point is at the middle between the rail tops.
 """
 
 from __future__ import annotations

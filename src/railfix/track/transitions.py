@@ -79,7 +79,7 @@ class OrdinateElement:
 
     @property
     def turn_rad(self) -> float:
-        """Direction at the curved end, seen from the straight one, positive to the left [rad]."""
+        """Direction at the curved end relative to the straight end, positive to the left [rad]."""
         return float(np.arctan(self._ordinates(np.array([self.tangent_m]))[1][0]))
 
     @property

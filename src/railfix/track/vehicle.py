@@ -94,7 +94,7 @@ def read_vehicle(path: FilePath) -> Vehicle:
 class Body:
     """Position and attitude of the car body at n chainages, facing rising chainage."""
 
-    #: Chainage of the bogie centres, the lower one first; shape (n,).
+    #: Chainage of the bogie centres, the lower first; shape (n,).
     lower_m: Floats
     upper_m: Floats
     origin: Floats  #: Midway between the bogie centres, ECEF; shape (n, 3) [m].
@@ -311,7 +311,7 @@ def antenna_trajectory(
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
         Point of the vehicle to which the chainage refers: the centreline point abeam the antenna
         (beyond the outer bogies the centreline is extended straight), the middle between the bogies,
-        or a bogie centre; front and rear are those of the vehicle.
+        or a bogie centre; front and rear are relative to the vehicle.
 
     Returns
     -------

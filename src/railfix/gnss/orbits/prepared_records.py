@@ -27,7 +27,7 @@ from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 #: Longest distance of an epoch from toe [s]: GPS and QZSS half the broadcast fit interval and
 #: never less than this (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour);
 #: Galileo 4 h (Galileo OS SDD 1.3, 2.4.2: no data older than that are broadcast). BeiDou (renewed every hour) and
-#: GLONASS (renewed every 30 min) do not broadcast a validity: the limits are those of RTKLIB 2.4.3 (MAXDTOE_CMP,
+#: GLONASS (renewed every 30 min) do not broadcast a validity: the limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP,
 #: MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 

@@ -244,7 +244,7 @@ def _fill_precise(
     observed: Masks,
     states: SatelliteStates,
 ) -> None:
-    """Replace broadcast positions and clocks by those of the precise ephemeris."""
+    """Replace broadcast positions and clocks by precise ones."""
     known = {str(s): i for i, s in enumerate(precise.satellite)}
     column = np.array([known.get(s, -1) for s in satellite.tolist()], dtype=np.intp)
     glonass = np.char.startswith(satellite, "R")

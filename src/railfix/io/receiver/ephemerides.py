@@ -255,7 +255,7 @@ class _EphemerisBuilder:
         return cnav_record(satellite, {**parts[2], **parts[1], **parts[0]})
 
     def _bcnav2(self, satellite: str, _: np.datetime64) -> Record | None:
-        """Record of B-CNAV2: message 11 follows 10, and the clock's issue ends with that of the ephemeris."""
+        """Record of B-CNAV2: message 11 follows 10, and the clock's issue ends with the ephemeris issue."""
         parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.BCNAV2))
         if (
             parts is None

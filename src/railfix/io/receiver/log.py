@@ -50,7 +50,7 @@ _BLOCK: Final = 24  #: u-blox: bytes of a block of MON-RF after the four of the 
 #: Septentrio: first block of bands or front ends after the time stamp (6 bytes).
 _BANDS, _FRONT_ENDS = 12, 24
 _NO_GAIN: Final = -128
-#: u-blox SEC-SIGLOG: bytes of an event, and how long a single trigger counts [s].
+#: u-blox SEC-SIGLOG: bytes of an event, and duration of the effect of a single trigger [s].
 _EVENT: Final = 8
 _TRIGGERED_S: Final = 10
 _SIMULATED: Final = 0  #: Kind of detection that is used; jamming detections begin with a warning, as in that recording.

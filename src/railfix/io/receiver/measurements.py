@@ -184,7 +184,7 @@ Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
-#: Data source of Galileo: the clock is that of E5a and E1.
+#: Data source of Galileo: the clock refers to E5a and E1.
 _E5A_CLOCK: Final = 1 << 8
 _MOSCOW_S: Final = 3 * 3600.0
 
@@ -235,7 +235,7 @@ def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
 
 
 def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Record of Galileo: I/NAV from the fields of its words 1 to 5 or of RTCM 1046, F/NAV from those of RTCM 1045."""
+    """Record of Galileo: I/NAV from the fields of words 1 to 5 or of RTCM 1046, F/NAV from the fields of RTCM 1045."""
     week, epoch = _week_and_toc(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)
     health = 0
     for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # as RINEX packs them

@@ -319,10 +319,10 @@ _UBX_E5A: Final = (3, 4)
 _CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
 #: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
-#: Offsets of the numbers of F/NAV pages, of CNAV messages and of pages of B-CNAV1 among those of a satellite.
+#: Offsets of the numbers of F/NAV pages, CNAV messages and B-CNAV1 pages among the page numbers of a satellite.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
-Pages = Iterator[tuple[int, int, Values]]  #: Row, number among those of the satellite, and fields of each page.
+Pages = Iterator[tuple[int, int, Values]]  #: Row, page number of the satellite, and fields of each page.
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:

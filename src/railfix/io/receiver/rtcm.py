@@ -372,8 +372,8 @@ _FIRST_MSM_WEEK: Final = 1642
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
     """Return the time of the ephemerides of a log, which determines the week of its observations; NaT without any.
 
-    The weeks of Galileo and BeiDou are unique; that of GPS, modulo 1024, is the one nearest to `near`, or without it
-    the first since MSM were defined (July 2011 to February 2031): the computer's clock is not used.
+    The weeks of Galileo and BeiDou are unique; the GPS week, modulo 1024, is resolved to the week nearest to `near`, or
+    without it to the first since MSM were defined (July 2011 to February 2031): the computer's clock is not used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

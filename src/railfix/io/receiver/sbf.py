@@ -3,7 +3,7 @@
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
 (GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
 GEORawL5, BDSRawB2a), 4.2.8 (PVTGeodetic, PVTCartesian); PolaRx5TR reference guide 5.5.0, page 326 (BDSRawB1C).
-The 72, 1200 and 528 symbols of B-CNAV1 are its three subframes, the bits of each before those that correct them.
+The 72, 1200 and 528 symbols of B-CNAV1 are its three subframes, each with its data bits before the correction bits.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
 
 
 def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, int]] | None:
-    """Offsets of the sub-blocks of one block, each with that of its first-type sub-block; None of a broken one."""
+    """Offsets of the sub-blocks of one block, each with its first-type sub-block's offset; None for a broken block."""
     cursor, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
     size1, size2 = int(head["size1"]), int(head["size2"])
     places: list[tuple[int, int]] = []

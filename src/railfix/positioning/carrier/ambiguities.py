@@ -38,8 +38,8 @@ class PhaseLimits(Settings):
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Steps of the walk.
     #: Correlation time of code errors: epochs closer together than this add no information on the ambiguities.
-    #: The variance of the ambiguities is multiplied by correlation / interval, up to that of codes alone. The positions
-    #: do not change. 0 for white noise, such as simulated noise.
+    #: The variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes
+    #: alone. The positions do not change. 0 for white noise, such as simulated noise.
     correlation_s: float = Field(default=20.0, ge=0)
     #: Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
@@ -98,7 +98,8 @@ class PhasePositions(NotebookTable):
     n_fixed: Integers  #: Differences of ambiguities fixed to whole cycles, shape (T,).
     #: Probability that one of these, or of the best candidates, is wrong; NaN without any; shape (T,).
     integer_risk: Floats
-    #: All arcs of a run, or those that continue after the last epoch (`phase_positions`); None in results, row by row.
+    #: All arcs of a run, or the arcs that continue after the last epoch (`phase_positions`); None in results, row by
+    #: row.
     arcs: ArcAmbiguities | None
 
     iterations: int
@@ -167,7 +168,7 @@ def assemble_positions(
 
 
 _VECTORS: Final = 12  #: Vectors compared.
-#: Fractions of the differences, those of the strongest phases first, that are tried in turn.
+#: Fractions of the differences, strongest phases first, that are tried in turn.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 

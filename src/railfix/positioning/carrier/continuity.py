@@ -57,7 +57,7 @@ def number_arcs(
     Parameters
     ----------
     slip : ndarray of bool, shape (T, M)
-        Where arcs begin (`slips.find_slips`, and what other tests add).
+        Where arcs begin (`slips.find_slips`, and further tests).
     has_phase : ndarray of bool, shape (T, M)
     satellite, signal : ndarray of str, shape (M,)
     state : ArcState, optional

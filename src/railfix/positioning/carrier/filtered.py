@@ -185,7 +185,7 @@ def _ambiguities(
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
     """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
 
-    Computed from each epoch's own normal equations and those of earlier epochs; then the ambiguities of all arcs, and
+    Computed from the normal equations of each epoch and all earlier epochs; then the ambiguities of all arcs, and
     the memory after the last epoch. `held`: see `inverse_of_arcs`.
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
@@ -198,7 +198,7 @@ def _ambiguities(
     own[row, index, count + 1 :] = right
     own = np.delete(own[:, :count], count, axis=2)
     carried = np.concatenate([memory.matrix, memory.right], axis=1)
-    # cumsum from the carried sums: the same additions in the same order however epochs are cut.
+    # cumsum from the carried sums: the same additions in the same order for any division into chunks.
     sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
     after = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
     level = np.zeros((len(arc_id), count + 1))
@@ -302,7 +302,7 @@ def _without(memory: Memory, ends: Masks) -> Memory:
 
 
 def _join(pieces: list[PhasePositions]) -> PhasePositions:
-    """Concatenate segments; the arcs are those of the last segment."""
+    """Concatenate segments; the arcs are taken from the last segment."""
     arrays: dict[str, Any] = {
         item.name: np.concatenate([getattr(p, item.name) for p in pieces])
         for item in fields(PhasePositions)

@@ -72,7 +72,7 @@ class SbasCorrections:
 
     A message is used from its time of reception on (`SbasMessages.time`), never before. Results are independent of the
     other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn`, which is
-    chosen beforehand (`best_prn`), are left out; `notes` on their origin precede those of the corrections.
+    chosen beforehand (`best_prn`), are left out; `notes` on their origin precede the notes on the corrections.
     """
 
     def __init__(

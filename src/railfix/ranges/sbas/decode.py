@@ -242,7 +242,7 @@ def _join(parts: Sequence[Decoded]) -> Decoded:
 
 
 def long_term(messages: SbasMessages) -> Decoded:
-    """Return both halves of type 25 and that of type 24, one row per satellite; `reference` is NaT without velocity."""
+    """Return the halves of types 25 and 24, one row per satellite; `reference` is NaT without velocity."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
         row = find_rows(messages, kind)

@@ -12,8 +12,8 @@ SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that slot and fraction of the ra
 that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays
 differ by metres: they are not in its corrections.
 
-Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), serve a note alone.
-Layouts and scales are those that cssrlib and MAAST (L5_decodeMT39.m, 40, 47) share. Messages of SouthPAN of three days
+Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), are used for a note
+only. Layouts and scales are common to cssrlib and MAAST (L5_decodeMT39.m, 40, 47). Messages of SouthPAN of three days
 (`test_sbas_orbits.py`) determine the rest: the semi-major axis is counted from 6370 km, and the node from the meridian
 of Greenwich at midnight of GPS time. Open: a step of the inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6 rad/s;
 SouthPAN sends 0, and an orbit with another rate has no position here. BDSBAS has a different layout and is left out.
@@ -151,7 +151,7 @@ def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
 class DfmcService:
     """Corrections by the L5 messages of one SBAS satellite at any epochs; a message is used from its reception on.
 
-    Messages of other PRNs are left out; `notes` on their origin are put before those of the corrections.
+    Messages of other PRNs are left out; `notes` on their origin precede the notes on the corrections.
     """
 
     def __init__(self, messages: SbasMessages, *, prn: int, notes: tuple[str, ...] = ()) -> None:

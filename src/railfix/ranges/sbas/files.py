@@ -317,7 +317,7 @@ def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMes
 
 
 def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
-    """Return the bits of parity that each message carries: 24 in complete messages, 6 or none in cut ones.
+    """Return the number of parity bits of each message: 24 in complete messages, 6 or 0 in cut messages.
 
     A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as
     they came: in a file of the latter most of them are the first of the parity, by chance 1 in 64.

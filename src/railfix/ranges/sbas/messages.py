@@ -106,7 +106,7 @@ class SbasMessages(RowArrays, NotebookTable):
         return f"SBAS PRN {prn} was asked for; the log has {known}"
 
     def of(self, prn: int) -> SbasMessages:
-        """Return the messages of one PRN; the counts of rejected messages are those of all PRNs."""
+        """Return the messages of one PRN; the counts of rejected messages are for all PRNs."""
         return self.take(self.prn == prn)
 
     @classmethod

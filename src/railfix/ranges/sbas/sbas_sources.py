@@ -1,6 +1,6 @@
 """SBAS on L1 and on L5 as sources of corrections.
 
-The sum of the variances is that of DO-229D (J.2.2), without the airborne receiver's: ``sigma_flt^2 + sigma_UIRE^2 +
+The variances are summed as in DO-229D (J.2.2), without the airborne receiver's: ``sigma_flt^2 + sigma_UIRE^2 +
 sigma_tropo^2``; multipath and receiver noise on a railway are added to it (P1 2.4).
 """
 

@@ -181,7 +181,7 @@ class SatelliteCorrections(FrozenArrays):
     rate_growth_m: Floats
     long_term_growth_m: Floats
     en_route_m: Floats
-    inflated: Masks  #: Degradation data are missing: sigma is that of UDRE plus 8 m; shape (T, K).
+    inflated: Masks  #: Degradation data are missing: sigma is sigma UDRE plus 8 m; shape (T, K).
     rss: Masks  #: The terms are summed as squares (RSS_UDRE of type 10), shape (T, K).
     covariance: Integers  #: Row of the covariance (type 28) in force, -1 without; shape (T, K).
 

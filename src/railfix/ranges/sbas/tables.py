@@ -50,7 +50,7 @@ class Series:
 
     @classmethod
     def of(cls, series: Integers, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Series:
-        """Sort rows by series, then time, then as they came; rows of series below 0 are left out."""
+        """Sort rows by series, then time, then original order; rows of series below 0 are left out."""
         order = np.lexsort((time, series)).astype(np.int64)
         order = order[series[order] >= 0]
         columns = {name: values[order] for name, values in columns.items()}

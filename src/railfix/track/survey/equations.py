@@ -41,7 +41,7 @@ class Equations:
     matrix: sp.csr_array  #: Shape (n * size, unknowns).
     value: Floats  #: Shape (n * size,).
     size: int
-    share: Floats  #: Weight of an observation as a fraction of an independent one; 1 where not given; shape (n,).
+    share: Floats  #: Weight of an observation as a fraction of an independent observation; 1 by default; shape (n,).
     robust: bool = True  #: Whether outliers are down-weighted.
     scaled: bool = False  #: Whether the standard deviations are scaled by the residuals.
 

@@ -282,7 +282,7 @@ def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
 
 
 def _interpolate_positions(run: SurveyRun) -> Floats:
-    """Return positions with missing ones interpolated in time, shape (n, 3) [m]."""
+    """Return positions, missing positions interpolated in time, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
     return np.stack([np.interp(run.seconds, run.seconds[known], run.ecef_m[known, i]) for i in range(3)], axis=1)
 
