@@ -134,7 +134,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 
     `points` are the known points as texts, one per log; without any, the headers' positions are used. SettingsError:
     navigation or points are missing, or not applicable. MismatchError: a header has no position, or the logs have no
-    epoch in common.
+    satellite or no epoch in common.
     """
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:

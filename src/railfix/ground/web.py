@@ -71,7 +71,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None if the password is wrong, or too many were."""
+        """Open a session and return its token; None if the password is wrong, or too many from the address were."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}

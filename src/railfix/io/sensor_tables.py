@@ -32,7 +32,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "pulses": ("[count]", "[pulse]", "[distance_m]", "[direction]"),
     "acceleration": ("[specific_force_mps2]", "[force_forward_mps2]", "[acceleration_mps2]"),
 }  # fmt: skip
-#: Sensors without output for some time, which rows with the time alone report; tables without a time.
+#: Sensors that may have no output for some time, which rows with the time alone report; tables without a time.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 _TIMELESS: Final = ("ranging_units", "list of balises")
 #: Tables without empty values, with strictly rising times and at least two rows.

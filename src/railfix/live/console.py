@@ -266,7 +266,7 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
         raise SettingsError(f"--metrics {address}: cannot be listened at ({error})") from None
 
 
-#: The sensors are checked after this time, at positions at least this far apart; the radar is checked at this interval
+#: The sensors are checked after this time, the radar at this interval, with positions at least this far apart in time
 #: [ns].
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000

@@ -74,7 +74,8 @@ def along_track(
 ) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
     """Return filtered positions of one antenna, the filter's input, and its state.
 
-    The filter itself weighs codes that screens and exclusions of single epochs have rejected (`gnss_epochs`).
+    Of the codes that screens and exclusions of single epochs have rejected, the filter itself weighs those with some
+    reasons, and leaves out the others (`gnss_epochs`).
 
     The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
     `samples` are the on-board sensor samples since the previous chunk; `references` has the line's features, ground
@@ -316,7 +317,7 @@ def _find_fix(tracked: Tracked) -> FilterFix:
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:
     """Return arc lengths on the trajectory, shape (T,) [m].
 
-    A position beyond an end within its errors (four sigmas, or the code sigmas at a start) is moved to that end; NaN
+    A position beyond an end within its errors (four sigmas, or 30 m as for codes at a start) is moved to that end; NaN
     further out.
     """
     arc, end = tracked.arc_m, trajectory.arc_m[-1]

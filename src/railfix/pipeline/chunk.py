@@ -19,7 +19,7 @@ from railfix.screens import PairedEpochs, Screened
 class Chunk:
     """Epochs of all antennas, concatenated, and the outputs of the stages so far."""
 
-    names: tuple[str, ...]  #: Observations of the antennas.
+    names: tuple[str, ...]  #: Names of the antennas.
     antennas: AntennaRows  #: Trajectories and rows of the antennas.
     corrected: CorrectedRanges  #: Corrected ranges with the verdicts so far.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.

@@ -213,7 +213,7 @@ class Config(ScreenSettings):
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()  #: Process and measurement noise of the filter.
     sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and the tachometer's wheel.
-    #: Limits of the sensor stages.
+    #: Limits of the stages of single-epoch positions.
     clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()

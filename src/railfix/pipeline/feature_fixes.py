@@ -25,7 +25,7 @@ from railfix.tracking import Line
 
 #: Below this speed the rates are not used [m/s].
 SLOWEST_MPS: Final = 1.0
-#: Averaging length of the rates, in metres; the body's oscillations are shorter.
+#: Least number of whole metres, passed without a break, for a comparison with a feature.
 _LEAST_POINTS: Final = 30
 
 

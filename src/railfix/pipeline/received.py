@@ -60,7 +60,7 @@ class Received:
     sbas: SbasCorrections | DfmcService | None = None  #: Corrections from these messages.
     #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
     klobuchar: Floats | None = None
-    #: Standard deviation of the vertical delay if default coefficients are used, otherwise 0.
+    #: Standard deviation of the vertical delay if typical coefficients replace broadcast ones, otherwise 0.
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()  #: One sentence on each replacement of requested data.
     base: BaseErrors | None = None  #: Range errors measured by a base station.

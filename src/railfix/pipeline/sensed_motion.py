@@ -75,7 +75,8 @@ class SensedMotion:
     #: Properties of the line under the body, toward rising arc length (P2 2.3): gradient by wheel and accelerometer (an
     #: offset of 0.01 m/s2 is 0.001); curvature by the yaw rate, positive to the right; cant by the roll of the body
     #: over the wheels' contact points, positive with the left rail higher; and chainage of the body's middle. They are
-    #: NaN where the wheel is slower than `SLOWEST_MPS`; cant is also NaN without a vehicle; shape (T,).
+    #: NaN unless the wheel rolls without slip and faster than `SLOWEST_MPS`; cant is also NaN without a vehicle; shape
+    #: (T,).
     gradient: Floats
     curvature_1pm: Floats
     cant_m: Floats

@@ -63,7 +63,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
-    """Yield short pieces and the states before them; pieces with sensors are short already."""
+    """Return short pieces and the states before them; pieces with sensors are short already."""
     size = len(replay.epochs)
     sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
     if size <= _EPOCHS or sensed:

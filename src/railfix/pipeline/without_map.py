@@ -95,7 +95,7 @@ class RangesWithoutMap:
     no_position: Codes  #: `NoPosition` from the numbers of codes, records and satellites; shape (T,).
 
 
-#: Rejection reasons of codes from satellites that are not used.
+#: Rejection reasons of codes that do not count in the number of observed satellites.
 _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OTHER_SIGNAL_TAKEN)
 
 

@@ -22,7 +22,7 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Number of conventional positions, and their distance from the line, after which a run is stopped early.
+#: Number of conventional positions, all more than `ANOTHER_PLACE_M` from the line, after which a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
 #: Largest time between the log and its navigation records; records further away are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")

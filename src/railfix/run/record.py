@@ -34,8 +34,9 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Figures of an antenna without rows. Limits at which the filter's levels are counted [m].
+#: Limits at which the filter's levels are counted [m].
 WITHIN_M: Final = (20, 50)
+#: Figures of an antenna without rows.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 

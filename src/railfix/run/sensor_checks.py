@@ -50,8 +50,8 @@ class PositionMotion:
     """Motion of an antenna by its positions, M cells of time; NaN where a neighbour is missing."""
 
     time: Datetimes  #: Shape (M,).
-    #: Chainage, speed and acceleration toward rising chainage; gradient of the line as climb over horizontal length,
-    #: and its heading, whose rate is positive to the right; shape (M,).
+    #: Speed and acceleration toward rising chainage; gradient of the line as climb over horizontal length; rate of the
+    #: line's heading, positive to the right; shape (M,).
     speed_mps: Floats
     acceleration_mps2: Floats
     gradient: Floats
@@ -211,8 +211,9 @@ _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
 #: Largest scale error of a worn wheel.
 _OTHER_TEETH: Final = 0.1
-#: Comparison of ranges with satellite positions: largest time difference [s], minimum speed, largest distance of the
-#: unit [m], minimum cosine of its direction along the track, and number required on each side.
+#: Comparison of ranges with satellite positions: largest time between two positions [s], minimum distance run
+#: between them [m], largest distance of the unit [m], minimum cosine of its direction along the track, and number
+#: required on each side.
 _BETWEEN_S: Final = 3.0
 _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0

@@ -223,7 +223,7 @@ class Log:
     paths: tuple[Path, ...]
     chunk_epochs: int
     reading: LogReading = field(default_factory=LogReading)
-    #: First epoch, and end of the log.
+    #: Time from which epochs are read, and time before which the last one lies; None without a limit.
     start: datetime | None = None
     end: datetime | None = None
     share: float = 0.0  #: Fraction of the files that has been read, 0 to 1.

@@ -169,7 +169,7 @@ class StandstillPhases:
     elevation_deg: Floats  #: Shape (T, M).
     wavelength_m: Floats  #: Shape (M,).
     group: Strings  #: Satellites on one clock and signal, shape (M,).
-    distance_m: float  #: Vector from the base station.
+    distance_m: float  #: Distance from the base station.
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
         """Return the mean double differences over some epochs, of each satellite over its longest unbroken part."""

@@ -35,7 +35,7 @@ class Provenance:
     files: tuple[str, ...] = ()
     crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` where none is named.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
-    #: ``"ellipsoidal"`` or ``"orthometric"``; the height datum is empty if none was given.
+    #: ``"ellipsoidal"`` or ``"orthometric"``; `height_datum_asked` is empty if none was given.
     height_datum_asked: str = ""
     height_datum_used: str = "ellipsoidal"
     geoid: str = ""  #: Geoid model used to convert orthometric to ellipsoidal heights; empty where none was needed.
