@@ -74,10 +74,10 @@ class TwoFrequencyState:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Combined(NotebookTable):
-    """One pseudorange per satellite from two codes: T epochs by K channels; NaN where the second code is missing."""
+    """One pseudorange per satellite from two codes: T epochs by K channels; NaN where only the first is used."""
 
     code_m: Floats  #: Shape (T, K).
-    variance_m2: Floats  #: Correction added to the first code, shape (T, K).
+    variance_m2: Floats  #: Change of the variance relative to the first code, shape (T, K).
     share: Floats  #: Weight of the second code; the first has 1 less this weight; shape (T, K).
     #: Delay on the first frequency beyond the model, shape (T, K).
     ionosphere_m: Floats
