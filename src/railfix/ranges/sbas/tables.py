@@ -226,7 +226,7 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add the row where each series begins: the first of its satellite, or one after per row that was not monitored."""
+    """Add the row where each series begins: the first of its satellite, or the row after one that was not monitored."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
