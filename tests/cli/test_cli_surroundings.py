@@ -91,7 +91,7 @@ def text_of(output: str) -> str:
         ("simulate demo --set rate_hz=1e9 --out {out}", 4, "rate_hz"),
         ("map check {desk}/line.csv --max-gap nan", 4, "--max-gap"),
         ("map check {desk}/line.csv --mid-chord -1", 4, "--mid-chord"),
-        ("map from-positions {desk}/rtk.csv --out {out}.csv --spacing 1e300", 3, ""),
+        ("map from-positions {desk}/rtk.csv --out {out}.csv --spacing 1e300", 7, "0 of 200 positions left"),
         ("map from-positions {desk}/rtk.csv --out {out}.csv --spacing 0", 4, "--spacing"),
         ("map from-positions {desk}/rtk.csv --out {out}.csv --quality x", 4, "--quality"),
         ("map from-positions {desk}/rtk.csv --out {out}.csv --column a", 4, "--column"),
