@@ -150,9 +150,9 @@ def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]
 
 
 def channel_sums(values: Floats) -> Floats:
-    """Return sums over the channels, axis 1, added one after the other: channels of zeros do not change a bit.
+    """Return sums over the channels, axis 1, in their order, so that channels of zeros leave each sum exactly as it is.
 
-    So the sums of a whole log, with the channels of all its epochs, equal the sums of its single epochs.
+    The sums of a whole log, with the channels of all its epochs, therefore equal the sums of its single epochs.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
 
