@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import gzip
-import json
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 from typer.testing import CliRunner
 
@@ -22,15 +20,12 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
 from railfix.io import read_positions
-from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
+from railfix.io.train_message import MessageStatus
 from railfix.live import session
 from railfix.live.channels import TwoChannels, compare, digests
-from railfix.live.console import Metrics
 from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.forms import nmea_bytes, tpv_bytes
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
-from railfix.live.sources import check_source
 from railfix.live.stream import Lag, ReceivedData, ReceiverState, receive_bytes, single_epochs
 from railfix.simulate.demonstration import demo_files
 
@@ -116,34 +111,6 @@ def test_live_is_batch(logs: dict[str, tuple[Observations, ...]], batch: railfix
         assert np.nanmax(np.abs(got - expected.chainage_m)) < 1e-9
     assert engine.counts["paired"] == EPOCHS
     assert [output.message.sequence for output in outputs] == list(range(1, len(outputs) + 1))
-
-
-def test_one_antenna_late_or_missing(logs: dict[str, tuple[Observations, ...]]) -> None:
-    """An epoch whose pair comes after 30 ms goes alone, and the late one is counted; each period has one message."""
-    engine = LiveEngine(processor(), LiveSettings())
-    arrivals = [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:60]]
-    arrivals += [
-        (tag_ns(epoch) + (45 * MS if 20 <= k < 30 else 5 * MS), "rear", epoch)
-        for k, epoch in enumerate(logs["rear"][:60])
-        if not 40 <= k < 45
-    ]
-    outputs = played(engine, arrivals)
-    assert engine.counts["front alone"] == 15
-    assert engine.counts["late"] == 10
-    assert engine.counts["paired"] == 45
-    assert sum(output.result is not None for output in outputs) == 60
-
-
-def test_periods_without_input_have_a_message(logs: dict[str, tuple[Observations, ...]]) -> None:
-    """A gap of 2 s at 10 Hz: 19 or 20 messages that say so, then positions again."""
-    engine = LiveEngine(processor("front"), LiveSettings())
-    epochs = [*logs["front"][:30], *logs["front"][50:80]]
-    outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in epochs])
-    silent = [o for o in outputs[:-1] if o.message.status is MessageStatus.NO_INPUT]
-    assert 19 <= len(silent) <= 21
-    assert outputs[40].message.status is MessageStatus.NO_INPUT
-    assert outputs[40].message.chainage_cm is None
-    assert sum(o.result is not None for o in outputs) == 60
 
 
 def test_one_message_a_period_however_epochs_come(logs: dict[str, tuple[Observations, ...]]) -> None:
@@ -257,19 +224,6 @@ def test_a_clock_of_100_ppm_beside_the_receivers_is_no_lag() -> None:
     assert not any(lag.skips(k * 1000 * MS, round(k * 1000 * MS * (1.0 + 1e-4))) for k in range(3600))
 
 
-def test_the_wait_ends_when_a_message_is_due(logs: dict[str, tuple[Observations, ...]]) -> None:
-    """An epoch that came too early waits for the end of a period; the next is due one and a half later, then one."""
-    engine = LiveEngine(processor("front"), LiveSettings(period_s=0.2))
-    engine.push("front", logs["front"][0], now_ns=0)
-    sent: list[tuple[int, MessageStatus]] = []
-    for now_ms, wait_ms in ((0, 200), (50, 150), (200, 200), (440, 60), (500, 200), (650, 50)):
-        outputs = engine.poll(now_ns=now_ms * MS, sent_ns=now_ms * MS)
-        sent += [(now_ms, output.message.status) for output in outputs if output.part != "rows"]
-        assert engine.wait_s(now_ns=now_ms * MS) == pytest.approx(wait_ms / 1e3)
-    assert [now_ms for now_ms, _ in sent] == [200, 500]
-    assert sent[1][1] is MessageStatus.NO_INPUT
-
-
 def test_numbers_are_reserved_for_ten_times_between_two_states(
     logs: dict[str, tuple[Observations, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -287,49 +241,6 @@ def test_numbers_are_reserved_for_ten_times_between_two_states(
     assert saved[-1].engine.sequence < 4  # of an orderly end, that of the last message
 
 
-def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]]) -> None:
-    engine = LiveEngine(processor("front"), LiveSettings(restart_epochs=3))
-    first = list(logs["front"][60:90])
-    sequence = [*first[:10], first[9], first[5], *first[10:]]
-    at = tag_ns(first[0])
-    outputs = played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(sequence)])
-    assert engine.counts["duplicate"] == 1
-    assert engine.counts["out of order"] == 1
-    assert engine.counts["restart"] == 0
-    assert sum(o.result is not None for o in outputs) == len(first)
-    again = list(logs["front"][:20])  # the receiver comes back with older tags
-    later = played(engine, [(at + 10**10 + 100 * MS * k, "front", epoch) for k, epoch in enumerate(again)])
-    assert engine.counts["restart"] == 1
-    assert sum(o.result is not None for o in later) == 18  # the third epoch in a row restarts
-
-
-def test_what_is_used_in_place_of_what_was_asked_for_is_told(logs: dict[str, tuple[Observations, ...]]) -> None:
-    """Ephemerides without coefficients of the ionosphere at the start, the coefficients ten epochs later."""
-    known = processor("front")
-    navigation = known.received.navigation
-    bare = railfix.EpochProcessor(known.config, known.trajectories, navigation=replace(navigation, klobuchar={}))
-    engine = LiveEngine(bare, LiveSettings())
-    assert "no coefficients of GPS or QZSS received" in engine.reports[0]
-    engine.reports.clear()
-    at = tag_ns(logs["front"][0])
-    played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][:10])])
-    assert not engine.reports
-    engine.add_navigation(navigation)
-    played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][10:20], 10)])
-    assert [text.startswith("no longer so: ionosphere") for text in engine.reports] == [True]
-
-
-def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> None:
-    engine = LiveEngine(processor("front"), LiveSettings())
-    epochs = [
-        replace(epoch, time=epoch.time + np.timedelta64(1 if k >= 10 else 0, "ms"))
-        for k, epoch in enumerate(logs["front"][:20])
-    ]
-    outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in epochs])
-    assert engine.counts["tag step"] == 1
-    assert sum(o.result is not None for o in outputs) == 20
-
-
 def ubx_line(log: Path, folder: Path) -> Path:
     """A line of 1 km through the place that the receiver itself gives."""
     latitude, longitude, height = (float(np.median(v)) for v in geodetic_from_ecef(read_positions(log).ecef_m))
@@ -337,62 +248,6 @@ def ubx_line(log: Path, folder: Path) -> Path:
     path = folder / "line.csv"
     path.write_text("# crs: EPSG:4979\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
     return path
-
-
-async def serve_in_fragments(data: bytes, seed: int, server_ready: asyncio.Future[int]) -> None:
-    """One client gets the bytes in fragments of random length."""
-    rng = np.random.default_rng(seed)
-    done = asyncio.Event()
-
-    async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        place = 0
-        while place < len(data):
-            step = int(rng.integers(1, 3000))
-            writer.write(data[place : place + step])
-            await writer.drain()
-            place += step
-        writer.close()
-        done.set()
-
-    server = await asyncio.start_server(answer, "127.0.0.1", 0)
-    server_ready.set_result(server.sockets[0].getsockname()[1])
-    await done.wait()
-    server.close()
-
-
-@pytest.mark.slow
-def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) -> None:
-    """UBX with its own ephemerides over TCP in random fragments: the epochs of the file read live, bit for bit."""
-    log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
-    data = gzip.decompress(log.read_bytes())[:700_000]
-    part = tmp_path / "part.ubx"
-    part.write_bytes(data)
-    trajectory = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([ubx_line(log, tmp_path)]))}
-
-    async def session(source: str | None) -> list[LiveOutput]:
-        outputs: list[LiveOutput] = []
-        engine = LiveEngine(
-            railfix.EpochProcessor(railfix.Config(), trajectory),
-            LiveSettings(period_s=1.0, no_input="skip", reconnect="off"),
-        )
-        if source is not None:
-            await run_session(engine, {"front": source}, [], speed=None, hooks=Hooks(observe=outputs.append))
-            return outputs
-        ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        server = asyncio.create_task(serve_in_fragments(data, 5, ready))
-        port = await ready
-        await run_session(
-            engine, {"front": f"tcp://127.0.0.1:{port}"}, [], speed=None, hooks=Hooks(observe=outputs.append)
-        )
-        await server
-        return outputs
-
-    from_file, from_socket = asyncio.run(session(str(part))), asyncio.run(session(None))
-    a, b = chainages(from_file, "front"), chainages(from_socket, "front")
-    assert list(a) == list(b)
-    assert len(a) > 80
-    assert np.isfinite(list(a.values())).sum() > 40
-    assert np.array_equal(list(a.values()), list(b.values()), equal_nan=True)
 
 
 @pytest.mark.slow
@@ -415,7 +270,6 @@ def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_pat
             for epoch in received.epochs:
                 engine.push("front", epoch, now_ns=tag_ns(epoch))
                 for output in engine.poll(now_ns=tag_ns(epoch)):
-                    assert output.result is not None
                     placed = bool(np.isfinite(output.result.antennas["front"].chainage_m[-1]))
                     statuses.append((records, placed))
     assert not any(placed for known, placed in statuses if known < 3)
@@ -443,90 +297,6 @@ def test_two_channels_agree_and_a_difference_stops(logs: dict[str, tuple[Observa
         compare(ours, theirs)
 
 
-def test_messages_of_the_demonstration(logs: dict[str, tuple[Observations, ...]]) -> None:
-    """Front end, bounds, speed and views of one message."""
-    settings = LiveSettings(train=9, line=2, facing=1, front_offset_m=2.0, length_m=20.0)
-    outputs = played(LiveEngine(processor(filter="track"), settings), [
-        (tag_ns(epoch), name, epoch) for name, epochs in logs.items() for epoch in epochs
-    ])  # fmt: skip
-    placed = [o for o in outputs if o.message.status is MessageStatus.POSITION]
-    assert len(placed) > 0.8 * EPOCHS
-    output = placed[-1]
-    message = output.message
-    assert (message.train, message.line, message.length_cm) == (9, 2, 2000)
-    assert message.over_cm == message.under_cm
-    assert message.over_cm is not None
-    assert message.protection_level_cm is not None
-    assert message.over_cm >= message.protection_level_cm > 0
-    assert output.result is not None
-    reference = float(next(iter(output.result.fusion.values())).chainage_m[-1])
-    assert abs(message.chainage_cm / 100.0 - 2.0 - reference) < 25.0  # of one of the antennas, 18.2 m apart
-    sentences = nmea_bytes(output).decode().splitlines()
-    assert [s[:6] for s in sentences] == ["$GPGGA", "$GPRMC", "$GPGST"]
-    for sentence in sentences:
-        body, checksum = sentence[1:].split("*")
-        value = 0
-        for character in body.encode():
-            value ^= character
-        assert f"{value:02X}" == checksum
-    fields = sentences[0].split(",")
-    latitude = float(fields[2][:2]) + float(fields[2][2:]) / 60.0
-    tpv = json.loads(tpv_bytes(output))
-    assert tpv["lat"] == pytest.approx(latitude, abs=1e-8)
-    assert (tpv["class"], tpv["mode"]) == ("TPV", 3)
-    assert Metrics(epochs={"paired": 3}).text().count("# TYPE") == 8
-
-
-def test_bounds_of_the_filter_where_it_has_a_level(logs: dict[str, tuple[Observations, ...]]) -> None:
-    engine = LiveEngine(processor("front", filter="track"), LiveSettings())
-    outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:40]])
-    output = outputs[-2]
-    assert output.result is not None
-    amount = float(output.result.fusion["front"].tracked.amount_m[-1])
-    assert output.message.over_cm is not None
-    assert 0.0 <= output.message.over_cm / 100.0 - amount < 0.03
-
-
-def test_the_command_on_the_demonstration(tmp_path: Path) -> None:
-    """RINEX files replayed live: messages in JSON and CBOR, tables as `railfix run` writes them."""
-    files = demo_files()
-    parts = {name: tmp_path / f"{name}.rnx" for name in ("front", "rear")}
-    for name, path in parts.items():
-        railfix.write_observations(railfix.read_observations(files[name])[:30], path)
-    lines, binary, out = tmp_path / "messages.jsonl", tmp_path / "messages.cbor", tmp_path / "out"
-    common = ["--track", str(files["track"]), "--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
-    log = ["--front", str(parts["front"]), "--rear", str(parts["rear"])]
-    words = ["live", *log, *common, "--live", "no_input=skip", "--send", f"json@{lines}", "--send", f"cbor@{binary}"]
-    done = RUNNER.invoke(app, [*words, "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    batch = RUNNER.invoke(app, ["run", *log, *common, "--out", str(tmp_path / "run")])
-    assert batch.exit_code == 0
-    live_rows, rows = (
-        pl.read_parquet(folder / "positions.parquet").sort("time_gpst", "antenna") for folder in (out, tmp_path / "run")
-    )
-    # In the log also epochs without a single code have a row; receivers send none.
-    rows = rows.join(live_rows.select("time_gpst", "antenna"), on=["time_gpst", "antenna"], how="semi")
-    assert live_rows.height == rows.height > 50
-    assert live_rows["status"].equals(rows["status"])
-    difference = (live_rows["chainage_m"] - rows["chainage_m"]).fill_nan(None).abs().max()
-    assert difference is not None
-    assert float(difference) < 1e-9
-    messages = [from_json(line) for line in lines.read_text().splitlines()]
-    assert decoded(binary.read_bytes()) == messages
-    assert [m.sequence for m in messages] == list(range(1, len(messages) + 1))
-    refused = RUNNER.invoke(app, [*words, "--out", str(tmp_path / "other")])
-    assert refused.exit_code == 8
-
-
-def decoded(data: bytes) -> list[TrainMessage]:
-    messages, place = [], 0
-    while place < len(data):
-        length = int.from_bytes(data[place : place + 2], "big")
-        messages.append(decode(data[place + 2 : place + 2 + length]))
-        place += 2 + length
-    return messages
-
-
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
@@ -547,11 +317,6 @@ def test_what_is_wrong_is_one_sentence(words: list[str], code: int, says: str) -
     assert done.exit_code == code, done.output
     assert says in " ".join(done.output.split())
     assert "Traceback" not in done.output
-
-
-def test_sources_that_are_right_are_taken() -> None:
-    for good in ("-", "a.ubx", "tcp://localhost:1", "ntrip://u:p@localhost:2101/MOUNT", "serial:/dev/ttyS0?baud=9600"):
-        check_source(good)
 
 
 def test_a_track_of_another_country_is_named_once(tmp_path: Path) -> None:

@@ -122,7 +122,6 @@ def test_a_session_with_such_a_caster_ends_by_sigterm() -> None:
         stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        assert process.stdout is not None
         assert process.stdout.readline()
         time.sleep(1.0)
         process.send_signal(signal.SIGTERM)

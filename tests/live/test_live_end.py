@@ -92,7 +92,6 @@ def test_a_second_signal_ends_the_program_when_a_callback_of_the_compiler_lost_t
     """Python reports an exception in a callback from C and goes on, as with Ctrl-C: the next signal must count."""
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", CALLBACK], stdout=pipe, stderr=pipe, text=True) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "lost\n"
         process.send_signal(signal.SIGTERM)
         assert process.wait(20.0) == 143

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,26 +11,24 @@ import pytest
 
 from live_outputs import output_of
 from pipeline_cases import clean_trajectories, demo_observations
-from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.rinex import read_navigation
-from railfix.io.train_message import MessageStatus, Source, SuspectedInterference, Unknown
+from railfix.io.train_message import MessageStatus, SuspectedInterference
 from railfix.live.console import Metrics
 from railfix.live.engine import EngineState, LiveEngine
-from railfix.live.forms import gga_sentence, nmea_bytes, tpv_bytes
+from railfix.live.forms import gga_sentence, nmea_bytes
 from railfix.live.session import Hooks, _Session
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import FOREVER, Sensed, SensorLines, single_epochs
-from railfix.motion.samples import RadarSpeeds, SensorSamples, TachometerPulses
-from railfix.motion.slip import MotionState
+from railfix.motion.samples import RadarSpeeds, SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import Result
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.simulate.demonstration import demo_files
-from railfix.tracking import Kind, TrackStatus
+from railfix.tracking import TrackStatus
 
 
 @pytest.mark.requirement("A8")
@@ -73,104 +70,6 @@ def with_track(result: Result, name: str, *, tracked: dict[str, Any] | None = No
     track = result.fusion[name]
     changed = replace(track, tracked=replace(track.tracked, **(tracked or {})), **values)
     return replace(result, antennas={name: result.antennas[name]}, fusion={name: changed})
-
-
-@pytest.mark.requirement("A8")
-@pytest.mark.parametrize("facing", [-1, 0, 1])
-def test_the_front_end_is_ahead_of_the_place_in_the_direction_it_looks(filtered: Result, facing: int) -> None:
-    """A train of 40 m whose front end is 7.5 m ahead of the front antenna, 9.1 m ahead of the vehicle's middle."""
-    one = with_track(filtered, "front")
-    apart_m = float(abs(one.fusion["front"].chainage_m[-1] - one.antennas["front"].chainage_m[-1]))
-    middle = float(one.fusion["front"].chainage_m[-1]) - 9.1
-    message = output_of(one, LiveSettings(facing=facing, front_offset_m=7.5, length_m=40.0)).message
-    ahead = {1: 9.1 + 7.5, 0: 0.0, -1: 40.0 - 9.1 - 7.5}[facing]
-    assert message.chainage_cm == pytest.approx(100.0 * (middle + facing * ahead), abs=0.6)
-    assert (message.facing, message.length_cm) == (facing, 4000)
-    assert message.unknown == (Unknown(0) if facing else Unknown.FACING)
-    assert message.over_cm is not None
-    assert message.protection_level_cm is not None
-    either = 0.0 if facing else 40.0 - 9.1 - 7.5  # the rear end, the further one, may be ahead on either side
-    assert message.over_cm - message.protection_level_cm == pytest.approx(100.0 * (either + apart_m) + 1.0, abs=2.0)
-    if not facing:
-        assert (message.safe_front_cm, message.safe_rear_cm) == (None, None)
-        return
-    assert message.chainage_cm is not None
-    assert message.safe_front_cm == pytest.approx(message.chainage_cm + facing * message.over_cm, abs=1)
-    assert message.safe_rear_cm == pytest.approx(message.chainage_cm - facing * (message.over_cm + 4000), abs=1)
-
-
-@pytest.mark.requirement("A8")
-def test_bound_of_the_speed_and_probability_of_the_track(filtered: Result) -> None:
-    """0.1 m/s: 5.33 sigmas are 53.3 cm/s, rounded up; 0.9876 is 987 thousandths."""
-    values = {"speed_sigma_mps": np.full(3, 0.1), "probability": np.full(3, 0.9876)}
-    message = output_of(with_track(filtered, "front", tracked=values), LiveSettings()).message
-    assert (message.speed_bound_cmps, message.track_permille) == (54, 987)
-
-
-@pytest.mark.requirement("A8")
-def test_the_bound_holds_for_the_single_epoch_and_for_the_filter(filtered: Result) -> None:
-    """The filter's place moved 4 m away from the single epoch's: the bounds are 4 m wider than the level."""
-    single = filtered.antennas["front"].chainage_m
-    bounds = []
-    for away_m in (0.0, 4.0, -4.0):
-        arc_m = filtered.fusion["front"].trajectory.arc_at_chainage(single + away_m)
-        moved = with_track(filtered, "front", arc_m=arc_m)
-        message = output_of(moved, LiveSettings()).message
-        assert message.over_cm is not None
-        assert message.protection_level_cm is not None
-        bounds.append(message.over_cm - message.protection_level_cm)
-    assert bounds == [pytest.approx(1, abs=1), pytest.approx(401, abs=1), pytest.approx(401, abs=1)]
-
-
-@pytest.mark.requirement("A8")
-def test_forms_name_hemispheres_utc_and_the_place_of_the_first_antenna(filtered: Result) -> None:
-    """GPS time is 18 s ahead of UTC from 2017 on."""
-    for latitude, longitude, letters in ((35.5, 139.5, ("N", "E")), (-35.5, -139.5, ("S", "W"))):
-        one = with_track(filtered, "front")
-        # computed from the position on the line at the first access; no line is on the southern half as well
-        vars(one.fusion["front"])["geodetic"] = np.full(3, latitude), np.full(3, longitude), np.zeros(3)
-        message = output_of(one, LiveSettings()).message
-        at = (np.datetime64("2024-03-05T00:00:10", "ns") - GPS_EPOCH) // np.timedelta64(1, "ns")
-        output = replace(output_of(one), message=message.replaced(time_ns=int(at)))
-        fields = nmea_bytes(output).decode().splitlines()[0].split(",")
-        assert fields[1] == "235952.00"
-        assert (fields[3], fields[5]) == letters
-        assert (fields[2], fields[4]) == ("3530.0000000", "13930.0000000")
-        tpv = json.loads(tpv_bytes(output))
-        assert (tpv["time"], tpv["lat"], tpv["lon"]) == ("2024-03-04T23:59:52.000Z", latitude, longitude)
-    places = []
-    for name in ("rear", "front"):  # whichever has the smaller level, the point is the same
-        fusion = {
-            other: replace(track, tracked=replace(track.tracked, level_m=level, amount_m=level))
-            for other, track in filtered.fusion.items()
-            for level in [np.full(3, 3.0 if other == name else 99.0)]
-        }
-        output = output_of(replace(filtered, fusion=fusion))
-        assert output.place is not None
-        assert output.place.antenna == name
-        tpv = json.loads(tpv_bytes(output))
-        places.append(ecef_from_geodetic(tpv["lat"], tpv["lon"], tpv["altHAE"]))
-    assert np.linalg.norm(places[0] - places[1]) < 3.0  # the antennas are 18.2 m apart
-
-
-@pytest.mark.requirement("A8")
-def test_nothing_from_before_a_restart_of_the_receiver_is_used() -> None:
-    """Epochs that wait for the other antenna, and samples of sensors, are of the time before."""
-    processor = EpochProcessor(
-        parse_config({"filter": "track"}), clean_trajectories(), navigation=read_navigation(demo_files()["nav"])
-    )
-    engine = LiveEngine(processor, LiveSettings(restart_epochs=3))
-    epochs = single_epochs(demo_observations()["front"][:60])
-    for epoch in epochs[40:43]:
-        engine.push("front", epoch, now_ns=0)
-    pulses = TachometerPulses(time=epochs[0].time, pulse=np.array([1]), direction=np.array([1]))
-    engine._samples = SensorSamples(tachometer=pulses)
-    for epoch in epochs[:3]:
-        engine.push("front", epoch, now_ns=0)
-    assert engine.counts["restart"] == 1
-    assert not engine._samples
-    tags = [o.result.antennas["front"].time[-1] for o in engine.poll(now_ns=10**12) if o.result is not None]
-    assert tags == [epochs[2].time[0]]
 
 
 @pytest.mark.requirement("A8", "E5")
@@ -229,33 +128,6 @@ def test_interference_is_the_worst_of_both_antennas_and_satellites_are_the_most(
         gga = nmea_bytes(output_of(both)).decode().split(",")
         assert gga[7] == "07"
     assert output_of(filtered, LiveSettings()).message.interference == SuspectedInterference(0)
-
-
-@pytest.mark.requirement("A8", "E5")
-def test_a_way_that_inertia_carries_is_of_the_inertial_unit(filtered: Result) -> None:
-    used = np.zeros_like(filtered.fusion["front"].tracked.used)
-    used[-1, Kind.WHEEL] = 1
-    for state, expected in ((MotionState.NORMAL, Source.TACHOMETER), (MotionState.INERTIAL_SLIDE, Source.INERTIAL)):
-        sensed = replace(filtered.fusion["front"].sensed, state=np.full(3, state, dtype=np.int8))
-        message = output_of(
-            with_track(filtered, "front", tracked={"used": used}, sensed=sensed), LiveSettings()
-        ).message
-        assert message.sources == Source.FRONT_RECEIVER | expected
-
-
-@pytest.mark.requirement("A8")
-def test_speeds_of_forms_are_without_a_sign_and_carried_places_are_estimates(filtered: Result) -> None:
-    """10 m/s toward falling chainage are 19.44 knots; quality 6 of NMEA is an estimated position."""
-    one = with_track(filtered, "front", tracked={"speed_mps": np.full(3, -10.0)})
-    message = output_of(one, LiveSettings()).message
-    assert message.speed_cmps == -1000
-    for status, quality, valid in (
-        (MessageStatus.POSITION, "1", "A"), (MessageStatus.COASTING, "6", "A"), (MessageStatus.DOUBTFUL, "0", "V"),
-    ):  # fmt: skip
-        output = replace(output_of(one), message=message.replaced(status=status))
-        gga, rmc, _ = (line.split(",") for line in nmea_bytes(output).decode().splitlines())
-        assert (gga[6], rmc[2], rmc[7]) == (quality, valid, "19.44")
-        assert json.loads(tpv_bytes(output))["speed"] == 10.0
 
 
 @pytest.mark.requirement("A12")

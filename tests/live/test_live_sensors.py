@@ -16,11 +16,9 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.core.errors import InputFileError
 from railfix.core.settings_files import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
-from railfix.live import console
 from railfix.live.console import SensorWatch
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import ROW_FORMS
@@ -221,15 +219,6 @@ def test_a_restart_in_a_slip_goes_on_from_the_state_file(case: Ride, tmp_path: P
     np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
 
 
-def test_an_epoch_waits_no_longer_than_asked_for(case: Ride, tmp_path: Path) -> None:
-    engine = engine_of(case, tmp_path, sensor_wait_s=0.1)
-    first = case.observations[:1]
-    engine.push("front", first, now_ns=0)
-    assert engine.poll(now_ns=90_000_000) == []
-    assert engine.wait_s(now_ns=90_000_000) == pytest.approx(0.01)
-    assert len(engine.poll(now_ns=100_000_000)) == 1
-
-
 def test_samples_wait_for_an_antenna_without_an_epoch(case: Ride, tmp_path: Path) -> None:
     """The rear antenna's epochs are missing for a second: its next one has the way of the wheel over all of it."""
     write_toml(tmp_path / "v.toml", vehicle_table(case.simulation.scenario.vehicle))
@@ -286,26 +275,6 @@ def test_a_line_that_is_no_row_is_counted_and_left_out(line: str) -> None:
     assert sensed.until == np.datetime64("2024-03-05T03:10:03")
 
 
-def test_a_stream_of_another_table_is_refused_by_name() -> None:
-    with pytest.raises(
-        InputFileError, match=r"tcp://127.0.0.1:9: the first line has no column pulse; expected a header"
-    ):
-        SensorLines(sensor="tachometer", source="tcp://127.0.0.1:9").take(b"time_gpst,speed_mps\n")
-    assert set(HEADERS) == set(SENSORS)
-
-
-def test_a_range_to_a_unit_that_is_not_surveyed_is_counted(case: Ride, tmp_path: Path) -> None:
-    engine, lines = engine_of(case, tmp_path), SensorLines(sensor="ranging", source="test")
-    rows = "2024-03-05T03:10:01,A,50.5,\n2024-03-05T03:10:01,C,60.5,0.2\n2024-03-05T03:10:02,A,,\n,A,5,\n"
-    sensed = lines.take(f"{HEADERS['ranging']}\n{rows}".encode())
-    assert sensed.skipped == 2
-    assert isinstance(sensed.samples.ranging, StationRanges)
-    assert sensed.samples.ranging.station.tolist() == ["A", "C"]
-    np.testing.assert_array_equal(sensed.samples.ranging.sigma_m, [np.nan, 0.2])
-    assert sensed.count_unsurveyed(engine.processor.units) == 1
-    assert sensed.count_unsurveyed(None) == 2
-
-
 @pytest.mark.slow
 def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, tmp_path: Path) -> None:
     """The ride's outputs over and over, each time later; from the eleventh on the radar reads 4 % more."""
@@ -322,44 +291,12 @@ def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, t
             watch.take(Sensed(sensor="radar", samples=SensorSamples(radar=some), until=some.time[-1]))
             assert len(vars(watch)["_radar"].radar) < 130 * 10
         for output in outputs:
-            assert output.result is not None
             front, track = output.result.antennas["front"], output.result.fusion["front"]
             later = replace(front, time=front.time + shift)
             result = replace(output.result, antennas={"front": later}, fusion={"front": track})
             watch.take(replace(output, result=result))
     (note,) = said
     assert re.search(r"from .* its speeds are \+[34].\d % off those by satellites, [+-]0.\d % before", note), note
-
-
-@pytest.mark.slow
-def test_the_watch_of_the_sensors_speaks_once_and_forgets(
-    case: Ride, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(console, "WATCHED_NS", 70_000_000_000)
-    engine = engine_of(case, tmp_path, sensor_wait_s=0.2)
-    outputs, said = live(case, engine, latency_s=0.05), list[str]()
-    watch = SensorWatch(engine.processor, said.append)
-    ranges = case.samples.ranging
-    wrong = replace(case.samples, ranging=replace(ranges, range_m=ranges.range_m + 5.0))
-    for rows in np.array_split(np.arange(len(case.observations)), 7):  # as they come, sensor by sensor
-        begin, end = case.observations.time[rows[0]] - np.timedelta64(500, "ms"), case.observations.time[rows[-1]]
-        for sensor, table in wrong.between(begin, end).tables.items():
-            for piece in np.array_split(np.arange(len(table)), 50):  # pieces are joined now and then
-                some = type(table)(**{name: values[piece] for name, values in vars(table).items()})
-                watch.take(Sensed(sensor=sensor, samples=SensorSamples(**{sensor: some}), until=end))
-        for k in rows:
-            watch.take(outputs[k])
-    (note,) = said
-    assert "ranges are 5." in note or "ranges are 4." in note
-    watch.judge()
-    assert said == [note]
-    assert not any(vars(watch)[name] for name in ("_place_ns", "_samples", "_blocks"))
-    right = SensorWatch(engine.processor, said.append)
-    right.take(Sensed(sensor="all", samples=case.samples, until=FOREVER))
-    for output in outputs:
-        right.take(output)
-    right.judge()
-    assert said == [note]
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_j
 from railfix.live import sinks
 from railfix.live.console import Metrics, SessionLog
 from railfix.live.engine import LiveOutput
-from railfix.live.forms import etcs_form, forms
+from railfix.live.forms import forms
 from railfix.live.session import Hooks, _Session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import MqttTarget, Outlet, open_sink
@@ -118,27 +118,6 @@ def test_a_target_that_refuses_is_counted_and_a_defect_is_raised() -> None:
     broken.close()
     with pytest.raises(ZeroDivisionError):
         broken.send(2)
-
-
-def test_a_disk_that_is_full_does_not_stop_the_other_sinks(tmp_path: Path) -> None:
-    """/dev/full refuses every byte; the file beside it has all messages."""
-    if not Path("/dev/full").exists():
-        pytest.skip("there is no /dev/full here")
-
-    async def run() -> Any:
-        full = await open_sink("json@/dev/full", overwrite="replace")
-        file = await open_sink(f"json@{tmp_path / 'messages'}")
-        for k in range(20):
-            for sink in (full, file):
-                sink.send(output(k))
-        full.close()
-        file.close()
-        return full
-
-    full = asyncio.run(run())
-    assert full.failed == 20
-    assert "No space left" in full.failure
-    assert [from_json(line).sequence for line in (tmp_path / "messages").read_text().splitlines()] == list(range(20))
 
 
 def test_readers_of_a_server_and_datagrams() -> None:
@@ -346,18 +325,6 @@ def test_a_session_that_does_not_begin_leaves_no_file(tmp_path: Path) -> None:
 
 
 # --- forms --------------------------------------------------------------------
-
-
-def test_position_reports_of_etcs() -> None:
-    """Against the reference of the settings; nothing without a position or with a doubt that it cannot say."""
-    form = etcs_form(LiveSettings(reference=77, reference_m=12_000.0))
-    placed = {"chainage_cm": 1_234_567, "over_cm": 812, "under_cm": 655, "status": MessageStatus.POSITION}
-    report = json.loads(form(output(1, **placed)))
-    assert (report["NID_PACKET"], report["NID_LRBG"], report["D_LRBG"], report["Q_SCALE"]) == (0, 77, 346, 1)
-    far = json.loads(form(output(1, **{**placed, "chainage_cm": 11_200_000})))
-    assert (far["D_LRBG"], far["Q_SCALE"], far["L_DOUBTOVER"]) == (10_000, 2, 1)
-    assert form(output(1)) == b""
-    assert form(output(1, **{**placed, "over_cm": 40_000_000})) == b""
 
 
 def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:

@@ -17,12 +17,11 @@ from railfix.core.errors import SettingsError
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import TrainMessage, Unknown, decode, from_json
-from railfix.live.engine import EngineState, LiveEngine, LiveOutput
+from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import cbor_bytes, forms, json_bytes
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
-from railfix.live.train_ends import CHANGED_ENDS_M, RunningEnd, TrainFrame
-from railfix.pipeline.processor_state import State
+from railfix.live.train_ends import TrainFrame
 from railfix.simulate.demonstration import demo_files
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import AntennaOffset, Vehicle
@@ -84,15 +83,10 @@ def beyond_m(message: TrainMessage, middle_m: float, ahead_m: dict[int, float]) 
     """How far the true front end is beyond its bounds, and the true ends beyond the safe ones; `ahead_m`: of the ends
     on the side of rising and falling chainage from the middle.
     """
-    assert message.chainage_cm is not None
-    assert message.over_cm is not None
-    assert message.under_cm is not None
     side = message.facing
     front = middle_m + side * ahead_m[side]
     place = message.chainage_cm / 100.0
     off = max(side * (front - place) - message.under_cm / 100.0, side * (place - front) - message.over_cm / 100.0)
-    assert message.safe_front_cm is not None
-    assert message.safe_rear_cm is not None
     rear = middle_m - side * ahead_m[-side]
     safe = max(side * (front - message.safe_front_cm / 100.0), side * (message.safe_rear_cm / 100.0 - rear))
     return off, safe
@@ -131,7 +125,6 @@ def test_the_true_ends_are_inside_the_bounds_in_every_message_of_every_form(
         place, front = 100.0 + sign * packet["D_LRBG"], middle + message.facing * ahead[message.facing]
         assert place - packet["L_DOUBTUNDER"] <= front <= place + packet["L_DOUBTUNDER"]
         assert packet["Q_DIRLRBG"] == (1 if message.facing > 0 else 0)
-        assert output.place is not None
         assert output.place.geodetic is not None
         antenna = railfix.core.geodesy.ecef_from_geodetic(*output.place.geodetic)
         first = journey.paths["front"]
@@ -154,37 +147,6 @@ def without_vehicle(path: Trajectory) -> Trajectory:
 
 
 @pytest.mark.requirement("A8")
-def test_what_is_unknown_has_a_reason_of_its_own_and_the_bounds_cover_it() -> None:
-    """Without a vehicle file nothing but the antenna's own place is known; more becomes known with each setting."""
-    journey = ride("rising", slice(300, 330, 10))
-    bare = {"front": without_vehicle(journey.paths["front"])}
-    alone = Ride(paths=bare, logs={"front": journey.logs["front"]}, middle_m={})
-    everything = Unknown.FACING | Unknown.FRONT_END | Unknown.LENGTH
-    for values, unknown in (
-        ({}, everything),
-        ({"facing": 1}, Unknown.FRONT_END | Unknown.LENGTH),
-        ({"facing": 1, "front_offset_m": 2.5}, Unknown.LENGTH),
-        ({"facing": 1, "front_offset_m": 2.5, "length_m": 40.0}, Unknown(0)),
-        ({"front_offset_m": 2.5, "length_m": 40.0}, Unknown.FACING),
-        ({"facing": -1, "front_offset_m": 2.5}, Unknown.LENGTH),
-        ({"length_m": 40.0}, Unknown.FACING | Unknown.FRONT_END),
-    ):
-        settings = LiveSettings(period_s=1.0, no_input="skip").replaced(**values)
-        output = list(outputs_of(alone, settings, without={"front": slice(0)}))[-1]
-        message = output.message
-        assert message.unknown == unknown
-        assert (forms(settings)["etcs"](output) == b"") == (Unknown.FRONT_END in unknown or message.over_cm is None)
-        assert message.chainage_cm is not None
-        assert output.place is not None
-        known = Unknown.FRONT_END not in unknown and message.facing
-        ahead = message.facing * values.get("front_offset_m", 0.0) if known else 0.0
-        assert message.chainage_cm / 100.0 == pytest.approx(output.place.chainage_m + ahead, abs=0.006)
-        if message.over_cm is not None and unknown == Unknown.FACING:  # the rear end, 37.5 m away, may be ahead
-            assert message.over_cm >= 3750
-        assert (message.safe_rear_cm is None) == (unknown != Unknown(0) or message.over_cm is None)
-
-
-@pytest.mark.requirement("A8")
 def test_without_a_vehicle_file_the_place_is_that_of_the_first_antenna_alone() -> None:
     """How far the antennas are apart is not known: the second one says nothing of the first one's place."""
     journey = ride("rising", slice(300, 360, 10))
@@ -204,46 +166,6 @@ def test_a_train_shorter_than_its_front_is_ahead_is_refused() -> None:
     assert (frame.front_m, frame.rear_m, frame.running) == (HALF_M, HALF_M, 1)
     frame = TrainFrame.of(paths, LiveSettings(length_m=100.0))  # a train behind the vehicle
     assert (frame.front_m, frame.rear_m) == (HALF_M, 100.0 - HALF_M)
-
-
-@pytest.mark.requirement("A8")
-def test_ends_change_after_a_run_the_other_way_and_not_by_rolling_back_a_jump_or_a_closed_line() -> None:
-    def after(places: list[float], moving: int, start: RunningEnd, bound: float = 3.0) -> RunningEnd:
-        for place in places:
-            start = start.after(place, bound, moving)
-        return start
-
-    up = after([float(x) for x in range(0, 1000, 10)], 1, RunningEnd(direction=1))
-    assert up.direction == 1
-    back = [990.0 - x for x in range(1, 57)]
-    assert after(back[:-1], -1, up).direction == 1  # 50 m and both bounds of 3 m are 56 m
-    changed = after([*back, 933.0], -1, up)
-    assert changed.direction == -1
-    assert changed.sentence(up) == "the train has changed ends: it has run 50 m toward falling chainage"
-    assert after(back, 0, up).direction == 1  # a place that drifts while the speed is not known
-    assert after([0.0, 10.0, 20.0], -1, up).direction == 1  # once round a closed line
-    assert after([930.0], -1, up, bound=np.inf).direction == 1  # a place without a bound
-    unknown = RunningEnd(direction=0)
-    found = after([5.0 * k for k in range(13)], 1, unknown)
-    assert found.direction == 1
-    assert after([0.0, 20.0, 40.0], 1, unknown).direction == 0
-    assert CHANGED_ENDS_M == 50.0
-
-
-@pytest.mark.requirement("A8")
-def test_the_end_that_runs_ahead_is_kept_over_a_restart() -> None:
-    journey = ride("rising", slice(300, 330, 10))
-    processor = railfix.EpochProcessor(railfix.Config(filter="off"), journey.paths)
-    engine = LiveEngine(processor, LONG)
-    assert engine.export_state().running.direction == 1
-    epoch = single_epochs(journey.logs["front"])[0]
-    tag = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
-    saved = EngineState(
-        state=State(), done_ns=tag - 10**9, last_tag={}, sequence=3, running=RunningEnd(direction=-1, last_m=5.0)
-    )
-    engine.resume(saved)
-    engine.push("front", epoch, now_ns=0)
-    assert engine.export_state().running == saved.running
 
 
 def test_the_vehicle_file_has_the_ends(tmp_path: Path) -> None:
