@@ -118,7 +118,6 @@ def test_without_its_fault_hypothesis_a_wrong_balise_would_make_the_level_wrong(
     rolled = replace(pulses, time=pulses.time[kept], pulse=pulses.pulse[kept], direction=pulses.direction[kept])
     silent = replace(case, samples=replace(case.samples, tachometer=rolled))
     listed = case.balises
-    assert listed is not None
     moved = replace(listed, chainage_m=listed.chainage_m + np.where(listed.name == "B012", 10.0, 0.0))
     outcomes = {}
     for prior in (1e-6, 0.0):

@@ -80,7 +80,6 @@ def test_ranges_to_ground_units_place_the_train_in_the_tunnel(case: Ride) -> Non
 
 @pytest.mark.requirement("E4")
 def test_a_unit_surveyed_wrongly_does_not_move_the_train_while_there_are_satellites(case: Ride) -> None:
-    assert case.units is not None
     far = case.units.ecef_m + 40.0
     moved = Ride(**{**vars(case), "units": GroundUnits(name=case.units.name, ecef_m=far)})
     found = moved.run(filter_sources=(*GNSS, "range"), sensors=PLACE)

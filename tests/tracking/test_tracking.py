@@ -11,13 +11,12 @@ from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.constants import CONTRADICTION_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.chunk import compute_singer_step, prepare_chunk
+from railfix.tracking import GnssEpochs, Kind, Line, TrackingLimits, TrackStatus, track
+from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.search import places
 from railfix.tracking.state import Monitors, TrackState
 from tracking_cases import (
     ORIGIN_M,
-    Ride,
     bent_line,
     corner_line,
     part,
@@ -27,24 +26,6 @@ from tracking_cases import (
     with_codes_behind,
     without_epochs,
 )
-
-
-def _in_parts(ride: Ride, cuts: list[int]) -> tuple[list[Tracked], TrackState | None]:
-    results, state = [], None
-    for begin, end in zip([0, *cuts], [*cuts, len(ride.epochs)], strict=True):
-        result, state = track(part(ride.epochs, slice(begin, end)), ride.line, state)
-        results.append(result)
-    return results, state
-
-
-@pytest.mark.requirement("E5")
-def test_noise_free_epochs_give_the_place_and_speed() -> None:
-    case = ride()
-    result, _ = track(case.epochs, case.line)
-    settled = slice(20, None)
-    assert np.abs(result.arc_m - case.arc_m)[settled].max() < 0.05
-    assert np.abs(result.speed_mps - case.speed_mps)[settled].max() < 0.05
-    assert (result.status[settled] == TrackStatus.TRACKING).all()
 
 
 @pytest.mark.requirement("E5")
@@ -60,19 +41,6 @@ def test_a_start_does_not_depend_on_where_the_map_has_its_points(start_m: float)
         found.append(places(chunk, 0, case.line, TrackingLimits()))
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
     assert np.abs(found[0][0] - start_m) < 10.0
-
-
-@pytest.mark.requirement("E5")
-@pytest.mark.parametrize("cuts", [[1], [7, 60], list(range(1, 90))])
-def test_any_cutting_gives_the_same_numbers(cuts: list[int]) -> None:
-    case = ride(90, noise=1.0)
-    whole, last = track(case.epochs, case.line)
-    parts, state = _in_parts(case, cuts)
-    for name in ("arc_m", "sigma_m", "speed_mps", "probability", "status", "innovation", "weight"):
-        joined = np.concatenate([getattr(one, name) for one in parts])
-        np.testing.assert_array_equal(joined, getattr(whole, name), err_msg=name)
-    assert state is not None
-    np.testing.assert_array_equal(state.mean, last.mean)
 
 
 @pytest.mark.requirement("E5")
@@ -118,16 +86,6 @@ def test_a_satellite_whose_signals_take_turns_is_the_same_epoch_by_epoch() -> No
         found, state = track(one, line, state)
         arcs.append(found.arc_m[0])
     np.testing.assert_allclose(np.array(arcs), whole.arc_m, atol=1e-9)
-
-
-@pytest.mark.requirement("E5")
-def test_no_epoch_depends_on_a_later_one() -> None:
-    case = ride(60, noise=1.0)
-    code = case.epochs.code_m.copy()
-    code[40:] += 100.0
-    changed, _ = track(replace(case.epochs, code_m=code), case.line)
-    whole, _ = track(case.epochs, case.line)
-    np.testing.assert_array_equal(changed.arc_m[:40], whole.arc_m[:40])
 
 
 @pytest.mark.requirement("E5")
@@ -236,18 +194,6 @@ def test_a_place_put_wrong_is_lost_and_sought_again() -> None:
     later, _ = track(part(case.epochs, slice(50, 120)), case.line, replace(state, mean=mean))
     assert TrackStatus.LOST in later.status
     assert np.abs(later.arc_m[-20:] - case.arc_m[-20:]).max() < 3.0
-
-
-@pytest.mark.requirement("E5")
-def test_the_noise_of_the_motion_is_that_of_many_short_steps() -> None:
-    whole_step, whole_noise = compute_singer_step(3.0, 1.0, 2.0)
-    step, noise = compute_singer_step(0.01, 1.0, 2.0)
-    total, product = np.zeros((3, 3)), np.eye(3)
-    for _ in range(300):
-        total = step @ total @ step.T + noise
-        product = step @ product
-    np.testing.assert_allclose(product, whole_step, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(total, whole_noise, rtol=1e-9)
 
 
 @pytest.mark.requirement("E5")

@@ -242,7 +242,6 @@ def test_ranges_to_ground_units_give_the_place_to_decimetres() -> None:
     found, state = track(case.epochs, case.line, sensors=_ranged(case, kept=0.6), levels=True)
     assert found.used[:, 3 + ix.RANGE_COLUMN].sum() > 40
     assert np.abs(found.arc_m - case.arc_m)[10:].max() < 0.4
-    assert state.bank is not None
     assert "range" in state.bank.without
     alone, _ = track(case.epochs, case.line)
     assert found.sigma_m[20:].max() < 0.5 * alone.sigma_m[20:].min()
@@ -255,7 +254,6 @@ def test_a_wheel_and_phases_before_the_speed_is_known_are_regular() -> None:
     way = np.diff(case.arc_m, prepend=np.nan)
     sensors = SensorEpochs(wheel_m=way, wheel_sigma_m=np.full(12, 0.02))
     found, state = track(case.epochs, case.line, sensors=sensors, levels=True)
-    assert state.bank is not None
     assert np.isfinite(state.bank.mean).all()
     assert (found.level_m[2:] > found.level_noise_m[2:]).all()
 
@@ -264,7 +262,6 @@ def test_a_wheel_and_phases_before_the_speed_is_known_are_regular() -> None:
 def test_what_is_no_number_in_a_sub_filter_bounds_nothing_and_in_the_filter_begins_anew() -> None:
     case = ride(60, noise=1.0)
     _, state = track(part(case.epochs, slice(0, 30)), case.line, levels=True)
-    assert state.bank is not None
     mean = state.bank.mean.copy()
     mean[2] = np.nan
     broken = replace(state, bank=replace(state.bank, mean=mean))
@@ -417,7 +414,6 @@ def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
         _, after = track(
             nothing, case.line, copy_with(state, monitors=Monitors(map_log_variance=log_variance)), levels=True
         )
-        assert after.bank is not None
         assert len(after.bank.without) > 10
         own.append(after.covariance[0, ix.ARC, ix.ARC])
         banks.append(after.bank.covariance[:, ix.ARC, ix.ARC])

@@ -179,7 +179,6 @@ def test_two_satellites_without_which_nothing_is_known_leave_no_level() -> None:
 def test_what_is_known_without_two_satellites_is_that_of_a_filter_without_them(one: int, other: int) -> None:
     case = ride(120, noise=1.0, seed=7, code_sigma_m=3.0)
     _, state = track(case.epochs, case.line, limits=LIMITS, levels=True)
-    assert state.bank is not None
     rows = [state.bank.without.index(str(case.epochs.satellite[k])) for k in (one, other)]
     known = 1.0 / state.bank.covariance[rows, 0, 0]
     left = known.sum() - 1.0 / state.covariance[0, 0, 0]
@@ -204,7 +203,6 @@ def test_a_satellite_that_rises_after_a_switch_brings_no_older_knowledge() -> No
     epochs = replace(case.epochs, **measured)
     _, state = track(part(epochs, slice(0, 30)), case.line, limits=LIMITS, levels=True)
     _, state = track(part(epochs, slice(30, 34)), case.line, replace(state, bank=None), limits=LIMITS, levels=True)
-    assert state.bank is not None
     sigma = dict(zip(state.bank.without, np.sqrt(state.bank.covariance[:, 0, 0]), strict=True))
     assert sigma["all in view"] > 1.1 * np.sqrt(state.covariance[0, 0, 0])
     assert sigma[str(epochs.satellite[3])] >= sigma["all in view"]
@@ -219,7 +217,6 @@ def test_the_sub_filter_with_all_in_view_begins_without_codes_too_and_ends_besid
     epochs, state, there = replace(case.epochs, code_m=code), replace(state, bank=None), []
     for begin, end in ((30, 31), (31, 34), (34, 100)):
         _, state = track(part(epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
-        assert state.bank is not None
         there.append("all in view" in state.bank.without)
     assert there == [True, True, False]
 
@@ -325,7 +322,6 @@ def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
     case = ride(20, noise=1.0)
     limits = TrackingLimits(level_constellation_prior=0.0)
     _, state = track(case.epochs, case.line, limits=limits, levels=True)
-    assert state.bank is not None
     assert set(state.bank.without) == {*case.epochs.satellite, *OTHERS} - {"all in view"}
     rare = budget(TrackingLimits(level_constellation_prior=1e-13, level_fault_prior=1e-3))
     assert rare.prior[1] == 0.0
@@ -344,7 +340,6 @@ def test_a_satellite_behind_a_bridge_keeps_its_sub_filter_and_one_long_gone_has_
     code[20:40, 2] += 25.0
     code[45:, 2] += 25.0
     result, state = track(replace(case.epochs, **blank), case.line, limits=LIMITS, levels=True)
-    assert state.bank is not None
     assert str(case.epochs.satellite[2]) in state.bank.without
     assert str(case.epochs.satellite[5]) not in state.bank.without
     # A sub-filter that had restarted would ask for K1 times what codes of one epoch tell.
@@ -367,39 +362,8 @@ def test_without_the_other_constellation_the_level_names_the_risk_that_nothing_b
     one, _ = track(replace(case.epochs, **blank), case.line, limits=LIMITS, levels=True)
     np.testing.assert_array_equal(one.unchecked_prior[50:], prior)
     np.testing.assert_allclose(found.level_m[150:180], one.level_m[150:180], rtol=0.2)
-    assert state.bank is not None
     assert {"E", "G"} < set(state.bank.without)
     assert found.unchecked_prior[-1] == 0.0
-
-
-@pytest.mark.requirement("C2")
-@pytest.mark.parametrize("fault", ["ramp 0.1", "ramp 1", "step 50"])
-def test_no_error_over_the_level_with_a_faulty_satellite(fault: str) -> None:
-    case = ride(100, noise=1.0, seed=4)
-    kind, size = fault.split()
-    t = np.arange(100.0)
-    bias = np.where(t >= 30.0, float(size) * (t - 30.0) if kind == "ramp" else float(size), 0.0)
-    worst = 0.0
-    for satellite in (2, 5):
-        code, rate = case.epochs.code_m.copy(), case.epochs.rate_mps.copy()
-        code[:, satellite] += bias
-        result, _ = track(replace(case.epochs, code_m=code, rate_mps=rate), case.line, limits=LIMITS, levels=True)
-        error = np.abs(result.arc_m - case.arc_m)
-        assert (error <= result.level_m)[5:].all(), fault
-        worst = max(worst, float(np.median(result.level_m[40:])))
-    assert worst < 40.0
-
-
-@pytest.mark.requirement("C2")
-def test_the_sub_filter_without_the_faulty_satellite_keeps_the_place() -> None:
-    case = ride(100, noise=1.0, seed=2)
-    code = case.epochs.code_m.copy()
-    code[20:, 3] += 0.3 * np.arange(80.0)
-    _, state = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS, levels=True)
-    assert state.bank is not None
-    k = state.bank.without.index(str(case.epochs.satellite[3]))
-    sigma = np.sqrt(state.bank.covariance[k, 0, 0])
-    assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < 3.0 * sigma
 
 
 @pytest.mark.requirement("C2")
@@ -411,7 +375,6 @@ def test_the_sub_filter_without_the_satellites_of_a_side_keeps_the_place(side: s
     along = (sight * axes[:, :1]).sum(axis=-1) * (1.0 if side == "ahead" else -1.0)
     code = case.epochs.code_m + np.where(along > 0.2, np.clip(0.2 * (np.arange(100.0) - 20.0), 0.0, 14.0)[:, None], 0.0)
     found, state = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS, levels=True)
-    assert state.bank is not None
     k = state.bank.without.index(side)
     sigma = np.sqrt(state.bank.covariance[k, 0, 0])
     assert abs(found.arc_m[-1] - case.arc_m[-1]) > 3.0
@@ -436,17 +399,6 @@ def test_late_codes_of_all_satellites_of_a_side_are_in_the_level(
 
 
 @pytest.mark.requirement("C2")
-def test_cutting_changes_no_level() -> None:
-    case = ride(50, noise=1.0)
-    whole, _ = track(case.epochs, case.line, limits=LIMITS, levels=True)
-    state, levels = None, []
-    for begin, end in ((0, 1), (1, 20), (20, 50)):
-        result, state = track(part(case.epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
-        levels.append(result.level_m)
-    np.testing.assert_array_equal(np.concatenate(levels), whole.level_m)
-
-
-@pytest.mark.requirement("C2")
 def test_cutting_after_a_switch_changes_no_level(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the deep city another place takes over after some seconds, and all sub-filters restart."""
     given = []
@@ -462,7 +414,6 @@ def test_cutting_after_a_switch_changes_no_level(recordings: Path, monkeypatch: 
     assert abs(whole.arc_m[11] - whole.arc_m[10]) > 1000.0
     for cut in (11, 12, 15, 24):
         _, state = track(epochs.take(slice(0, cut)), line, limits=LIMITS, levels=True)
-        assert state.bank is not None
         assert cut == 11 or "all in view" in state.bank.without
         found, _ = track(epochs.take(slice(cut, None)), line, state, limits=LIMITS, levels=True)
         for name in ("level_m", "ground_level_m", "separation_m"):
@@ -476,7 +427,6 @@ def test_amounts_grow_with_the_way_since_codes_and_sensors_are_left_out_too() ->
     gap = np.zeros(120, dtype=bool)
     gap[80:] = True
     result, state = track(without_epochs(case.epochs, gap), case.line, limits=LIMITS, sensors=wheel(case), levels=True)
-    assert state.bank is not None
     assert "wheel" in state.bank.without
     error = np.abs(result.arc_m - case.arc_m)
     assert (error <= result.amount_m)[10:].all()
@@ -501,7 +451,6 @@ def test_a_sub_filter_follows_the_line_where_a_fault_has_led_the_filter_away() -
     nothing = np.full(code.shape, np.nan)
     epochs = replace(case.epochs, code_m=code, phase_m=nothing, rate_mps=nothing)
     result, state = track(epochs, case.line, limits=TrackingLimits(late_degrees_of_freedom=4.0), levels=True)
-    assert state.bank is not None
     k = state.bank.without.index(str(case.epochs.satellite[2]))
     assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < 3.0
     assert (np.abs(result.arc_m - case.arc_m) <= result.level_m)[5:].all()

@@ -110,7 +110,6 @@ def test_thinned_epochs_have_what_was_measured_between() -> None:
     assert sensed.wheel_m is not None
     assert sensed.wheel_sigma_m is not None
     assert sensed.force_mps2 is not None
-    assert sensed.force_sigma_mps2 is not None
     np.testing.assert_allclose(sensed.wheel_m, [0.0, 15.0, way[6:16].sum(), way[16:26].sum(), way[26:36].sum()])
     np.testing.assert_allclose(sensed.wheel_sigma_m, 0.5 * np.sqrt([1, 5, 10, 10, 10]))
     np.testing.assert_allclose(sensed.force_mps2, [0.0, 0.3, 1.05, 2.05, np.nan])
