@@ -95,7 +95,6 @@ def test_the_level_of_the_filter_covers_a_pull_where_asked_for() -> None:
         assert bounded[:140].mean() > 0.9
         over[use] = int((np.abs(ride.error_m(found)) > found.tracked.level_m)[bounded].sum())
         if use == "off":  # in one piece: once the pull is seen nothing bounds the place
-            assert found.wheel is not None
             seen = found.wheel.parted
             assert seen[149:].all()
             assert (found.tracked.status[seen] == TrackStatus.SPOOFING_SUSPECTED).sum() > 20

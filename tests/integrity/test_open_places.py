@@ -99,7 +99,6 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
     result, line = pixel.solved(settings), pixel.trajectory
     own = SATELLITE_PRIOR if local_prior else dict.fromkeys(SATELLITE_PRIOR, 0.0)
     risk = RiskBudget(local_prior=local_prior, satellite_prior=dict(own), side_prior=side_prior)
-    assert result.protection is not None
     level = result.protection.level.level_m * (1.0 if local_prior else 0.3)
     ranges = ranges_of(result)
     rows = np.flatnonzero(np.isfinite(level) & np.isfinite(result.arc_m) & (result.fix.section.excess > 10.83))[::15]
@@ -148,7 +147,6 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
         .process(log)[0]
         .antennas["front"]
     )
-    assert result.protection is not None
     level, arc = share * result.protection.level.level_m, result.fix.constrained.arc_m
     model = linear_model(ranges_of(result), path, arc, section=np.maximum(result.fix.constrained.section, 0))
     systems = [name[0] for name in result.satellite[result.columns].tolist()]

@@ -100,6 +100,13 @@ def test_tails_of_all_hypotheses_use_up_the_risk(seed, side_prior, of_constellat
         return
     assert got.k_false_alarm[0] == pytest.approx(expected.k_false_alarm, rel=1e-9)
     assert np.isinf(got.level_m[0]) == np.isinf(expected.largest_m)
+    for mine, theirs in (
+        (got.fault_free_m, expected.fault_free_m),
+        (got.one_fault_m, expected.one_fault_m),
+        (got.two_fault_m, expected.two_fault_m),
+    ):
+        if not 1e3 < theirs < np.inf:
+            assert mine[0] == pytest.approx(theirs, rel=1e-6)
     if expected.largest_m < 1e3:
         assert expected.level_m * (1.0 - 1e-6) <= got.level_m[0] <= 1.01 * expected.level_m
     assert got.separation[0] == pytest.approx(expected.separation, rel=1e-5)

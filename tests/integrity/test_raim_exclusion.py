@@ -284,22 +284,6 @@ def test_unused_channels_are_never_named():
         assert not unused[t, named[t, k]].any()
 
 
-def test_order_of_satellites_changes_nothing():
-    ranges, arc = mixed_case()
-    order = np.r_[np.random.default_rng(1).permutation(6), 6 + np.random.default_rng(2).permutation(4), 11, 10]
-    shuffled = replace(
-        ranges,
-        sat_ecef_m=ranges.sat_ecef_m[:, order],
-        code_m=ranges.code_m[:, order],
-        weight=ranges.weight[:, order],
-    )
-    one, two = (exclude(linear_model(r, raim_cases.LINE, arc)) for r in (ranges, shuffled))
-    assert np.array_equal(one.outcome, two.outcome)
-    assert np.array_equal(one.excluded[:, order], two.excluded)
-    clear = one.outcome != Outcome.INSEPARABLE  # of equals, the first channel
-    assert one.own_error_m[clear][:, order] == pytest.approx(two.own_error_m[clear], rel=1e-6, nan_ok=True)
-
-
 def test_epochs_that_cannot_be_tested():
     arc = np.array([500.0, np.nan, 700.0, 900.0])
     ranges = raim_cases.made(np.nan_to_num(arc, nan=500.0), "GGGGGG", seed=5, faults_m={2: 300.0})

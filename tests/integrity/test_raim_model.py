@@ -80,22 +80,6 @@ def test_model_is_least_squares_with_all_columns(seed, case, space):
     assert model.wsse[0] == pytest.approx((residual**2).sum(), rel=1e-6, abs=1e-5)
 
 
-@pytest.mark.parametrize(("systems", "ties"), CASES)
-def test_projector_gives_residuals_and_redundancy(systems, ties):
-    """nu = S y, its diagonal the redundancy; the redundancies add up to the degrees of freedom, priors apart."""
-    arc = np.linspace(100.0, 1900.0, 20)
-    ranges = raim_cases.made(arc, systems, seed=8, tie_sigma_m=ties)
-    for model in (linear_model(ranges, raim_cases.LINE, arc), point_model(ranges, raim_cases.LINE.at_arc(arc))):
-        if model.freedom[0] < 0:
-            continue
-        parts = compact(model)
-        assert np.einsum("tij,tj->ti", parts.projector, model.misfit) == pytest.approx(model.residual, abs=1e-8)
-        assert np.einsum("tii->ti", parts.projector) == pytest.approx(model.redundancy, abs=1e-12)
-        assert np.abs(parts.projector - parts.projector.swapaxes(1, 2)).max() < 1e-13
-        if ties is None and model.interest == 2:
-            assert model.redundancy.sum(axis=1) == pytest.approx(model.freedom, abs=1e-9)
-
-
 def test_map_error_is_carried_once_and_not_scaled():
     """Position variance = scale^2 of the ranges' part + the map's part; both by simulation."""
     arc = np.full(20_000, 731.0)

@@ -60,7 +60,6 @@ def station(request: pytest.FixtureRequest, recordings: Path) -> Station:
     name, azimuth = request.param
     outcome = geonet(recordings, name, azimuth)
     result, trajectory = outcome.result, outcome.trajectory
-    assert result is not None
     assert trajectory is not None
     columns = result.columns
     used = result.reason[:, columns] == 0

@@ -43,48 +43,6 @@ def test_noncentrality_misses_with_the_stated_probability():
     assert np.isnan(noncentrality([0, -1])).all()
 
 
-def test_noncentrality_by_drawing():
-    """A biased Gaussian vector of P4's 3 degrees of freedom."""
-    limits = RaimLimits(missed_detection=0.1)
-    draws = np.random.default_rng(1).normal(size=(100_000, 3))
-    draws[:, 1] += np.sqrt(noncentrality(3, limits=limits))
-    missed = int(((draws**2).sum(axis=1) < 16.2662).sum())
-    low, high = binom.interval(0.9999, 100_000, 0.1)
-    assert low <= missed <= high
-
-
-@pytest.mark.parametrize(
-    ("systems", "ties", "channel"), [("GGGGG", None, 2), ("GGGEEE", None, 4), ("GGGEE", (0, 1), 3)]
-)
-def test_minimal_detectable_bias_is_missed_as_stated(systems, ties, channel):
-    """Through the whole chain: biased ranges, solved, tested; and at noise twice the sigmas."""
-    limits, epochs = RaimLimits(missed_detection=0.1), 20_000
-    sat = synthetic.satellites(np.random.default_rng(4), 1, systems)
-    arc = np.full(epochs, ARC[0])
-    many = np.repeat(sat, epochs, axis=0)
-    sigma = np.linspace(0.8, 2.0, len(systems))
-    for scale in (1.0, 2.0):
-        probe = raim_cases.made(ARC, systems, seed=1, tie_sigma_m=ties, sat_ecef_m=sat, sigma_m=sigma)
-        model = linear_model(probe, raim_cases.LINE, ARC)
-        bias = reliability(model, limits=limits, scale=scale).minimal_detectable_bias_m[0, channel]
-        assert 1.0 < bias < 100.0
-        ranges = raim_cases.made(
-            arc,
-            systems,
-            seed=3,
-            tie_sigma_m=ties,
-            faults_m={channel: bias},
-            noise=scale,
-            sat_ecef_m=many,
-            sigma_m=sigma,
-        )
-        got, line = raim_cases.solved(ranges, arc)
-        verdict = detect(got.wsse, got.residual_m, line.freedom, limits=limits, scale=scale)
-        low, high = binom.interval(0.9999, epochs, 0.1)
-        slack = 0 if scale == 1.0 else 0.03 * epochs  # the map error does not grow with the noise
-        assert low - slack <= np.count_nonzero(~verdict.detected) <= high + slack
-
-
 def responses(case: oracle.Problem) -> tuple[np.ndarray, np.ndarray]:
     """Projector of the ranges, (n, n), and movement of the wanted components, (n, k), for whitened errors."""
     inverse = np.linalg.pinv(case.design, rcond=1e-12)
