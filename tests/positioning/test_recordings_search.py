@@ -191,15 +191,6 @@ def test_search_equals_exhaustive_search(recordings: Path, calls: Calls, name: s
     assert ties == 0
 
 
-@pytest.mark.slow
-@pytest.mark.requirement("A4")
-@pytest.mark.parametrize("name", RUNS)
-def test_position_equals_a_general_optimiser(recordings: Path, calls: Calls, name: str):
-    RUNS[name](recordings)
-    compared, _ = compare_positions(calls, 25)
-    assert compared >= 20
-
-
 @pytest.mark.requirement("A3")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)

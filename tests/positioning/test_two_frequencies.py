@@ -115,7 +115,6 @@ def test_pieces_of_a_log_give_the_same_bits() -> None:
     for item in fields(Combined):
         pieces = np.concatenate([getattr(part, item.name) for part in parts])
         np.testing.assert_array_equal(pieces, getattr(whole, item.name), err_msg=item.name)
-    assert state is not None
     np.testing.assert_array_equal(state.sums, last.sums)
 
 
@@ -248,7 +247,6 @@ def test_fault_of_a_second_code_alone_is_weighed_down(recordings: Path) -> None:
     assert faulty.screens[NAME].reject[wrong, at].all()
     error, before = (straight_distance(each.arc_m, reference, line) for each in (faulty, clean))
     assert np.nanmax(np.abs(error - before)) < 1.0
-    assert faulty.protection is not None
     assert not (error > faulty.protection.level.level_m).any()
 
 
