@@ -11,13 +11,9 @@ import base_score
 import recordings_truth
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.timescale import GPS_EPOCH
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
-from railfix.live.engine import LiveEngine
-from railfix.live.settings import LiveSettings
-from railfix.live.stream import single_epochs
 from railfix.pipeline.base_station_stage import Stations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
@@ -83,7 +79,6 @@ def test_differences_of_codes_halve_the_errors(drive: Drive) -> None:
 def test_fixed_integers_are_right_and_any_cutting_gives_the_same(drive: Drive) -> None:
     (whole,) = drive.run(base=True, carrier="fixed")
     error = drive.errors(whole)
-    assert whole.phase is not None
     fixed = whole.phase.n_fixed > 0
     assert fixed.sum() > 150
     assert np.nanpercentile(error[fixed], 95) < 0.05
@@ -108,7 +103,6 @@ def test_a_position_of_the_stream_is_taken_from_its_headers(drive: Drive) -> Non
     moved = with_place(drive.base[1:2], PLACE + 1.0)
     _, state = processor.process({"front": drive.train[2:3]}, state, base=moved)
     errors = base_errors(state)
-    assert errors is not None
     assert len(errors) == 1  # the one before was of another place
 
 
@@ -147,37 +141,13 @@ def test_integers_of_two_antennas_on_a_roof_are_right(recordings: Path) -> None:
     )  # fmt: skip
     result, _ = processor.process({"front": case.train[:40]}, base=case.base[:40])
     phase = result.antennas["front"].phase
-    assert phase is not None
     fixed = phase.n_fixed > 0
     assert fixed.sum() >= 20
     error = along_track_error(phase.arc_m, case.reference[:40], case.trajectory)
     assert np.abs(error[fixed]).max() < 0.02
 
 
-@pytest.mark.slow
-def test_a_live_engine_gives_the_same(drive: Drive) -> None:
-    (whole,) = drive.run(base=True, protection="off", carrier="smoothed")
-    config = parse_config(
-        {"filter": "off", "elevation": {"mask_deg": 15.0}, "protection": "off", "carrier": "smoothed"}
-    )
-    processor = EpochProcessor(
-        config, {"front": drive.trajectory}, navigation=drive.navigation, stations=Stations(base_ecef_m=PLACE)
-    )
-    engine, found = LiveEngine(processor, LiveSettings(period_s=1.0, no_input="skip")), []
-    for k in range(12):
-        for part in single_epochs(drive.base[k : k + 1]):
-            engine.add_base(part)
-            engine.add_base(part)  # repeated by the caster
-        (epoch,) = single_epochs(drive.train[k : k + 1])
-        tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
-        engine.push("front", epoch, now_ns=tag_ns)
-        found += [output.result.antennas["front"].arc_m[-1] for output in engine.poll(now_ns=tag_ns) if output.result]
-    np.testing.assert_allclose(found, whole.arc_m[:12], atol=1e-6)
-    assert engine.counts["base station out of order"] == 12
-
-
 def base_errors(state: State) -> BaseErrors | None:
-    assert state.base is not None
     return state.base.errors
 
 

@@ -54,17 +54,6 @@ def test_epochs_of_10_hz_with_observations_and_epochs_missing() -> None:
     assert whole["train"]["chainage_m"].is_not_nan().sum() > 150
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.1])
-@pytest.mark.parametrize("step", [1, 10])
-def test_the_demonstration_in_chunks_of_any_kind(share: float, step: int) -> None:
-    logs = {
-        name: thinned(log[300 : 300 + 200 * step : step], share, seed=k)
-        for k, (name, log) in enumerate(demo_observations().items(), 3)
-    }
-    check(demo_processor(), logs)
-
-
 def write_recording(name: str, recordings: Path, folder: Path) -> tuple[dict[str, Observations], list[str]]:
     """Logs of a recording by antenna, and the words of a command that name its navigation, map and vehicle."""
     if name == "demonstration":

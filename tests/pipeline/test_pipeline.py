@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 import recordings_score
@@ -71,45 +69,6 @@ def m8t(recordings) -> tuple[EpochProcessor, Observations]:
     navigation = read_navigation([folder / "hksc137c.nav"])
     observations = read_observations(folder / "20210517.light-urban.tste.ublox.m8t.GC.obs")
     return make_processor(recordings_score.SETTINGS, navigation, {"front": trajectory}), observations
-
-
-@pytest.mark.requirement("A8")
-@pytest.mark.parametrize(("size", "epochs"), [(1, 120), (7, 785), (1000, 785)])
-@pytest.mark.every(4)
-def test_chunks_of_a_recording_give_the_whole(m8t, size: int, epochs: int):
-    one, observations = m8t
-    parts = {"front": observations[:epochs]}
-    whole, _ = in_pieces(one, parts, [])
-    pieces, _ = in_pieces(one, parts, chunked(size, epochs))
-    same(whole["front"], pieces["front"], atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.requirement("A8")
-@given(edges=st.sets(st.integers(1, 199), min_size=1, max_size=8), first=st.sampled_from([0, 700, 1500]))
-@settings(max_examples=15)
-def test_cut_anywhere(edges: set[int], first: int):
-    """A live epoch, given the state before it, is that epoch of the batch."""
-    one = processor()
-    parts = {name: whole[first : first + 200] for name, whole in demo_observations().items()}
-    whole, _ = in_pieces(one, parts, [])
-    pieces, _ = in_pieces(one, parts, sorted(edges))
-    for name in ANTENNAS:
-        same(whole[name], pieces[name], atol=1e-9)
-
-
-def test_inputs_are_left_alone():
-    parts = {name: whole[:60] for name, whole in demo_observations().items()}
-    for part in parts.values():
-        assert not part.code_m.flags.writeable
-    before = {
-        name: {k: v.tobytes() for k, v in vars(p).items() if isinstance(v, np.ndarray)} for name, p in parts.items()
-    }
-    track = {name: t.ecef_m.tobytes() for name, t in clean_trajectories().items()}
-    processor().process(parts)
-    for name, part in parts.items():
-        assert before[name] == {k: v.tobytes() for k, v in vars(part).items() if isinstance(v, np.ndarray)}
-        assert track[name] == clean_trajectories()[name].ecef_m.tobytes()
 
 
 @pytest.mark.requirement("A4")

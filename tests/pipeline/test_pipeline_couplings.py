@@ -65,8 +65,6 @@ def test_an_excluded_satellite_counts_in_the_risk() -> None:
     assert (excluded.raim.outcome == Outcome.EXCLUDED_ONE).all()
     assert (excluded.reason[:, used_satellite()] == Reason.FAULT_EXCLUDED).all()
     np.testing.assert_allclose(excluded.chainage_m[0], absent.chainage_m[0], atol=1e-3)
-    assert excluded.protection is not None
-    assert absent.protection is not None
     ratio = excluded.protection.level.fault_free_m[0] / absent.protection.level.fault_free_m[0]
     # a tenth of the risk over the ways to exclude one of a dozen satellites: K from 5.8 to 6.5
     assert 1.05 < ratio < 1.3
@@ -101,9 +99,6 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
         return processor.process({"front": front()})[0].antennas["front"]
 
     without, three, six = (level(bias).protection for bias in (0.0, 3.0, 6.0))
-    assert without is not None
-    assert three is not None
-    assert six is not None
     assert np.array_equal(level(3.0).chainage_m, fault_free().chainage_m)
     added = three.level.fault_free_m - without.level.fault_free_m
     assert (added > 1.0).all()
@@ -135,9 +130,7 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
     assert (low & used).any()
     assert np.array_equal((sides[:, 1] & used), low & right & used)
     assert np.array_equal((sides[:, 0] & used), low & ~right & used)
-    assert result.protection is not None
     more = front_alone(front(), BASE | {"risk": {"side_prior": 1e-4}}).protection
-    assert more is not None
     assert (more.level.level_m > result.protection.level.level_m).all()
 
 
@@ -145,10 +138,8 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
 def test_no_level_reaches_into_a_stretch_without_one() -> None:
     """Positions whose level touches the stretch have none; the verdict is unavailable, positions stay."""
     middle = float(np.median(fault_free().chainage_m))
-    assert fault_free().protection is not None
     before = fault_free().protection.level.level_m
     found = front_alone(front(), BASE | {"no_level_m": [[middle, middle + 5.0]]})
-    assert found.protection is not None
     touched = (fault_free().chainage_m + before > middle) & (fault_free().chainage_m - before < middle + 5.0)
     assert touched.any()
     assert np.array_equal(np.isinf(found.protection.level.level_m), touched)
@@ -156,7 +147,6 @@ def test_no_level_reaches_into_a_stretch_without_one() -> None:
     assert (found.protection.status[touched] == LevelStatus.UNAVAILABLE).all()
     assert np.array_equal(found.chainage_m, fault_free().chainage_m)
     far = front_alone(front(), BASE | {"no_level_m": [[middle + 1e4, middle + 2e4]]}).protection
-    assert far is not None
     assert np.array_equal(far.level.level_m, before)
 
 
@@ -175,7 +165,6 @@ def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
             models=Models(error_model=replace(model, after=wide)),
         )
         protection = processor.process({"front": front()})[0].antennas["front"].protection
-        assert protection is not None
         return protection.level.fault_free_m
 
     least, small, two, twenty, forty = (level(sigma) for sigma in (1e-4, 1e-3, 2.0, 20.0, 40.0))
@@ -371,8 +360,6 @@ def test_exclusions_in_the_middle_of_a_chunk_are_those_of_their_epochs(monkeypat
     of_whole, of_part = (scale for scale in scales if len(scale) == 20)  # others are second attempts
     assert len(set(of_whole.tolist())) > 10
     np.testing.assert_allclose(of_whole, of_part, rtol=1e-12)
-    assert whole.protection is not None
-    assert part.protection is not None
     for found, expected in (
         (whole.along_sigma_m, part.along_sigma_m), (whole.chainage_m, part.chainage_m),
         (whole.protection.level.level_m, part.protection.level.level_m),

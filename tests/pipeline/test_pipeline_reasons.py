@@ -138,7 +138,6 @@ def test_a_position_clamped_to_an_end_within_the_noise_is_not_ok():
     found = front_alone(front()[:1], MASK_ONLY, trajectories=line(np.concatenate([there.ecef_m[kept], end])))
     all_are(found, Status.MAP_END)
     assert found.fix.constrained.overshoot_m[0] == pytest.approx(1.0, abs=0.1)
-    assert found.protection is not None
     assert found.protection.status[0] == LevelStatus.UNAVAILABLE
 
 

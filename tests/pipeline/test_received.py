@@ -82,7 +82,6 @@ def test_all_records_one_chunk_before_their_use_equal_all_at_the_start() -> None
         result, state = empty.process(piece, state, navigation=navigation)
         for name, antenna in result.antennas.items():
             found[name].append(flat(antenna))
-    assert state is not None
     assert len(state.received.navigation.kepler) == len(navigation.kepler)
     for name, pieces in found.items():
         joined = {k: np.concatenate([p[k] for p in pieces]) for k in pieces[0]}
@@ -278,8 +277,6 @@ def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
     np.testing.assert_allclose(assumed.sigma_m[used] ** 2, stated.sigma_m[used] ** 2 + added**2, rtol=1e-3)
     # the residuals show how little of it there is, and the learnt noise scale follows
     assert assumed.along_sigma_m[0] > 1.3 * stated.along_sigma_m[0]
-    assert stated.protection is not None
-    assert assumed.protection is not None
     assert (assumed.protection.level.level_m > 1.3 * stated.protection.level.level_m).all()
 
 
@@ -305,8 +302,6 @@ def test_an_accuracy_worse_than_usual_is_believed() -> None:
     np.testing.assert_allclose(worse.sigma_m[used], np.hypot(usual.sigma_m[used], 6.85), rtol=1e-6)
     np.testing.assert_allclose(worse.sigma_m[:, ~here], usual.sigma_m[:, ~here], rtol=1e-6)
     assert (none.reason[used] == Reason.UNHEALTHY).all()
-    assert usual.protection is not None
-    assert worse.protection is not None
     assert (worse.protection.level.level_m > usual.protection.level.level_m).all()
 
 

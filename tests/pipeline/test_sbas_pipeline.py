@@ -26,7 +26,6 @@ from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import late_sides, level_facts, prior_basis_text, protection_levels
-from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import fit_ranges
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.antenna_rows import AntennaRows
@@ -127,22 +126,6 @@ def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, correcte
     other = saastamoinen_delay_m(latitude, height, elevation)
     assert used.sum() > 500
     np.testing.assert_allclose(troposphere[used], other[used], rtol=0.04, atol=0.02)
-
-
-def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResult) -> None:
-    processor = make_processor(recording.config(), recording.navigation, {"front": recording.line})
-    for size in (1, 7):
-        state, parts = State(), []
-        for first in range(140, 200, size):
-            result, state = processor.process({"front": recording.observations[first : first + size]}, state)
-            parts.append(result.antennas["front"])
-        together = np.concatenate([p.corrected_code_m[:, p.columns] for p in parts])[:60]
-        np.testing.assert_allclose(
-            together, corrected.corrected_code_m[140:200][:, corrected.columns], rtol=0, atol=1e-6
-        )
-        reasons = np.concatenate([p.reason[:, p.columns] for p in parts])[:60]
-        sbas = int(sum(r for r in Reason if r.name.startswith("SBAS_")))
-        np.testing.assert_array_equal(reasons & sbas, corrected.reason[140:200][:, corrected.columns] & sbas)
 
 
 def test_the_parked_antenna_stays_where_it_is(recording: Recording, corrected: AntennaResult) -> None:

@@ -6,7 +6,6 @@ import json
 from datetime import datetime
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
@@ -14,8 +13,6 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.core.errors import SettingsError
-from railfix.core.timescale import seconds, timedelta
-from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS
 from railfix.pipeline.result_tables import SMOOTHED_COLUMNS, TRAIN_COLUMNS
@@ -23,7 +20,6 @@ from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.simulate import demo_files
 from railfix.simulate.demonstration import demo_inputs
 
-START = np.datetime64("2024-03-05T03:10:00", "us")
 SPAN = {"start": datetime(2024, 3, 5, 3, 10, 5), "end": datetime(2024, 3, 5, 3, 10, 13)}
 
 
@@ -75,32 +71,6 @@ def test_smoothed_columns_stand_beside_those_of_the_filter(tracked: RunSummary, 
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.slow
-def test_samples_of_sensors_count_once_however_the_log_is_cut(tmp_path: Path) -> None:
-    truth = pl.read_csv(demo_files()["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
-    truth = truth.filter(pl.col("antenna") == "front").slice(0, 400)
-    way, pulse_m = truth["chainage_m"].to_numpy() - truth["chainage_m"][0], TachometerLimits().pulse_m
-    moving = slice(int(np.flatnonzero(way > 0.0)[0]) - 1, None)
-    turned = np.arange(1, int(way[-1] / pulse_m))
-    instants = np.interp(turned * pulse_m, way[moving], seconds(truth["time_gpst"].to_numpy() - START)[moving])
-    pulses = {"time_gpst": START + timedelta(instants), "pulse": turned, "direction": 0 * turned + 1}
-    path = tmp_path / "pulses.csv"
-    pl.DataFrame(pulses).write_csv(path)
-    tables = {}
-    for chunk in (1000, 30):
-        options = RunOptions(
-            chunk_epochs=chunk, start=datetime(2024, 3, 5, 3, 10, 12), end=datetime(2024, 3, 5, 3, 10, 32)
-        )
-        inputs = _inputs().replaced(tachometer=path)
-        files = run_files(inputs, Config(filter="track"), out=tmp_path / str(chunk), options=options).files
-        tables[chunk] = pl.read_parquet(files["train.parquet"])
-    assert_frame_equal(tables[30], tables[1000], abs_tol=1e-6)
-    measured = tables[30]["innovation_wheel_m"].drop_nulls().abs()
-    assert len(measured) > 200
-    assert measured.max() < 0.3  # type: ignore[operator]
-
-
-@pytest.mark.requirement("E5")
 def test_reflections_of_some_tenths_of_a_second_move_the_train_nowhere(tmp_path: Path) -> None:
     """At 03:12:28 Dopplers and phases of the rear antenna are reflected for 0.4 s, 10 s after the tunnel.
 
@@ -135,12 +105,6 @@ def test_summary_and_record_count_what_the_table_holds(tracked: RunSummary) -> N
         assert found["along_sigma_m"]["max_m"] == mine["along_sigma_m"].max()
         assert found["along_sigma_m"]["p50_m"] == mine["along_sigma_m"].quantile(0.5)
         assert record["antennas"][antenna]["filter"] == found
-
-
-@pytest.mark.requirement("E5")
-def test_chunks_change_nothing(tracked: RunSummary, tmp_path: Path) -> None:
-    other = _run(tmp_path / "run", Config(filter="track"), 13)
-    assert_frame_equal(*(pl.read_parquet(s.files["train.parquet"]) for s in (tracked, other)), abs_tol=1e-9)
 
 
 @pytest.mark.requirement("E5")

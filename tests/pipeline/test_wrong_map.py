@@ -65,7 +65,6 @@ def test_off_the_map_in_the_middle_of_a_line(across_m: float, least: float) -> N
     assert middle.sum() > 250
     told = np.isin(result.status, [Status.OFF_MAP, Status.MAP_OFFSET])
     assert told[middle].mean() > least
-    assert result.protection is not None
     assert not (result.protection.status[told] == LevelStatus.AVAILABLE).any()
 
 
@@ -121,21 +120,16 @@ def test_a_map_that_is_not_found_wrong_is_within_the_level(right: AntennaResult)
     """The position without the map, at the prior of a wrong map, with and without a faulty satellite."""
     wrong = on_a_map(up_m=20.0)
     free = on_a_map(up_m=20.0, map_prior=0.0)
-    assert wrong.protection is not None
-    assert free.protection is not None
-    assert right.protection is not None
     with_it, without_it = wrong.protection.level.level_m, free.protection.level.level_m
     has = np.isfinite(without_it)
     assert (with_it[has] >= without_it[has] * (1.0 - 1e-3)).all()
     assert np.percentile(with_it[has] / without_it[has], 95) > 1.02
     # A prior of one in a hundred counts more.
     more = on_a_map(up_m=20.0, map_prior=1e-2).protection
-    assert more is not None
     has &= np.isfinite(with_it)
     assert np.median(more.level.level_m[has] / with_it[has]) > 1.01
     clean = right.protection.level.level_m
     covered = on_a_map(map_prior=0.0).protection
-    assert covered is not None
     finite = np.isfinite(clean)
     assert np.median(clean[finite] / covered.level.level_m[finite]) < 1.01
 
