@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
@@ -90,23 +89,6 @@ def test_error_names_file_line_and_cause(tmp_path: Path, case: str) -> None:
     assert caught.value.line == line
     assert "\n" not in message
     assert caught.value.exit_code == 3
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", "is empty"),
-        (bytes(range(256)) * 4, "binary"),
-        (gzip.compress((header() + GOOD).encode())[:-20], "damaged|early|cut|ends"),
-        (b"PK\x03\x04" + b"x" * 100, "zip"),
-    ],
-    ids=["empty", "binary", "gzip cut", "zip"],
-)
-def test_files_that_are_no_text(tmp_path: Path, content: bytes, words: str) -> None:
-    path = tmp_path / "a.nav"
-    path.write_bytes(content)
-    with pytest.raises(InputFileError, match=words):
-        read_navigation(path)
 
 
 @pytest.mark.requirement("G5")

@@ -1,8 +1,7 @@
-"""Navigation files of real receivers, number by number, against two other readers."""
+"""Navigation files of real receivers, number by number, against RTKLIB."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -142,49 +141,3 @@ def test_ionosphere_against_rtklib(read: tuple[Path, Navigation]) -> None:
     for letter, theirs in (("G", nav.ion_gps), ("C", nav.ion_cmp), ("J", nav.ion_qzs)):
         ours = navigation.klobuchar.get(letter, np.zeros(8))
         assert [theirs[i] for i in range(8)] == ours.tolist(), letter
-
-
-# ---------------------------------------------------------------- georinex
-
-#: Files that georinex reads, with what it calls the numbers.
-_GEORINEX_FILES = (
-    "kinematic/gsdc_pixel5_a/hour1180.21n",
-    "kinematic/japan_mosaic_2021265_with_GEONET3034/SEPT2650.21P",
-    pytest.param("dual/mosaic_x2_99cm/base.nav", marks=pytest.mark.slow),
-    "static/rtklib_geonet2005/07590920.05n",
-)
-_GEORINEX = {
-    "SVclockBias": "af0_s", "Crs": "crs", "DeltaN": "delta_n", "M0": "m0", "Cuc": "cuc", "Eccentricity": "eccentricity",
-    "Cus": "cus", "sqrtA": "sqrt_a", "Toe": "toe_sow_s", "Cic": "cic", "Omega0": "omega0", "Cis": "cis", "Io": "i0",
-    "Crc": "crc", "omega": "omega", "OmegaDot": "omega_dot", "IDOT": "i_dot",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", _GEORINEX_FILES)
-@pytest.mark.every(3)
-def test_kepler_records_against_georinex(recordings: Path, name: str) -> None:
-    """Every record that georinex keeps is one of ours; it keeps one a satellite and clock time, and no D exponents."""
-    georinex = pytest.importorskip("georinex", reason="the independent reader is not installed")
-    kepler = read_navigation(recordings / name).kepler
-    own = np.where(kepler.satellite.astype("<U1") == "C", kepler.toc - np.timedelta64(14, "s"), kepler.toc)
-    rows: dict[tuple[str, int], list[int]] = {}
-    for i, key in enumerate(zip(kepler.satellite.tolist(), own.astype("int64").tolist(), strict=True)):
-        rows.setdefault(key, []).append(i)
-    compared = 0
-    with warnings.catch_warnings():
-        # Its own, about a future version of xarray.
-        warnings.simplefilter("ignore", FutureWarning)
-        theirs = georinex.load(recordings / name, use="GJEC" if name.endswith(("P", ".nav")) else None)
-    for satellite in theirs.sv.to_numpy().tolist():
-        one = theirs.sel(sv=satellite).dropna("time", how="all")
-        for time in one.time.to_numpy():
-            values = one.sel(time=time)
-            if not np.isfinite(float(values["M0"])):
-                continue
-            ours = rows.get((satellite[:3].replace(" ", "0"), int(time.astype("datetime64[ns]").astype(np.int64))), [])
-            numbers = np.array([float(values[key]) for key in _GEORINEX])
-            table = np.array([[getattr(kepler, field)[i] for field in _GEORINEX.values()] for i in ours])
-            assert len(ours)
-            assert (table == numbers).all(axis=1).any(), (satellite, time)
-            compared += 1
-    assert compared >= 0.4 * len(rows)

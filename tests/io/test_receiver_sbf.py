@@ -23,7 +23,6 @@ from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.measurements import join_measurements
 from railfix.live.stream import ReceiverState, receive_bytes
 from railfix.ranges.sbas import from_receiver
-from railfix.ranges.sbas.messages import with_parity
 from railfix.simulate import sbas_stream as stream
 
 pytestmark = pytest.mark.requirement("A8")
@@ -222,28 +221,6 @@ def test_ephemerides_of_pages_are_those_of_ubx(cold: tuple[Path, Navigation]) ->
             np.testing.assert_array_equal(ours[key][name], value, err_msg=f"{key} {name}")
 
 
-def test_rtklib_reads_the_same_ephemerides(cold: tuple[Path, Navigation], tmp_path: Path) -> None:
-    """Galileo records as `convbin` writes them of the same SBF file.
-
-    RTKLIB 2.4.3 makes none from pages of GPS, and its decoder of these pages (not that of UBX) cuts off bits of af1,
-    af2, sqrt(A), i-dot and Crs: those are compared bit by bit in test_receiver_nav_messages.py.
-    """
-    program = shutil.which("convbin")
-    if program is None:
-        pytest.skip("convbin (Debian package rtklib) is not installed")
-    path, _ = cold
-    target = tmp_path / "log.nav"
-    words = [program, "-r", "sbf", "-v", "3.04", "-n", str(target), "-od", "-o", str(tmp_path / "log.obs"), str(path)]
-    subprocess.run(words, capture_output=True, check=True, timeout=60)
-    ours, theirs = by_satellite(railfix.read_navigation(path)), by_satellite(railfix.read_navigation(target))
-    assert len(theirs) >= 19
-    assert set(theirs) == {key for key in ours if key[0][0] == "E"}
-    names = ("af0_s", "eccentricity", "m0", "delta_n", "omega0", "i0", "omega", "omega_dot", "cuc", "cic", "iode")
-    for key, record in theirs.items():
-        for name in names:
-            assert ours[key][name] == pytest.approx(record[name], rel=1e-11, abs=0.0), (key, name)
-
-
 @pytest.mark.parametrize("letter", ["G", "J", "E", "C", "R", "S"])
 def test_words_of_a_page_are_those_of_ubx(letter: str) -> None:
     """Random bits of every constellation there and back; a page whose CRC failed is left out and counted."""
@@ -275,28 +252,6 @@ def test_words_of_a_page_are_those_of_ubx(letter: str) -> None:
     assert np.array_equal(read.words, words[kept])
     assert letter != "R" or read.glonass_channel.tolist() == sent.glonass_channel[kept].tolist()
     assert read.skipped == {"SBF navigation pages without valid CRC": 1}
-
-
-def test_sbas_messages_of_pages() -> None:
-    """GEORawL1 gives the messages that were put in, with their parity checked."""
-    rng = np.random.default_rng(3)
-    bits = rng.integers(0, 256, (6, 32), dtype=np.uint8)
-    bits[:, 0] = np.array([0x53, 0x9A, 0xC6] * 2)
-    bits[:, 1] = bits[:, 1] & 3 | 4 << 2  # type 4
-    bits = with_parity(bits)
-    words = np.zeros((6, 10), dtype=np.uint32)
-    words[:, :8] = bits.view(">u4").reshape(6, 8)
-    words[5, 3] ^= np.uint32(1)  # damaged: its parity tells
-    names = np.full(6, "S36")
-    zero = np.zeros(6, dtype=np.int64)
-    sent = Subframes(satellite=names, signal=zero, glonass_channel=zero, words=words, order=np.arange(6))
-    start = np.datetime64("2025-05-23T13:59:00", "ns")
-    data = b"".join(page(sent, k, start + np.timedelta64(k, "s")) for k in range(6))
-    read = sbf.navigation_subframes(find_frames(np.frombuffer(data, np.uint8)))
-    messages = from_receiver(sbas_frames(read, start + np.arange(6).astype("timedelta64[s]")))
-    assert (messages.prn.tolist(), messages.type.tolist()) == ([136] * 5, [4] * 5)
-    assert np.array_equal(messages.bits, bits[:5])
-    assert messages.rejected["parity"] == 1
 
 
 def test_sbas_messages_of_l5_are_another_stream() -> None:

@@ -117,17 +117,6 @@ def test_first_epochs_equal_georinex(recorded: Callable[[str], Path], tmp_path: 
     assert compare_with_georinex(path) > 100
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in RECORDINGS if n not in ("ESBC", "public station")])
-def test_all_epochs_equal_georinex(recorded: Callable[[str], Path], name: str) -> None:
-    assert compare_with_georinex(recorded(RECORDINGS[name][0])) > 3000
-
-
-@pytest.mark.slow
-def test_an_hour_of_the_day_log_equals_georinex(recorded: Callable[[str], Path], tmp_path: Path) -> None:
-    assert compare_with_georinex(first_epochs(recorded(RECORDINGS["ESBC"][0]), tmp_path / "hour.rnx", 120)) > 10_000
-
-
 @pytest.mark.parametrize(
     "name", ["geonet 0759", "crescent", "M8T", "F9P", "mosaic", "dual base", "ESBC", "public 10 Hz", "public station"]
 )

@@ -16,8 +16,6 @@ pytestmark = [pytest.mark.requirement("A7"), pytest.mark.slow]
 def bench() -> ModuleType:
     path = Path(__file__).parents[1] / "benchmarks" / "bench_reading.py"
     spec = importlib.util.spec_from_file_location("bench_reading", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["bench_reading"] = module
     spec.loader.exec_module(module)

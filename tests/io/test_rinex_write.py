@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import gzip
-import warnings
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
-import georinex
 import numpy as np
 import pytest
 from hatanaka import crx2rnx
@@ -106,26 +104,6 @@ def test_our_reader_gets_back_what_was_written(tmp_path: Path, name: str) -> Non
     assert header.leap_seconds == 18
     assert dict(header.glonass_channel) == {"R05": 1, "R06": -4}
     np.testing.assert_array_equal(header.approximate_ecef_m, written.header.approximate_ecef_m)
-
-
-@pytest.mark.requirement("A7")
-@pytest.mark.slow
-def test_georinex_gets_back_what_was_written(tmp_path: Path) -> None:
-    written = log()
-    write_observations(written, tmp_path / "log.rnx")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        found = georinex.load(tmp_path / "log.rnx")
-    # georinex keeps microseconds, and leaves out the epoch without satellites.
-    kept = [k for k in range(len(written)) if k != 5]
-    apart = np.abs(found.time.values[None, :] - written.time[kept, None])
-    rows = apart.argmin(axis=1)
-    assert apart.min(axis=1).max() <= np.timedelta64(1, "us")
-    assert len(found.time) == len(kept)
-    for m, (satellite, signal) in enumerate(CHANNELS):
-        for kind, field in (("C", "code_m"), ("L", "phase_cycles"), ("D", "doppler_hz"), ("S", "cn0_dbhz")):
-            values = found[kind + signal].sel(sv=satellite).values[rows]
-            np.testing.assert_allclose(values, getattr(written, field)[kept, m], rtol=0, atol=5.001e-4)
 
 
 def test_pieces_equal_the_whole(tmp_path: Path) -> None:
@@ -293,27 +271,6 @@ def test_navigation_reads_back(tmp_path: Path, name: str, second: Literal["L2", 
                 assert (x[~np.isnat(x)] == y[~np.isnat(x)]).all(), field
             else:
                 assert (x == y).all(), field
-
-
-@pytest.mark.slow
-@pytest.mark.requirement("A7")
-def test_georinex_reads_the_records(tmp_path: Path) -> None:
-    written = navigation().kepler
-    write_navigation(navigation(), tmp_path / "nav.rnx")
-    names = {"af0_s": "SVclockBias", "sqrt_a": "sqrtA", "eccentricity": "Eccentricity", "m0": "M0", "i_dot": "IDOT",
-             "crs": "Crs", "cic": "Cic", "omega0": "Omega0", "toe_sow_s": "Toe"}  # fmt: skip
-    for letter in "GEC":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = georinex.load(tmp_path / "nav.rnx", use=letter)
-        for satellite in np.unique(written.satellite[written.satellite.astype("<U1") == letter]):
-            rows = np.flatnonzero(written.satellite == satellite)
-            table = found.sel(sv=satellite)
-            for field, name in names.items():
-                values = table[name].dropna("time").values
-                np.testing.assert_allclose(
-                    values, getattr(written, field)[rows], rtol=1e-12, err_msg=f"{satellite} {field}"
-                )
 
 
 def test_what_has_no_navigation_form_is_refused(tmp_path: Path) -> None:
