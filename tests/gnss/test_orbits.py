@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import orbit_cases
@@ -229,25 +227,6 @@ def mixed() -> tuple[Navigation, np.ndarray, np.ndarray]:
         ("G31", "1C"),
     ]
     return navigation(*rows), np.array([c[0] for c in channels]), np.array([c[1] for c in channels])
-
-
-@settings(max_examples=15)
-@given(st.lists(st.sampled_from([1, 2, 7, 95, 96, 150]), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
-def test_any_cutting_into_chunks_gives_the_same_bits(lengths: list[int], seed: int) -> None:
-    nav, satellite, signal = mixed()
-    rng = np.random.default_rng(seed)
-    total = sum(lengths)
-    time = read_only(at(np.sort(rng.uniform(-7000, 7000, total))))
-    code = rng.uniform(2e7, 4e7, (total, len(satellite)))
-    code[rng.random(code.shape) < 0.2] = np.nan
-    whole = satellite_states(time, satellite, signal, read_only(code), nav)
-    begin = 0
-    for length in lengths:
-        part = slice(begin, begin + length)
-        piece = satellite_states(time[part], satellite, signal, read_only(code[part]), nav)
-        begin += length
-        for item in fields(whole):
-            np.testing.assert_array_equal(getattr(piece, item.name), getattr(whole, item.name)[part], item.name)
 
 
 def test_channels_do_not_depend_on_each_other_or_on_order_of_time() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pipeline_cases as cases
-from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.constants import FREQUENCY_L1
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.core.reasons import Reason
@@ -340,30 +340,6 @@ def test_the_accuracy_that_records_state_is_in_the_sigmas() -> None:
     np.testing.assert_array_equal(after[known & ~of_gps], before[known & ~of_gps])
 
 
-def test_the_phase_of_the_filter_is_without_clock_and_troposphere() -> None:
-    """Changes of wavelength x phase with those of the satellite clock and the troposphere, against the codes'."""
-    observations = cases.clean_observations()["front"]
-    settings = {"screens": [], "systems": ["G"], "ionosphere": "off", "filter": "track", "protection": "off"}
-    state, found = None, []
-    processor = cases.processor(settings)
-    for first in (0, 1500):
-        result, state = processor.process({"front": observations[first : first + 1500]}, state)
-        found.append(result)
-    front = [result.antennas["front"] for result in found]
-    columns = front[0].columns
-    phase = np.concatenate([r.replays["front"][0].epochs.phase_m for r in found])
-    corrected = np.concatenate([r.corrected_code_m[:, columns] for r in front])
-    size = len(phase)
-    correction = corrected - observations.code_m[:size, columns]  # clock less troposphere, group delay
-    turns = observations.phase_cycles[:size, columns] * SPEED_OF_LIGHT / FREQUENCY_L1
-    change, expected = phase - phase[0], (turns + correction) - (turns + correction)[0]
-    known = np.isfinite(change)
-    assert known.any(axis=0).sum() >= 6
-    np.testing.assert_allclose(change[known], expected[known], atol=1e-6)
-    moved = np.abs(np.diff(correction[[0, -1]], axis=0))
-    assert np.nanmax(moved) > 1e-2
-
-
 def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
     """Code + satellite clock - group delay - Klobuchar - Saastamoinen, each from the place of the solution."""
     observations, navigation = cases.clean_observations()["front"][:10], cases.clean_navigation()
@@ -394,29 +370,6 @@ def test_a_model_of_an_earlier_version_is_noted() -> None:
         "the file is of an earlier version, so make it again with railfix error-model"
     ]
     assert set(notes["new"]) < set(notes["old"])
-
-
-def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:
-    """An unbiased estimate has sum |s| >= 1: a bias b of any sign in every range adds b to the level at least."""
-    observations = {"front": cases.clean_observations()["front"][:30]}
-    config = parse_config({"filter": "off", "error_model": "line.toml", "screens": []})
-    results = []
-    for bias in (0.0, 2.0):
-        processor = EpochProcessor(
-            config,
-            cases.clean_trajectories(),
-            navigation=cases.clean_navigation(),
-            models=Models(error_model=uniform_model(3.0, bias)),
-        )
-        results.append(processor.process(observations)[0].antennas["front"])
-    plain, biased = (result.protection.level.level_m for result in results if result.protection is not None)
-    has = np.isfinite(plain)
-    assert has.sum() > 20
-    assert (biased[has] >= plain[has] + 2.0).all()
-    np.testing.assert_array_equal(results[0].chainage_m, results[1].chainage_m)
-    for result in results:
-        used = result.reason == 0
-        assert result.bound_sigma_m[used] == pytest.approx(3.0)
 
 
 def test_phases_have_the_weight_of_their_elevation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,17 +41,6 @@ def test_degradation_factors_and_masks_are_those_of_sidereon(log: SbasMessages) 
         assert (masks.band[i], masks.iodi[i]) == (theirs.band_number, theirs.iodi)
 
 
-def test_delays_are_those_of_sidereon(log: SbasMessages) -> None:
-    ours = named(decode.grid_delays(log))
-    assert len(ours.row) == 236
-    for i, row in enumerate(ours.row.tolist()):
-        theirs = sidereon_message(log, row).iono_delays
-        assert (ours.band[i], ours.block[i], ours.iodi[i]) == (theirs.band_number, theirs.block_id, theirs.iodi)
-        assert ours.givei[i].tolist() == [entry.givei for entry in theirs.entries]
-        raw = np.array([entry.vertical_delay for entry in theirs.entries])
-        assert np.array_equal(ours.delay_m[i], np.where(raw == 511, np.nan, raw * 0.125), equal_nan=True)
-
-
 def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasMessages) -> None:
     """cssrlib writes E23 in place of E24 and C_ltc_v1 ten times too large: those two are left out."""
     sbas = pytest.importorskip("cssrlib.sbas", reason="cssrlib (the oracle) is not installed")
