@@ -16,7 +16,6 @@ from railfix.motion.features import LineSeries, LocatedFeature, line_series, loc
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import Track
 from railfix.track.curves import curved_line
-from tracking_cases import bent_line
 
 NOISE = (2e-4, 1e-4)
 #: Way between P2's points A to D (table 1) [m].
@@ -73,29 +72,6 @@ def test_gaps_between_the_points_repeat_as_in_table_1() -> None:
 
 
 @pytest.mark.requirement("E3")
-def test_error_of_the_place_within_its_own_sigma() -> None:
-    line = _line()
-    z = []
-    for seed in range(60):
-        found = _locate(line, POINTS[1], POINTS[1] - 4.0, seed)
-        z.append((found.arc_m - POINTS[1]) / found.sigma_m)
-    assert np.sqrt(np.mean(np.square(z))) < 1.5
-
-
-@pytest.mark.requirement("E3")
-@pytest.mark.parametrize("off_m", [-3.9, 2.1, 0.09])
-def test_a_place_between_two_steps_of_the_search_is_found(off_m: float) -> None:
-    line = _line()
-    way = np.arange(-60.0, 60.5, 1.0)
-    series = {
-        name: np.interp(POINTS[1] + way, line.arc_m, getattr(line, name)) for name in ("gradient", "curvature_1pm")
-    }
-    measured = LineSeries(arc_m=way, **series)
-    found = locate(measured, line, POINTS[1] + off_m, 8.0, quantity="gradient", noise=NOISE)
-    assert found.arc_m == pytest.approx(POINTS[1], abs=0.05)
-
-
-@pytest.mark.requirement("E3")
 def test_two_equal_features_in_the_window_are_refused() -> None:
     line = _line(repeated=True)
     measured = _measured(line, 510.0, 3, half=15.0)
@@ -135,16 +111,6 @@ def test_a_straight_level_line_has_no_features_and_places_nothing() -> None:
     flat = LineSeries(arc_m=arc, gradient=0.0 * arc, curvature_1pm=0.0 * arc)
     assert map_features(flat) == []
     assert _locate(flat, 500.0, 503.0, 1).verdict == "none"
-
-
-@pytest.mark.requirement("E3")
-def test_features_of_a_map_are_where_the_line_bends() -> None:
-    series = line_series(bent_line(1500.0, turn_deg=60.0))
-    middle = (series.arc_m > 600.0) & (series.arc_m < 900.0)
-    assert np.median(series.curvature_1pm[middle]) == pytest.approx(np.radians(60.0) / 500.0, rel=0.05)
-    found = [f for f in map_features(series) if f.quantity == "curvature"]
-    assert min(abs(f.arc_m - 500.0) for f in found) < 20.0
-    assert min(abs(f.arc_m - 1000.0) for f in found) < 20.0
 
 
 @pytest.mark.requirement("E3")

@@ -10,7 +10,6 @@ from railfix.motion.samples import TachometerPulses
 from railfix.motion.tachometer import (
     TachometerLimits,
     check_speeds,
-    distance_m,
     pulse_acceleration,
     pulse_speeds,
     tooth_faults,
@@ -60,30 +59,6 @@ def test_a_change_of_acceleration_is_seen_within_the_window() -> None:
     before = np.array([np.searchsorted(instants, t) for t in (0.5, 1.5)]) * LIMITS.pulse_m
     averaged = ((count[1] - before[1]) - (count[0] - before[0])) / 1.0
     assert averaged < 0.5
-
-
-@pytest.mark.requirement("E2")
-def test_standing_nothing_is_said() -> None:
-    pulses = _pulses(np.arange(50) * LIMITS.pulse_m / 5.0)
-    end = seconds(pulses.time[-1] - START)
-    found = pulse_speeds(pulses, _at([end + 1.0, end + 2.0, end + 10.0]), limits=LIMITS)
-    assert np.isnan(found.speed_mps).all()
-
-
-@pytest.mark.requirement("E2")
-def test_slower_than_its_least_speed_says_nothing_never_zero() -> None:
-    slow = _pulses(np.arange(40) * LIMITS.pulse_m / 0.2)
-    assert np.isnan(pulse_speeds(slow, slow.time[10:], limits=LIMITS).speed_mps).all()
-    assert np.isnan(pulse_speeds(_pulses(np.empty(0)), _at([1.0]), limits=LIMITS).speed_mps).all()
-
-
-@pytest.mark.requirement("E2")
-def test_way_is_that_of_the_motion_and_its_sign_that_of_the_direction() -> None:
-    instants = _even(8.0, 0.4, 80.0)
-    asked = [2.0, 4.0, 6.0]
-    truth = 8.0 * np.array(asked) + 0.2 * np.array(asked) ** 2
-    np.testing.assert_allclose(distance_m(_pulses(instants), _at(asked), limits=LIMITS), truth, atol=0.01)
-    np.testing.assert_allclose(distance_m(_pulses(instants, -1), _at(asked), limits=LIMITS), -truth, atol=0.01)
 
 
 @pytest.mark.requirement("E2")

@@ -101,8 +101,6 @@ def on_old_datum(crs: str, place: tuple[float, float], shift_m: tuple[float, flo
     """Coordinates in a CRS of a place of WGS 84, by translation and the ellipsoid and projection alone."""
     system = CRS(crs)
     geodetic = system.geodetic_crs
-    assert geodetic is not None
-    assert geodetic.ellipsoid is not None
     a, f = geodetic.ellipsoid.semi_major_metre, 1.0 / geodetic.ellipsoid.inverse_flattening
     point = ecef_from_geodetic(np.array([place[0]]), np.array([place[1]]), np.array([0.0])) - np.array(shift_m)
     back = Transformer.from_pipeline(f"+proj=pipeline +step +inv +proj=cart +a={a} +f={f} +step +proj=unitconvert "

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pyproj import CRS, Transformer
+from pyproj import Transformer
 
 from frame_cases import FRAMES, ITRF, MOTION, TIME, YEAR, moved
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.crs import HELD, REALISATIONS, SAME, kind_of_frame
 from railfix.track.frames import points_at
-from railfix.track.georeference import georeference
 
 pytestmark = pytest.mark.requirement("A9")
 
@@ -64,29 +63,6 @@ def test_an_ensemble_and_a_frame_of_another_name_say_what_they_are_taken_for() -
     assert "latest realisation, which is ITRF2020" in points_at(place, "EPSG:4326", TIME)[1].method
 
 
-@pytest.mark.parametrize(
-    ("crs", "frame"),
-    [
-        ("EPSG:4618", "EPSG:4989"),  # SAD69: South America
-        ("EPSG:4272", "EPSG:4959"),  # NZGD49
-        ("EPSG:4162", "EPSG:4927"),  # Korean 1985, not Japan
-        ("EPSG:4269", "EPSG:4326"),  # NAD83 as of 1986: PROJ has none to NAD83(2011) without its grids
-        ("EPSG:31370", "EPSG:4937"),  # Belgian Lambert 72
-        ("EPSG:30169", "EPSG:4326"),  # Tokyo: PROJ has none to JGD2011 without its grid, and Korea's is not meant
-    ],
-)
-def test_an_older_datum_goes_to_the_modern_frame_of_its_region(crs: str, frame: str) -> None:
-    area = CRS(crs).area_of_use
-    assert area is not None
-    x = np.array([(area.west + (area.east - area.west) % 360.0 / 2.0 + 180.0) % 360.0 - 180.0])
-    y = np.array([(area.south + area.north) / 2.0])
-    if CRS(crs).is_projected:
-        x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(x, y)
-    place = georeference(crs, x, y, path="map")
-    assert place.frame == frame
-    assert "transformed to" in place.notes[0]
-
-
 @pytest.mark.slow
 def test_no_frame_of_the_table_stops_with_an_error() -> None:
     """Each name is one that PROJ knows, at its own area of use."""
@@ -96,7 +72,6 @@ def test_no_frame_of_the_table_stops_with_an_error() -> None:
     known |= {i.name: i for i in pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.GEOGRAPHIC_3D_CRS)}
     for name in {*HELD, *REALISATIONS, *SAME}:
         info = known[name]
-        assert info.area_of_use is not None
         latitude = (info.area_of_use.south + info.area_of_use.north) / 2.0
         place = ecef_from_geodetic(np.array([latitude]), np.array([info.area_of_use.west + 0.5]), np.array([0.0]))
         there, shift = points_at(place, f"EPSG:{info.code}", TIME)

@@ -81,20 +81,6 @@ def test_gpx_and_openstreetmap_have_no_heights_to_use(tmp_path: Path) -> None:
         read_track(osm)
 
 
-def test_national_grid_of_a_geopackage_is_used(tmp_path: Path) -> None:
-    from pyproj import Transformer
-
-    east, north = Transformer.from_crs("EPSG:4258", "EPSG:25832", always_xy=True).transform(LINE[:, 0], LINE[:, 1])
-    path = _write(tmp_path / "line.gpkg", "GPKG", np.stack([east, north, LINE[:, 2]], axis=-1), crs="EPSG:25832")
-    track = read_track(path, height_datum="ellipsoidal")
-    assert track.provenance.frame == "EPSG:4258"
-    assert np.abs(track.latitude_deg - LINE[:, 1]).max() < 1e-8
-    with pytest.raises(SettingsError, match="contradicts"):
-        read_track(path, height_datum="ellipsoidal", crs="EPSG:4326")
-    with pytest.raises(SettingsError, match="height datum is missing"):
-        read_track(path)
-
-
 def test_heights_come_from_a_profile_or_from_positions(tmp_path: Path) -> None:
     path = _write(tmp_path / "line.gpkg", "GPKG", LINE[:, :2].copy())
     length = read_track(_write(tmp_path / "l3.gpkg", "GPKG", LINE), height_datum="ellipsoidal").chainage_m[-1]
@@ -168,17 +154,6 @@ def test_rasters_that_cannot_be_used_are_one_sentence(tmp_path: Path) -> None:
 
 
 # --- alignments --------------------------------------------------------------
-
-
-def test_clothoid_is_that_of_the_fresnel_integrals() -> None:
-    radius, length = 300.0, 80.0
-    way = np.linspace(0.0, length, 50)
-    element = PlanElement(x_m=10.0, y_m=20.0, direction_rad=0.7, first=0.0, last=-1 / radius, length_m=length)
-    scale = np.sqrt(np.pi * radius * length)
-    sine, cosine = fresnel(way / scale)
-    local = scale * np.stack([cosine, -sine], axis=-1)
-    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
-    assert np.abs(element.place_at(way) - (local @ turn.T + [10.0, 20.0])).max() < 1e-9
 
 
 @pytest.mark.parametrize("law", LAWS)
