@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import integrity_tables
+import level_cases
 import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
 from railfix.io import read_observations
@@ -125,9 +125,9 @@ def test_all_screens_are_no_worse_than_none(recordings: Path, name: str):
 def test_stated_sigmas_hold_in_a_straight_line(recordings: Path, name: str):
     """Errors to the place on the map, other passes of the course included, over the stated sigma."""
     assert recordings.is_dir()
-    case = integrity_tables.cases()[name]
+    case = level_cases.cases()[name]
     result = case.solved()
-    error, _ = case.errors(result)
+    error = case.errors_m(result)
     known = np.isfinite(error)
     p68, p95 = np.percentile(error[known] / result.along_sigma_m[known], [68, 95])
     assert 0.8 <= p68 <= 1.2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-import integrity_tables
+import level_cases
 import raim_cases
 from integrity_recordings import ranges_of
 from plain_kernels import plain
@@ -31,15 +31,15 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
 @pytest.fixture(scope="module")
-def pixel(recordings: Path) -> integrity_tables.Case:
+def pixel(recordings: Path) -> level_cases.Case:
     """Four to seven GPS satellites on a course whose passes lie some 16 m beside each other."""
     assert recordings.is_dir()
-    return integrity_tables.cases()["Pixel"]
+    return level_cases.cases()["Pixel"]
 
 
 @pytest.mark.requirement("C2")
 @pytest.mark.slow
-def test_no_ok_position_is_over_its_level_with_a_large_fault(pixel: integrity_tables.Case) -> None:
+def test_no_ok_position_is_over_its_level_with_a_large_fault(pixel: level_cases.Case) -> None:
     """Every second satellite in turn 100 m too long from the middle on, some at a time when another one is off, too."""
     clean = pixel.solved()
     start, judged = len(clean) // 2, 0
@@ -47,8 +47,8 @@ def test_no_ok_position_is_over_its_level_with_a_large_fault(pixel: integrity_ta
         bias = np.zeros(pixel.observations.code_m.shape)
         bias[start:, pixel.observations.satellite == pixel.observations.satellite[channel]] = 100.0
         result = pixel.solved(bias_m=bias)
-        error, _ = pixel.errors(result)
-        level, calm = integrity_tables.bounds(result)
+        error = pixel.errors_m(result)
+        level, calm = level_cases.bounds(result)
         ok = (result.status == Status.OK) & calm & np.isfinite(error)
         judged += int(ok[start:].sum())
         assert not (ok & (error > level))[start:].any()
@@ -89,13 +89,13 @@ def risk_beyond(
     ids=["noise", "one fault", "two faults", "a side"],
 )
 def test_open_places_are_those_that_solving_every_subset_leaves_open(
-    pixel: integrity_tables.Case, local_prior: float, side_prior: float
+    pixel: level_cases.Case, local_prior: float, side_prior: float
 ) -> None:
     """None, each satellite, each pair and each side left out, at points of the whole course half a metre apart.
 
     Without priors noise alone leaves places open beyond too small a level; with large ones mostly two faults do.
     """
-    settings = integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-8)})  # smaller levels
+    settings = level_cases.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-8)})  # smaller levels
     result, line = pixel.solved(settings), pixel.trajectory
     own = SATELLITE_PRIOR if local_prior else dict.fromkeys(SATELLITE_PRIOR, 0.0)
     risk = RiskBudget(local_prior=local_prior, satellite_prior=dict(own), side_prior=side_prior)
@@ -180,9 +180,7 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.requirement("C2")
 @pytest.mark.parametrize("enough", [0.0, 1.0], ids=["each hypothesis", "loose bound"])
-def test_bounds_are_the_same_compiled(
-    pixel: integrity_tables.Case, monkeypatch: pytest.MonkeyPatch, enough: float
-) -> None:
+def test_bounds_are_the_same_compiled(pixel: level_cases.Case, monkeypatch: pytest.MonkeyPatch, enough: float) -> None:
     """Probabilities are far below the metres that kernels are compared to: to a millionth of themselves."""
     calls: list[tuple[Any, ...]] = []
 
@@ -192,7 +190,7 @@ def test_bounds_are_the_same_compiled(
 
     compiled = kernels.off_tangent.risk_off_tangent
     monkeypatch.setattr(kernels.off_tangent, "risk_off_tangent", recorded)
-    pixel.solved(integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-2)}))
+    pixel.solved(level_cases.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-2)}))
     assert calls
     for *arrays, clear_m, sigma_m, _ in calls:
         clear_m = np.linspace(20.0, 200.0, len(clear_m))

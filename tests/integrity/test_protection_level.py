@@ -12,7 +12,6 @@ from scipy.stats import norm
 import protection_oracle
 import raim_cases
 import raim_oracle as oracle
-from protection_hand_case import HAND, hand_model
 from railfix.integrity.protection import (
     Cause,
     LevelStatus,
@@ -28,6 +27,34 @@ from raim_cases import point_model
 pytestmark = pytest.mark.requirement("C2")
 
 ARC = np.array([731.0])
+#: A risk whose parts are all asked for, and leave figures that can be followed.
+HAND = RiskBudget(
+    risk_per_hour=1e-4,
+    samples_per_hour=1.0,
+    exclusion_share=0.0,
+    false_alarm=0.01,
+    satellite_prior={"G": 0.008, "E": 0.006, "C": 0.009},
+    local_prior=0.002,
+)
+#: Direction cosines of the five satellites along the track.
+COSINE = (0.8, -0.8, 0.4, -0.4, 0.0)
+
+
+def hand_model(error_m: tuple[float, ...]) -> LinearModel:
+    """Five satellites of one clock, 1 m each, none sees the map error."""
+    design = np.zeros((1, 5, 3))
+    design[0, :, 0] = COSINE
+    return LinearModel(
+        root_weight=np.ones((1, 5)),
+        clock=np.zeros(5, dtype=np.intp),
+        clock_covariance_m2=np.full((1, 1, 1), 0.2),
+        design=design,
+        covariance_m2=np.diag([1.0 / 1.6, 0.09, 0.36])[None],
+        prior=np.diag([0.0, 1.0 / 0.09, 1.0 / 0.36]),
+        misfit=np.array([error_m]),
+        freedom=np.array([3]),
+        interest=1,
+    )
 
 
 def test_case_worked_by_hand():

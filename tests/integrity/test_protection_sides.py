@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import integrity_tables
+import level_cases
 import protection_oracle
 import raim_cases
 import raim_oracle as oracle
@@ -17,6 +17,7 @@ from railfix.integrity.protection import Cause, RiskBudget, protection_level
 from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.pipeline.level_stage import late_sides
+from railfix.simulate.demonstration import demo_files
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -127,10 +128,10 @@ def test_satellites_ahead_and_behind_are_late_together_where_that_is_asked(sides
 
 def test_levels_of_a_run_have_the_satellites_ahead_where_that_is_asked() -> None:
     """On a minute of the demonstration no level is smaller with these hypotheses, and half are 1.5 times as large."""
-    case = integrity_tables.demonstration()
+    case = level_cases.of_files(demo_files())
     case = replace(case, observations=case.observations[600:900], reference_ecef_m=case.reference_ecef_m[600:900])
     beside, every = (
-        case.solved(integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(late_sides=sides)})).protection
+        case.solved(level_cases.SETTINGS.model_copy(update={"risk": RiskBudget(late_sides=sides)})).protection
         for sides in ("beside", "all")
     )
     ratio = every.level.level_m / beside.level.level_m

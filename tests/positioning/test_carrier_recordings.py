@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import carrier_score
+import carrier_forms
+import level_cases
+from pipeline_cases import clean_files
 from railfix.evaluate import Score, score
 from railfix.run.processor_setup import make_processor
 
 
 @cache
-def clean() -> carrier_score.Carried:
-    return carrier_score.carried(carrier_score.clean()[0])
+def clean() -> carrier_forms.Carried:
+    return carrier_forms.carried(level_cases.of_files(clean_files()))
 
 
 @cache
-def recorded(data: Path, name: str) -> carrier_score.Carried:
-    return carrier_score.carried(next(c for c in carrier_score.recordings(data) if c.name == name))
+def recorded(name: str) -> carrier_forms.Carried:
+    return carrier_forms.carried(level_cases.cases()[name])
 
 
-def scores(found: carrier_score.Carried) -> dict[str, Score]:
+def scores(found: carrier_forms.Carried) -> dict[str, Score]:
     """On the epochs that all forms have."""
     errors = found.errors()
     both = np.all([np.isfinite(e) for e in errors.values()], axis=0)
@@ -46,20 +47,21 @@ def test_slips_put_into_the_simulated_run_are_all_found():
     found = clean()
     assert not (found.slips.slip[1:] & np.isfinite(found.slips.phase_m[:-1])).any()
     assert not found.jumps.jump.any()
-    for one in carrier_score.detections(found, count=60):
+    for one in carrier_forms.detections(found, count=60):
         assert one.by_receiver_tests == 1.0
         assert one.by_either == 1.0
 
 
 @pytest.mark.requirement("A5")
 @pytest.mark.slow
-def test_a_mosaic_in_the_open(recordings):
+@pytest.mark.usefixtures("recordings")
+def test_a_mosaic_in_the_open():
     """No Dopplers: the line finds every slip of one cycle; the median error falls below half."""
-    found = recorded(recordings, "japan_mosaic")
+    found = recorded("Japan")
     got = scores(found)
     assert got["live"].p50_m < 0.5 * got["code"].p50_m
     assert got["live"].p95_m < 0.55 * got["code"].p95_m
-    for one in carrier_score.detections(found, sizes=(1, 10), count=60):
+    for one in carrier_forms.detections(found, sizes=(1, 10), count=60):
         assert one.by_receiver_tests == 0.0
         assert one.by_either > 0.97
     assert found.jumps.jump.sum() < 0.003 * found.jumps.judged.sum()
@@ -68,12 +70,13 @@ def test_a_mosaic_in_the_open(recordings):
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize(
     ("name", "p50"),
-    [("urbannav F9P", 0.95), pytest.param("urbannav M8T", 0.75, marks=pytest.mark.slow), ("gsdc_pixel5_a", 0.9)],
+    [("F9P", 0.95), ("M8T", 0.75), ("Pixel", 0.9)],
 )
 @pytest.mark.slow
-def test_in_towns_it_does_no_harm(recordings, name, p50):
+@pytest.mark.usefixtures("recordings")
+def test_in_towns_it_does_no_harm(name: str, p50: float):
     """Arcs of seconds, codes wrong by tens of metres: the median gains, the 95 % little."""
-    got = scores(recorded(recordings, name))
+    got = scores(recorded(name))
     assert got["live"].p50_m < p50 * got["code"].p50_m
     assert got["live"].p95_m < 1.05 * got["code"].p95_m
     assert got["hatch"].p50_m < 1.0 * got["code"].p50_m
@@ -81,10 +84,13 @@ def test_in_towns_it_does_no_harm(recordings, name, p50):
 
 
 @pytest.mark.requirement("A5")
-def test_chunks_of_a_telephone_give_the_same(recordings):
+@pytest.mark.usefixtures("recordings")
+def test_chunks_of_a_telephone_give_the_same():
     """Arcs begin at three epochs of four."""
-    case = next(c for c in carrier_score.recordings(recordings) if c.name == "gsdc_pixel5_a")
-    processor = make_processor(case.config.replaced(carrier="float"), case.navigation, {"front": case.trajectory})
+    case = level_cases.cases()["Pixel"]
+    processor = make_processor(
+        level_cases.SETTINGS.replaced(carrier="float"), case.navigation, {"front": case.trajectory}
+    )
     places = []
     for size in (len(case.observations), 300, 50):
         state, parts = None, []
@@ -97,11 +103,12 @@ def test_chunks_of_a_telephone_give_the_same(recordings):
 
 @pytest.mark.requirement("A5")
 @pytest.mark.slow
-def test_a_static_station_every_30_s(recordings):
+@pytest.mark.usefixtures("recordings")
+def test_a_static_station_every_30_s():
     """P4's experiment has 30 s: Dopplers absent, ambiguities that walk 0.05 m between epochs."""
     code, live = [], []
-    for station in ("0759 0", "3040 90"):
-        errors = recorded(recordings, f"geonet {station}").errors()
+    for station, azimuth_deg in (("0759", 0.0), ("3040", 90.0)):
+        errors = carrier_forms.carried(level_cases.station(station, azimuth_deg)).errors()
         code.append(errors["code"])
         live.append(errors["live"])
     assert np.percentile(np.abs(live), 95) < 1.05 * np.percentile(np.abs(code), 95)

@@ -85,10 +85,3 @@ def test_levels_over_the_hour(above: sbas_hour.Sky, found: dict[float, sbas_hour
     assert 0.1 < share[1] < 0.3
     assert 0.3 < share[3] < 0.5
     assert share[2] + share[4] < 0.02
-
-
-def test_the_picture_is_drawn(
-    above: sbas_hour.Sky, line: Trajectory, found: dict[float, sbas_hour.Levels], tmp_path: Path
-):
-    path = sbas_hour.picture(list(found.values()), above, line, tmp_path / "hour.png")
-    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

@@ -35,12 +35,12 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 from scipy.interpolate import make_interp_spline
+from scipy.stats import binomtest
 
 import paths
 import recordings_score
 import recordings_truth
 import sensed_ride
-from posterior_score import arc_of, bounds
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason, Status
@@ -68,6 +68,9 @@ from railfix.tracking import Line, Tracked, TrackStatus
 UNDETECTED: Final = ("pull 0.5 m/s, all", "pull 0.5 m/s, all, from the start")
 #: Beginnings of the names of faults that never begin with the first epoch.
 LATE_FAULTS: Final = ("Dopp", "phases", "step", "codes ", "late", "clock of", "clock +1")
+
+#: Beyond this the vehicle's place is not where its speed allows: it is sought further on [m].
+_OFF_M: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -140,6 +143,27 @@ def joined(parts: list[Judged]) -> Judged:
     return Judged(*(np.concatenate([getattr(p, n) for p in parts]) for n in Judged.__dataclass_fields__))
 
 
+def arc_of(reference: np.ndarray, time_s: np.ndarray, trajectory: Trajectory) -> np.ndarray:
+    """Arc length of the vehicle, lap by lap: the nearest place not far from that of the epoch before."""
+    points, arc = np.asarray(trajectory.ecef_m), np.asarray(trajectory.arc_m)
+    found = np.full(len(reference), np.nan)
+    near, last = 0.0, time_s[0]
+    for k, place in enumerate(reference):
+        if not np.isfinite(place[0]):
+            continue
+        window = (arc >= near - 15.0) & (arc <= near + 15.0 + 25.0 * max(time_s[k] - last, 1.0))
+        distance = np.linalg.norm(points - place, axis=1)
+        if distance[window].min() > _OFF_M:
+            window = arc >= near - 15.0
+        index = np.flatnonzero(window)
+        best = index[np.argmin(distance[index])]
+        segment = min(best, len(arc) - 2)
+        along = float((place - points[segment]) @ np.asarray(trajectory.tangent)[segment])
+        near = found[k] = float(np.clip(arc[segment] + along, arc[0], arc[-1]))
+        last = time_s[k]
+    return found
+
+
 def made(name: str, log: Path, nav: list[Path], truth: recordings_truth.Truth, trajectory: Trajectory | None) -> Case:
     """A case; without a line it is made from the reference."""
     time, ecef = truth
@@ -170,14 +194,6 @@ def simulated(name: str, seconds_at_most: float = 1800.0) -> Case:
     return Case(name, ride.observations, ride.simulation.navigation, trajectory, ecef, arc, sensors)
 
 
-def smartloc_rinex_truth(folder: Path) -> recordings_truth.Truth:
-    """The drive at Potsdamer Platz as recorded: seconds since the first epoch, ECEF."""
-    lines = (folder / "Berlin_Potsdamer_Platz_RTK_GT.txt").read_text(encoding="ascii").splitlines()
-    rows = np.array([line.split()[1:5] for line in lines if line.strip()], dtype=np.float64)
-    start = np.datetime64("2016-06-06T11:10:41.700", "ns")
-    return start + (np.round(rows[:, 0], 3) * 1e9).astype("timedelta64[ns]"), rows[:, 1:]
-
-
 @dataclass(frozen=True)
 class Recording:
     """Files of a recording beside the checkout, and what reads its reference."""
@@ -205,7 +221,7 @@ def recordings(data: Path) -> dict[str, Recording]:
         "berlin": Recording(
             berlin / "Berlin_Potsdamer_Platz.obs.gz",
             [berlin / "brdc1580.16n.gz", berlin / "brdc1580.16g.gz"],
-            partial(smartloc_rinex_truth, berlin),
+            partial(recordings_truth.smartloc_rinex_truth, berlin),
         ),
     }
 
@@ -826,7 +842,7 @@ def calibration(found: Judged) -> list[str]:
         mine = (found.probability >= low) & (found.probability < high) & np.isfinite(found.chainage_m)
         if mine.any():
             count, hits = int(mine.sum()), int(right[mine].sum())
-            least, most = bounds(hits, count)
+            least, most = binomtest(hits, count).proportion_ci(method="exact")
             lines.append(
                 f"    stated {low:.3f} to {min(high, 1.0):.3f}: right {hits} of {count}, {hits / count:.4f} "
                 f"({least:.4f} to {most:.4f})"

@@ -1,9 +1,8 @@
 """Scores of the filter along the track on the real recordings: ``python tests/studies/filter_score.py [TABLE ...]``.
 
-Tables: ``figures`` (single epochs beside, and smoothed), ``codes`` (whether their errors are common), ``ablation``
-(without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``terms`` (what
-decides levels; levels themselves: `belief_campaign`), ``systems`` (one constellation alone). One setting for all
-recordings; distances are straight ones on the map.
+Tables: ``figures`` (single epochs beside, and smoothed), ``ablation`` (without each kind of measurement), ``gaps``
+(windows without satellites, with and without a wheel); levels: `belief_campaign`. One setting for all recordings;
+distances are straight ones on the map.
 """
 
 from __future__ import annotations
@@ -15,13 +14,11 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from scipy.special import ndtr
 
 import paths
 import recordings_score
 import recordings_truth
 from railfix.core.constants import CLOCK_GROUP
-from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.pipeline import along_track
@@ -29,9 +26,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.smoothed_track import Replay, SmoothedTrack, smooth
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.bank import budget
-from railfix.tracking.packing import pack_state
+from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, track
 
 CONFIG = parse_config({"filter": "track"})
 #: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
@@ -51,7 +46,7 @@ class Case:
     wheel: SensorEpochs | None = None
 
     def run(self, epochs: GnssEpochs | None = None, **changes: object) -> Tracked:
-        sensors, levels = changes.pop("sensors", None), bool(changes.pop("levels", False))
+        sensors = changes.pop("sensors", None)
         assert sensors is None or isinstance(sensors, SensorEpochs)
         limits = TrackingLimits.model_validate(changes)
         return track(
@@ -59,7 +54,6 @@ class Case:
             Line(self.trajectory),
             limits=limits,
             sensors=sensors,
-            levels=levels,
         )[0]
 
     def smoothed(self, sensors: SensorEpochs | None = None) -> SmoothedTrack:
@@ -173,49 +167,6 @@ def ratio_of(case: Case, found: Tracked | SmoothedTrack) -> str:
     return f"error/sigma p95 {p95:4.1f} ({low:.1f} to {high:.1f}, {len(blocks)} blocks)"
 
 
-def show_codes(all_cases: list[Case]) -> None:
-    """Codes alone against the reference: whether they share an error, and how long their errors last.
-
-    The place along the line by the codes of one epoch with Student's t errors; its error over the sigma that
-    independent errors of the codes give, beside the residuals over theirs; how both are correlated over time.
-    """
-    lags = (1, 10, 30, 60, 120)
-    for case in all_cases:
-        epochs, line = case.epochs, Line(case.trajectory)
-        known = np.isfinite(case.reference[:, 0])
-        arc, _ = case.trajectory.nearest(np.where(known[:, None], case.reference, case.reference[known][0]))
-        distance, sight = range_with_rotation(epochs.sat_ecef_m, case.reference[:, None, :])
-        along = -np.einsum("tki,ti->tk", sight, line.at(arc)[1][:, 0])
-        sigma = epochs.code_sigma_m * np.sqrt(1.0 + TrackingLimits().code_white_share ** 2)
-        groups = epochs.clock[:, None] == np.unique(epochs.clock)
-        ratio, residual = np.full(len(epochs), np.nan), np.full(sigma.shape, np.nan)
-        for t in np.flatnonzero(case.observed):
-            ok = np.isfinite(epochs.code_m[t]) & np.isfinite(sigma[t])
-            design = np.column_stack([along[t, ok], groups[ok][:, groups[ok].any(axis=0)]])
-            if ok.sum() < design.shape[1] + 1:
-                continue
-            value, information = (epochs.code_m - distance)[t, ok], sigma[t, ok] ** -2.0
-            value = value - np.median(value)
-            weight = information
-            for _ in range(8):
-                change = np.linalg.solve(design.T @ (weight[:, None] * design), design.T @ (weight * value))
-                left = value - design @ change
-                weight = 5.0 * information / (4.0 + left**2 * information)
-            spread = np.linalg.inv(design.T @ (information[:, None] * design))[0, 0]
-            ratio[t], residual[t, ok] = change[0] / np.sqrt(spread), left / sigma[t, ok]
-        place, codes = np.clip(ratio, -4.0, 4.0)[:, None], np.clip(residual, -4.0, 4.0)
-        lasting = [
-            " ".join(f"{np.nanmean(x[lag:] * x[:-lag]) / np.nanmean(x**2):5.2f}" for lag in lags)
-            for x in (place, codes)
-        ]
-        print(
-            f"{case.name:9s} error/sigma p95 {np.nanpercentile(np.abs(ratio), 95):.1f}, rms of place "
-            f"{np.sqrt(np.nanmean(place**2)):.2f} and of residuals {np.sqrt(np.nanmean(codes**2)):.2f}; correlation "
-            f"after {lags} s: place {lasting[0]}, residuals {lasting[1]}",
-            flush=True,
-        )
-
-
 def show_figures(all_cases: list[Case]) -> None:
     for case in all_cases:
         if np.isfinite(case.single_arc_m).any():
@@ -283,70 +234,10 @@ def show_gaps(all_cases: list[Case]) -> None:
                     )
 
 
-def _levelled(found: Tracked) -> np.ndarray:
-    """Epochs with a level: finite, and neither lost nor expired."""
-    return np.isfinite(found.ground_level_m) & ~np.isin(found.status, (TrackStatus.LOST, TrackStatus.EXPIRED))
-
-
-def show_terms(all_cases: list[Case]) -> None:
-    """Which hypothesis spends most of the risk at the level, and how it differs; levels by other priors."""
-    for case in all_cases:
-        limits, line = TrackingLimits(), Line(case.trajectory)
-        given, state = budget(limits), None
-        named: dict[str, list[tuple[float, float, float]]] = {}
-        for t in range(len(case.epochs)):
-            found, state = track(case.epochs.take(slice(t, t + 1)), line, state, limits=limits, levels=True)
-            if state.bank is None or not len(state.bank.without) or not np.isfinite(found.ground_level_m[0]):
-                continue
-            apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
-            sigma = np.sqrt(state.bank.covariance[:, 0, 0])
-            source = pack_state(state, limits, levels=True).source
-            prior = source["prior"][source["running"]]
-            level = found.ground_level_m
-            spent = prior * (ndtr((apart - level) / sigma) + ndtr((-apart - level) / sigma))
-            own = 2.0 * ndtr(-level[0] / found.sigma_m[0])
-            k = int(np.argmax(spent))
-            name = state.bank.without[k] if spent[k] > own else "noise"
-            named.setdefault(name, []).append((max(float(spent[k]), own) / given.risk, sigma[k], apart[k]))
-        for name, rows in sorted(named.items(), key=lambda item: -len(item[1]))[:2]:
-            share, sigma_m, apart_m = np.median(rows, axis=0)
-            print(
-                f"{case.name:9s} {name:5s} at {len(rows)} of {sum(map(len, named.values()))} epochs: "
-                f"{100 * share:.0f} % of the risk, sigma {sigma_m:.1f} m, {apart_m:.1f} m apart"
-            )
-        for label, changes in (
-            ("without faults of constellations", {"level_constellation_prior": 0.0}),
-            ("6 independent errors an hour", {"level_samples_per_hour": 6.0}),
-        ):
-            found = case.run(levels=True, **changes)
-            ok = case.observed & _levelled(found)
-            print(f"{case.name:9s} {label}: level p50 {np.median(found.ground_level_m[ok]):.1f} m", flush=True)
-
-
-def show_systems(all_cases: list[Case]) -> None:
-    """With one constellation alone: those with three codes at half of the epochs."""
-    for case in all_cases:
-        letter = case.epochs.satellite.astype("<U1")
-        for name in np.unique(letter).tolist():
-            own = letter == name
-            codes = int(np.median(np.isfinite(case.epochs.code_m[:, own]).sum(axis=1)))
-            if codes < 3 or own.all():
-                continue
-            part = {
-                field: np.where(own, getattr(case.epochs, field), np.nan) for field in ("code_m", "phase_m", "rate_mps")
-            }
-            found = case.run(epochs=replace(case.epochs, **part))
-            text = figures_of(case.error(found)[case.observed])
-            print(f"{case.name:9s} {name} {codes:2d} codes  {text}  {ratio_of(case, found)}", flush=True)
-
-
 TABLES = {
     "figures": show_figures,
-    "codes": show_codes,
     "ablation": show_ablation,
     "gaps": show_gaps,
-    "terms": show_terms,
-    "systems": show_systems,
 }
 
 

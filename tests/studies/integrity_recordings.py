@@ -1,16 +1,14 @@
 """Protection levels on real recordings with references, each by error models of other recordings.
 
 ``python tests/studies/integrity_recordings.py FOLDER`` with the recordings beside the checkout writes references, maps,
-runs and models to the folder, and prints the tables of ``docs/level-results.md``; ``--epochs`` lists every epoch
-whose error passes its level.
+runs and models to the folder, and prints the tables of ``docs/level-results.md``.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,24 +17,23 @@ import numpy as np
 import paths
 import recordings_ablate
 import recordings_score
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.core.reasons import CHECK_FAILED, Reason, Status
+from railfix.core.geodesy import range_with_rotation
+from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.evaluate import along_track_error, interpolate_reference
-from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs, range_errors
+from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import ProtectionLevel, protection_level
 from railfix.integrity.raim import linear_model
-from railfix.integrity.stanford import Region, Stanford, stanford
+from railfix.integrity.stanford import Stanford, stanford
 from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.normal_equations import misfit, position_on_line
 from railfix.positioning.range_arrays import FILLER_SATELLITE_M, Ranges
 from railfix.ranges.channels import clock_groups
-from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
+from railfix.ranges.error_model import ErrorBins, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run.driver import open_inputs
 from railfix.run.processor_setup import make_processor
@@ -92,12 +89,6 @@ MODELS: Final = {
     },
 }
 JAPAN_BASE: Final = "japan_mosaic_2021265_with_GEONET3034/3034265G.21O"
-#: (|error| - bias) / sigma from which on a range stands outside of its model: one of a thousand, two-sided.
-OUTSIDE: Final = 3.29
-#: Another place of the line than the ranges' errors lead to from the true one: the part that they leave unexplained.
-UNEXPLAINED: Final = 0.5
-#: A reference interpolated over more than this does not tell [s].
-REFERENCE_STEP_S: Final = 1.5
 
 
 @dataclass(frozen=True)
@@ -119,15 +110,9 @@ class Judged:
     model: str
     result: AntennaResult
     trajectory: Trajectory
-    reference: AntennaReference
     observed: np.ndarray  # epochs with observations inside the reference
-    place_ecef_m: np.ndarray  # (T, 3) of the reference
     error_m: np.ndarray
-    range_error_m: np.ndarray  # (T, K) of `range_errors`
     from_ranges_m: np.ndarray  # along the line, by the errors of the ranges used
-    share: np.ndarray  # (T, K) metres along the line by metre of a range
-    misfit_m: np.ndarray  # (T, K) errors against a clock common to all, where `range_errors` has none
-    outside: np.ndarray  # (T, K) (|error| - bias) / sigma of the model
 
     @property
     def level_m(self) -> np.ndarray:
@@ -142,6 +127,11 @@ class Judged:
         return np.where(np.isin(self.result.status, against), np.inf, self.level_m)
 
     @property
+    def over(self) -> int:
+        """Number of epochs with a consistent level that the error passes."""
+        return int(np.count_nonzero(np.abs(self.error_m) > self.level_m))
+
+    @property
     def alarms(self) -> np.ndarray:
         level = self.result.protection.level
         return np.isfinite(self.error_m) & ~level.consistent & ~np.isnan(level.level_m)
@@ -149,22 +139,6 @@ class Judged:
     def diagram(self, limit_m: float, level_m: np.ndarray) -> Stanford:
         rows = self.observed
         return stanford(self.result.time[rows], self.error_m[rows], level_m[rows], alarm_limit_m=limit_m)
-
-
-@dataclass(frozen=True)
-class Over:
-    """One epoch whose error passes its level."""
-
-    time: np.datetime64
-    error_m: float
-    level_m: float
-    parts_m: tuple[float, float, float]
-    status: str
-    used: int
-    explained_m: float
-    why: str
-    where: str
-    ranges: str = field(repr=False)
 
 
 # ---- recordings and models ----------------------------------------------------------------------------------
@@ -264,21 +238,8 @@ def judged(
         result = replace(result, protection=replace(result.protection, level=level))
     place = interpolate_reference(result.time, one.reference.time, one.reference.ecef_m)
     error = along_track_error(result.arc_m, place, one.trajectory)
-    found = range_errors(result, one.trajectory, one.reference)
-    satellite = result.satellite[result.columns]
-    by_range = np.full((len(result), len(satellite)), np.nan)
-    # Of a satellite's signals one was used: its error is the one that counts.
     used = (result.reason[:, result.columns] == 0) & np.isfinite(result.sigma_m[:, result.columns])
-    row = np.searchsorted(result.time, found.time)
-    for name in np.unique(found.satellite):
-        of = (found.satellite == name) & found.samples.used
-        channel = np.flatnonzero(satellite == name)
-        which = channel[np.argmax(used[row[of]][:, channel], axis=1)]
-        by_range[row[of], which] = found.samples.error_m[of]
-    share, misfit = _moved(one, result, used, place)
-    scale = result.noise_scale if file is not None else np.maximum(result.noise_scale, least_scale)
-    bias = np.zeros(used.shape) if file is None else _bias(file, result, one)
-    sigma = np.fmax(scale[:, None] * result.sigma_m[:, result.columns], result.bound_sigma_m[:, result.columns])
+    gain, misfit = _moved(one, result, used, place)
     observed = np.isfinite(place[:, 0]) & np.any((result.reason & 1) == 0, axis=1)
     if since is not None:
         observed &= result.time >= since
@@ -288,25 +249,10 @@ def judged(
         model=model,
         result=result,
         trajectory=one.trajectory,
-        reference=one.reference,
         observed=observed,
-        place_ecef_m=place,
         error_m=error,
-        range_error_m=by_range,
-        from_ranges_m=np.where(used, share * misfit, 0.0).sum(axis=1),
-        share=share,
-        outside=(np.abs(np.where(np.isnan(by_range), misfit, by_range)) - bias) / sigma,
-        misfit_m=misfit,
+        from_ranges_m=np.where(used, gain * misfit, 0.0).sum(axis=1),
     )
-
-
-def _bias(file: Path, result: AntennaResult, one: Recording) -> np.ndarray:
-    """Largest nominal bias of each range by the model, shape (T, K)."""
-    columns = result.columns
-    arc, _ = one.trajectory.nearest(np.nan_to_num(result.point.ecef_m))
-    turned = result.azimuth_deg[:, columns] - one.trajectory.body_azimuth_deg(arc)[:, None]
-    _, bias = read_error_model(file).at(result.elevation_deg[:, columns], turned, result.cn0_dbhz[:, columns])
-    return np.nan_to_num(bias)
 
 
 def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np.ndarray) -> ProtectionLevel:
@@ -322,12 +268,11 @@ def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np
     )
 
 
-def ranges_of(result: AntennaResult, reasons: int = -1) -> Ranges:
-    """The ranges that the positions were solved with in the end, from what the result tells; or those besides that
-    have no other reason than the ones masked out."""
+def ranges_of(result: AntennaResult) -> Ranges:
+    """The ranges that the positions were solved with in the end, from what the result tells."""
     columns = result.columns
     sigma, code = result.sigma_m[:, columns], result.corrected_code_m[:, columns]
-    used = ((result.reason[:, columns] & reasons) == 0) & np.isfinite(sigma) & np.isfinite(code)
+    used = (result.reason[:, columns] == 0) & np.isfinite(sigma) & np.isfinite(code)
     return Ranges(
         sat_ecef_m=np.where(used[..., None], result.corrected.satellites.position_ecef_m, FILLER_SATELLITE_M),
         code_m=np.where(used, code, 0.0),
@@ -355,90 +300,6 @@ def _moved(one: Recording, result: AntennaResult, used: np.ndarray, place: np.nd
     some = np.isfinite(says).any(axis=1)
     misfit[some] -= np.nanmedian(says[some], axis=1, keepdims=True)
     return gain, misfit
-
-
-# ---- epochs over their level --------------------------------------------------------------------------------
-
-
-def over_level(one: Judged, level_m: np.ndarray | None = None) -> list[Over]:
-    """Every epoch with a consistent level that its error passes; or passes another bound than the level."""
-    level, result = one.level_m if level_m is None else level_m, one.result
-    found = []
-    for t in np.flatnonzero((np.abs(one.error_m) > level) & np.isfinite(one.level_m)):
-        parts = result.protection.level
-        found.append(
-            Over(
-                time=result.time[t],
-                error_m=float(one.error_m[t]),
-                level_m=float(level[t]),
-                parts_m=(float(parts.fault_free_m[t]), float(parts.one_fault_m[t]), float(parts.two_fault_m[t])),
-                status=Status(result.status[t]).text,
-                used=int(result.n_used[t]),
-                explained_m=float(one.from_ranges_m[t]),
-                why=_why(one, int(t)),
-                where=_where(one, int(t)),
-                ranges=_ranges_text(one, int(t)),
-            )
-        )
-    return found
-
-
-def _why(one: Judged, t: int) -> str:
-    error, off = one.error_m[t], one.outside[t] > OUTSIDE
-    off &= one.result.reason[t, one.result.columns] == 0
-    if _in_gap(one.reference.time, one.result.time[t]):
-        return "reference gap"
-    what = "another place of the line" if abs(error - one.from_ranges_m[t]) > UNEXPLAINED * abs(error) else "same place"
-    if off.sum() > 2:
-        return f"{what}, {off.sum()} of {one.result.n_used[t]} ranges off"
-    return f"{what}, {'each range within its model' if not off.any() else 'one or two ranges off'}"
-
-
-def _where(one: Judged, t: int) -> str:
-    """How far the place found is from the true one, and what the ranges say without those that are off."""
-    result, line = one.result, one.trajectory
-    true_arc, _ = line.nearest(one.place_ecef_m[t : t + 1])
-    sections = [int(line.segment_at(arc)[0][0]) for arc in (result.arc_m[t : t + 1], true_arc)]
-    turned = float(line.tangent[sections[0]] @ line.tangent[sections[1]])
-    straight = float(np.linalg.norm(line.at_arc(result.arc_m[t : t + 1])[0] - one.place_ecef_m[t]))
-    ranges = ranges_of(result, ~int(Reason.FAULT_EXCLUDED)).take(np.array([t]))
-    ranges = replace(ranges, weight=np.where(one.outside[t] > OUTSIDE, 0.0, ranges.weight))
-    best = int(np.argmin(misfit(ranges.take(np.zeros(len(line.ecef_m), dtype=np.intp)), line.ecef_m)))
-    other = position_on_line(ranges, line, np.array([best]))
-    again = float(np.linalg.norm(line.at_arc(other.arc_m)[0] - one.place_ecef_m[t]))
-    return (
-        f"found {straight:.0f} m away in a straight line, {abs(float(result.arc_m[t] - true_arc[0])):.0f} m along it, "
-        f"cosine of the directions {turned:+.2f}, own sigma {result.epoch_sigma_m[t]:.0f} m; "
-        f"best fit without those off: {again:.0f} m away"
-    )
-
-
-def _in_gap(known: np.ndarray, time: np.datetime64) -> bool:
-    """Whether the reference is interpolated across more than its usual step."""
-    after = int(np.searchsorted(known, time))
-    around = known[max(after - 1, 0) : after + 1]
-    return (
-        len(around) == 2
-        and bool((around[1] - around[0]) / np.timedelta64(1, "s") > REFERENCE_STEP_S)
-        and time not in around
-    )
-
-
-def _ranges_text(one: Judged, t: int) -> str:
-    """The satellites used or excluded: error, over the model's sigma, and what it did to the position."""
-    result, words = one.result, []
-    columns = result.columns
-    of_clock = one.range_error_m[t]
-    error = np.where(np.isnan(of_clock), one.misfit_m[t], of_clock)
-    for k in np.flatnonzero((result.reason[t, columns] & ~int(Reason.FAULT_EXCLUDED)) == 0):
-        c = columns[k]
-        done = f"moved it {one.share[t, k] * error[k]:+.1f}" if result.reason[t, c] == 0 else "excluded"
-        words.append(
-            f"{result.satellite[c]} {error[k]:+.1f} ({one.outside[t, k]:.1f} sigma) "
-            f"el {result.elevation_deg[t, c]:.0f} az {result.azimuth_deg[t, c]:.0f} "
-            f"cn0 {result.cn0_dbhz[t, c]:.0f} {done}"
-        )
-    return "; ".join(words)
 
 
 # ---- tables -------------------------------------------------------------------------------------------------
@@ -473,25 +334,6 @@ def table(groups: list[Group]) -> list[str]:
     return rows
 
 
-def diagrams(groups: list[Group]) -> list[str]:
-    """Stanford's regions at every alarm limit, by levels alone."""
-    rows = [
-        f"{'':40s}" + "".join(f"  alarm limit {limit:.0f} m{'':15s}" for limit in ALARM_LIMITS_M),
-        f"{'recording':14s} {'error model':25s}" + "  nominal  mis haz unavail u+m  -" * len(ALARM_LIMITS_M),
-    ]
-    for group in groups:
-        words = [_name(group)]
-        for limit in ALARM_LIMITS_M:
-            c = sum((Counter(one.diagram(limit, one.level_m).counts) for one in group), Counter())
-            words.append(
-                f"  {c[Region.NOMINAL]:6d} {c[Region.MISLEADING]:4d} {c[Region.HAZARDOUS]:3d} "
-                f"{c[Region.UNAVAILABLE]:7d} {c[Region.UNAVAILABLE_MISLEADING]:3d} "
-                f"{c[Region.NO_POSITION] + c[Region.UNJUDGED]:2d}"
-            )
-        rows.append(" ".join(words))
-    return rows
-
-
 def availabilities(groups: list[Group]) -> list[str]:
     """Availability and continuity by levels alone, and by the pipeline's verdict."""
     rows = [
@@ -513,75 +355,10 @@ def availabilities(groups: list[Group]) -> list[str]:
     return rows
 
 
-def by_status(groups: list[Group]) -> list[str]:
-    """Epochs whose error is over the level, by the status of the position."""
-    rows = [f"{'recording':14s} {'error model':25s} status: over / epochs with level and error"]
-    for group in groups:
-        level, error, status = (_joined(group, name) for name in ("level_m", "error_m", "status"))
-        both = np.isfinite(level) & np.isfinite(error)
-        over = both & (np.abs(error) > level)
-        words = [
-            f"{Status(s).text} {np.count_nonzero(over & (status == s))} / {np.count_nonzero(both & (status == s))}"
-            for s in np.unique(status[both])
-        ]
-        rows.append(f"{_name(group)} {', '.join(words)}")
-    return rows
-
-
-def reasons(groups: list[Group]) -> list[str]:
-    """Every epoch over its level: parts, satellites used with their true errors, and why."""
-    rows = []
-    for group in groups:
-        for over in (over for one in group for over in over_level(one)):
-            free, first, second = over.parts_m
-            rows.append(
-                f"{_name(group)} {str(over.time)[:21]} error {over.error_m:+.1f} level {over.level_m:.1f} "
-                f"(no fault {free:.1f}, one {first:.1f}, two {second:.1f}) {over.status}, {over.used} used, "
-                f"by the ranges {over.explained_m:+.1f}: {over.why}"
-            )
-            rows.append(f"    {over.where}")
-            rows += [f"    {words}" for words in over.ranges.split("; ")]
-    return rows or ["no error is over its level"]
-
-
-def held_by_hypotheses(groups: list[Group]) -> list[str]:
-    """Epochs that K sigma without fault hypotheses would not have bounded, by what was wrong."""
-    rows = [f"{'recording':14s} {'error model':25s} errors over K sigma without hypotheses, by what was wrong"]
-    for group in groups:
-        counts: Counter[str] = Counter()
-        for one in group:
-            found = over_level(one, one.result.protection.level.fault_free_m)
-            counts.update(over.why.replace(f" of {over.used}", "") for over in found)
-        if counts:
-            rows.append(f"{_name(group)} {'; '.join(f'{number} x {why}' for why, number in counts.most_common())}")
-    return rows
-
-
-def constant_parts(groups: list[Group]) -> list[str]:
-    """What one shift of all positions, the same the whole time, explains of the errors along the line."""
-    rows = [
-        f"{'recording':14s} {'error model':25s} shift east north [m]  rms of errors, left without it [m]  scale 50 %"
-    ]
-    for group in groups:
-        if len(group) > 1 or group[0].model != "none":
-            continue
-        (one,) = group
-        at = np.flatnonzero(np.isfinite(one.error_m) & (np.abs(one.error_m) < 50.0))
-        latitude, longitude, _ = geodetic_from_ecef(one.place_ecef_m[at[0]])
-        level = one.trajectory.tangent[one.result.fix.constrained.section[at]] @ enu_axes(latitude, longitude)[:2].T
-        shift, *_ = np.linalg.lstsq(level, one.error_m[at], rcond=None)
-        left = one.error_m[at] - level @ shift
-        rows.append(
-            f"{_name(group)} {shift[0]:10.2f} {shift[1]:5.2f} {np.sqrt(np.mean(one.error_m[at] ** 2)):15.2f} "
-            f"{np.sqrt(np.mean(left**2)):10.2f} {np.median(one.result.noise_scale[at]):18.2f}"
-        )
-    return rows
-
-
 def total(groups: list[Group]) -> list[str]:
     """All of them together."""
     both = [np.isfinite(one.level_m) & np.isfinite(one.error_m) for group in groups for one in group]
-    over = sum(len(over_level(one)) for group in groups for one in group)
+    over = sum(one.over for group in groups for one in group)
     return [f"{sum(int(b.sum()) for b in both)} levels with an error, {over} of them passed by it"]
 
 
@@ -639,7 +416,7 @@ def main() -> int:
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
     found = everything(data, options.folder, options.only)
-    for part in (table, total, constant_parts, availabilities, diagrams, by_status, held_by_hypotheses, reasons):
+    for part in (table, total, availabilities):
         print("\n".join(part(found)), end="\n\n")
     return 0
 

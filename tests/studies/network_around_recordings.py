@@ -28,7 +28,6 @@ import paths
 import recordings_truth
 from network_around import SHAPES, Shape, made, network_around, write_network
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
 from railfix.io import PositionLog, read_navigation, read_observations
 from railfix.pipeline.channel_book import ChannelBook
@@ -63,9 +62,6 @@ def recordings() -> dict[str, Recording]:
         folder / name
         for name in ("urbannav_tst", "gsdc_pixel5_a", "japan_mosaic_2021265_with_GEONET3034", "smartloc_berlin_rinex")
     )
-    lines = (berlin / "Berlin_Potsdamer_Platz_RTK_GT.txt").read_text(encoding="ascii").splitlines()
-    rows = np.array([line.split()[1:5] for line in lines], dtype=np.float64)
-    start = np.datetime64("2016-06-06T11:10:41.7", "ns")
     between = recordings_truth.urbannav_truth(paths.DATA)
     nav = (towers / "hksc137c.nav",)
     return {
@@ -88,7 +84,7 @@ def recordings() -> dict[str, Recording]:
         "Berlin": Recording(
             observations=berlin / "Berlin_Potsdamer_Platz.obs.gz",
             navigation=(berlin / "brdc1580.16n.gz", berlin / "brdc1580.16g.gz"),
-            truth=(start + timedelta(rows[:, 0] - rows[0, 0]), rows[:, 1:]),
+            truth=recordings_truth.smartloc_rinex_truth(berlin),
         ),
     }
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -46,7 +45,7 @@ from p1_rtklib import ABSENT, PROGRAM
 from p1_static import static_report
 from p1_test_line import PICTURE, SERVICE, figure_8, line_report
 from railfix.core.arrays import Masks
-from railfix.core.reasons import CHECK_FAILED, Status
+from railfix.core.reasons import Status
 from railfix.simulate import Scenario
 from railfix.simulate.scenario_file import load_recipe
 
@@ -62,8 +61,6 @@ WRONG_PLACE_M: Final = 50.0
 WITHOUT_TUNNELS_M: Final = ((0.0, 20_300.0), (28_800.0, 40_000.0))
 #: Seeds of lines and places besides the shipped ones, and the run of the scenario (hour, direction) on each.
 OTHER_RUNS: Final = ((11, 0), (12, 2), (13, 3), (14, 1), (15, 0))
-#: Limits of the own sigma that are tried besides 20 m and 10 m.
-LIMITS_M: Final = (20.0, 15.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 #: P1's systems, and with Galileo.
 SYSTEMS: Final = ("G", "GJ", "GJE")
 
@@ -95,7 +92,6 @@ FILTER_SYSTEMS: Final = ("GJ", "GJE")
 CORRECTED_WAYS: Final = tuple(
     replace(way, name=f"{way.name}{word}", sbas=sbas) for way in WAYS for word, sbas in (("", False), (", SBAS", True))
 )
-_NONE: Final = (Status.TOO_FEW_SATELLITES, Status.UNOBSERVABLE, Status.NO_CONVERGENCE, Status.NO_OBSERVATION)
 #: Large errors this near in time are one line of the list [epochs].
 BURST_EPOCHS: Final = 50
 #: Length of the short part [s].
@@ -156,53 +152,6 @@ def main_table(campaign: Campaign, where: Callable[[Passage], Masks]) -> Iterato
         yield row(name, campaign.passages, campaign.found[letters, way], yardstick, where)
 
 
-def thresholds_table(campaign: Campaign) -> Iterator[str]:
-    """What other limits of the own sigma (`Config.largest_sigma_m`) would have made of "default, drop"."""
-    yield "systems limit of own sigma [m]: points lost / largest error [m] / errors over 10 m"
-    for letters in SYSTEMS:
-        base = np.concatenate([np.isfinite(f.error_m) for f in campaign.found[letters, YARDSTICK.name]])
-        found = campaign.found[letters, "default, drop"]
-        error, own = (np.concatenate([getattr(f, name) for f in found]) for name in ("error_m", "own_sigma_m"))
-        observed = sum(np.count_nonzero(p.observed) for p in campaign.passages)
-        cells = []
-        for limit in LIMITS_M:
-            size = np.abs(error[np.isfinite(error) & (own <= limit)])
-            lost = 100.0 * (np.count_nonzero(base) - len(size)) / observed
-            cells.append(f"{limit:g}: {lost:+.2f} / {size.max():.1f} / {np.count_nonzero(size > GOAL_M)}")
-        yield f"{'+'.join(letters):7s} " + "   ".join(cells)
-
-
-def lost_table(campaign: Campaign) -> Iterator[str]:
-    """Why positions are lost that the yardstick has, and where, in points of the positioning rate."""
-    yield "points lost against the conventional"
-    observed = sum(np.count_nonzero(p.observed) for p in campaign.passages)
-    for letters in SYSTEMS:
-        for way in ("p1", "strict"):
-            why: Counter[str] = Counter()
-            where: Counter[str] = Counter()
-            gained = standing = 0
-            yardstick = campaign.found[letters, YARDSTICK.name]
-            for passage, base, found in zip(campaign.passages, yardstick, campaign.found[letters, way], strict=True):
-                had, has = np.isfinite(base.error_m), np.isfinite(found.error_m)
-                lost = had & ~has
-                gained += np.count_nonzero(has & ~had)
-                standing += np.count_nonzero(lost & (passage.speed_mps < 0.3))
-                failed = np.isin(found.status, [*CHECK_FAILED, *_NONE])
-                words = [s.text for s in Status]
-                why.update(
-                    words[s] if f else "uncertain" for s, f in zip(found.status[lost], failed[lost], strict=True)
-                )
-                where.update(passage.environment[lost].tolist())
-            cells = [
-                ", ".join(f"{name} {100 * n / observed:.2f}" for name, n in counts.most_common(4))
-                for counts in (why, where)
-            ]
-            yield (
-                f"{'+'.join(letters):7s} {way:7s}{cells[0]}; gained {100 * gained / observed:.2f}\n"
-                f"{'':15s}{cells[1]}; standing {100 * standing / observed:.2f}"
-            )
-
-
 def goal_table(campaign: Campaign) -> Iterator[str]:
     """Points of the rate lost and largest error, run by run, and whether that is the goal."""
     runs = list(dict.fromkeys(p.run for p in campaign.passages))
@@ -223,18 +172,6 @@ def goal_table(campaign: Campaign) -> Iterator[str]:
                 cells.append(f"{lost:+.2f} / {size.max():.1f} {goal}")
             yield f"{'+'.join(letters):6s}{name:21s}" + "".join(f"{cell:>18s}" for cell in cells)
     yield f"* the goal: under {GOAL_M:g} m, at most {GOAL_POINTS:.1f} points lost"
-
-
-def ranges_table(campaign: Campaign) -> Iterator[str]:
-    """Figure 11: range of the errors of each run, both antennas."""
-    runs = list(dict.fromkeys(p.run for p in campaign.passages))
-    yield f"{'lowest .. highest error [m]':27s}" + "".join(f"{run:>21s}" for run in runs)
-    for (letters, way), found in campaign.found.items():
-        cells = []
-        for run in runs:
-            error = np.concatenate([f.error_m for p, f in zip(campaign.passages, found, strict=True) if p.run == run])
-            cells.append(f"{np.nanmin(error):9.1f} ..{np.nanmax(error):+9.1f}")
-        yield f"{'+'.join(letters):7s} {way:19s}" + "".join(f"{cell:>21s}" for cell in cells)
 
 
 def extent(campaign: Campaign) -> str:
@@ -292,15 +229,7 @@ def commercial_report(campaign: Campaign) -> Iterator[str]:
     yield "\nways without tunnels"
     yield from main_table(campaign, without_tunnels)
     yield ""
-    yield from ranges_table(campaign)
-    yield ""
     yield from goal_table(campaign)
-    yield ""
-    yield from thresholds_table(campaign)
-    yield ""
-    yield from lost_table(campaign)
-    yield ""
-    yield from classes_table(campaign)
     yield ""
     yield from breaking_lines(campaign, "strict")
 
@@ -368,22 +297,10 @@ def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
             yield (
                 f"{passage.run} {passage.antenna:5s} {str(passage.time[t])[11:21]} {passage.chainage_m[t]:6.0f} m "
                 f"{passage.environment[t]:9s} {passage.speed_mps[t]:4.1f} m/s {item.error_m:+7.1f} m "
-                f"{Status(int(found.status[t])).text} own {found.epoch_sigma_m[t]:.1f} m dilution {item.dilution:.1f} "
+                f"{Status(int(found.status[t])).text} own {found.own_sigma_m[t]:.1f} m dilution {item.dilution:.1f} "
                 f"late {item.late} of {found.n_used[t]}: {item.signals}"
                 + (f" (largest of {together_in_time})" if together_in_time > 1 else "")
             )
-
-
-def classes_table(campaign: Campaign) -> Iterator[str]:
-    """How many large errors have how many late codes among those used."""
-    yield "10 m and more                    all  no late code  one late  more late  largest dilution of 'no late'"
-    for (letters, way), items in campaign.breaking.items():
-        late = np.array([i.late for i in items])
-        quiet = [i.dilution for i in items if i.late == 0]
-        yield (
-            f"{'+'.join(letters):7s} {way:19s} {len(items):9d} {np.count_nonzero(late == 0):13d} "
-            f"{np.count_nonzero(late == 1):9d} {np.count_nonzero(late > 1):18d} {max(quiet, default=np.nan):12.1f}"
-        )
 
 
 def report(part: str, folder: Path) -> Iterator[str]:

@@ -192,17 +192,12 @@ def smartloc_ranges(folder: Path) -> SmartlocLog:
     )
 
 
-#: Movement along the line that is added to positions, from their ranges, arcs, sections, and noise scales.
-Movement = Callable[[Ranges, Trajectory, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-
-
 def smartloc_chain(
     time: np.ndarray,
     ranges: Ranges,
     trajectory: Trajectory,
     start_ecef_m: np.ndarray,
     config: Config,
-    movement: Movement | None = None,
 ) -> np.ndarray:
     """The rooms in the order of the pipeline, on ranges that have no ephemerides; arcs, NaN where dropped."""
     index = SearchIndex(trajectory)
@@ -233,12 +228,10 @@ def smartloc_chain(
     redundancy = ranges.n_used - ranges.n_clocks - 1
     failed |= epoch_sigma_m(redundancy, got.wsse, got.exact_map_sigma_m, scale) > config.largest_sigma_m
     arc = np.where(got.dilution <= config.dilution_limit, got.arc_m, np.nan)
-    if movement is not None:
-        arc = arc + movement(ranges, trajectory, got.arc_m, got.section, scale)
     return np.where(failed & (config.failed_checks == "drop"), np.nan, arc)
 
 
-def smartloc(data: Path, config: Config = SETTINGS, movement: Movement | None = None) -> Outcome:
+def smartloc(data: Path, config: Config = SETTINGS) -> Outcome:
     """No RINEX: ranges, satellites, elevations and C/N0 go straight into the array functions."""
     log = smartloc_ranges(data / "kinematic" / "smartloc_berlin")
     time, ecef = recordings_truth.smartloc_truth(data / "kinematic" / "smartloc_berlin")
@@ -257,7 +250,7 @@ def smartloc(data: Path, config: Config = SETTINGS, movement: Movement | None = 
     clocks = tuple(CLOCK_GROUP[str(log.satellite[group.start])[0]] for group in ranges.groups)
     ties, _ = tie_clocks(log.time, clocks, "G", ranges, point, [OffsetState()], limits=config.clock_offsets)
     ranges = replace(ranges, ties=ties)
-    arc = smartloc_chain(log.time, ranges, trajectory, point.ecef_m, config, movement)
+    arc = smartloc_chain(log.time, ranges, trajectory, point.ecef_m, config)
     reference = interpolate_reference(log.time, time, ecef)
     observed = np.isfinite(reference[:, 0]) & np.isfinite(log.code_m).any(axis=1)
     nearest, _ = trajectory.nearest(point.ecef_m)

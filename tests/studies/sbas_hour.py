@@ -1,16 +1,15 @@
 """Protection levels along a line over Japan for an hour of MSAS messages: geometry alone, no receiver.
 
-``python tests/studies/sbas_hour.py [FOLDER]`` with the recordings beside the checkout prints the tables of
-``docs/level-results.md``, and writes a picture of each line to the folder. The lines are great circles with a
-point a kilometre; every ten seconds each satellite of the navigation file that MSAS corrects (issues of data
-matched) gives a range of its own sigma, and the level is that of a train at the point.
+``python tests/studies/sbas_hour.py`` with the recordings beside the checkout prints the tables of
+``docs/level-results.md``. The lines are great circles with a point a kilometre; every ten seconds each satellite of
+the navigation file that MSAS corrects (issues of data matched) gives a range of its own sigma, and the level is that
+of a train at the point.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -193,7 +192,7 @@ def _at_point(
     )
 
 
-# ---- tables and picture -------------------------------------------------------------------------------------
+# ---- tables -----------------------------------------------------------------------------------------------
 
 
 def warm(above: Sky) -> np.ndarray:
@@ -236,51 +235,9 @@ def parts_row(one: Levels, late: np.ndarray) -> str:
     return f"{one.local:18s} {one.mask_deg:4.0f}  {words[0]}    {words[1]}"
 
 
-def states_text(above: Sky, line: Trajectory, late: np.ndarray) -> str:
-    """Satellites above 5 degrees at the middle of the line, by what MSAS says of them and of the grid."""
-    place = np.broadcast_to(line.ecef_m[len(line.ecef_m) // 2], (len(above.time), 3))
-    elevation, azimuth = elevation_azimuth(above.position_ecef_m, place)
-    up = (elevation >= MASKS_DEG[0]) & late[:, None]
-    latitude, longitude, _ = geodetic_from_ecef(place)
-    grid = above.engine.ionosphere(above.time, latitude, longitude, elevation, azimuth).state
-    said = [f"{SatelliteState(s).name} {n}" for s, n in Counter(above.fixes.state[up].tolist()).most_common()]
-    of_grid = [f"{IonosphereState(s).name} {n}" for s, n in Counter(grid[up & above.good].tolist()).most_common()]
-    return f"{', '.join(said)}; grid where they are corrected: {', '.join(of_grid)}"
-
-
-def picture(found: list[Levels], above: Sky, line: Trajectory, path: Path) -> Path:
-    """Levels over time (median and 5 to 95 % of the line) and along the line (of the time)."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (over_time, along) = plt.subplots(2, 1, figsize=(10, 8), constrained_layout=True)
-    minute = (above.time - above.time[0]) / np.timedelta64(60, "s")
-    chainage = np.linspace(0.0, line.arc_m[-1] / 1000.0, found[0].level_m.shape[0])
-    for one in found:
-        value = np.where(np.isfinite(one.level_m), one.level_m, np.nan)
-        late, some = value[:, warm(above)], np.isfinite(value).any(axis=0)
-        for axis, x, low, middle, high in (
-            (over_time, minute[some], *np.nanpercentile(value[:, some], (5, 50, 95), axis=0)),
-            (along, chainage, *np.nanpercentile(late, (5, 50, 95), axis=1)),
-        ):
-            (drawn,) = axis.plot(x, middle, label=f"mask {one.mask_deg:.0f} deg")
-            axis.fill_between(x, low, high, color=drawn.get_color(), alpha=0.2, linewidth=0)
-    for axis, label in ((over_time, "minute of the log"), (along, "km along the line")):
-        for limit in ALARM_LIMITS_M:
-            axis.axhline(limit, color="black", linewidth=0.6, linestyle=":")
-        axis.set(ylim=(0.0, None), xlabel=label, ylabel="protection level along the line [m]")
-    over_time.legend()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
-
-
 def main() -> int:
-    """Print the tables, draw the picture."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", help="for the picture")
     parser.add_argument("--model", type=Path, help="error model of local errors, as well")
     parser.add_argument("--spacing-km", type=float, default=1.0)
     options = parser.parse_args()
@@ -298,7 +255,6 @@ def main() -> int:
         line = great_circle(*ends, spacing_m=1000.0 * options.spacing_km)
         found = levels(above, line, local)
         print(f"\n{name}: {len(line.ecef_m)} points on {line.arc_m[-1] / 1000.0:.0f} km, {late.sum()} epochs")
-        print(f"satellites above 5 deg in the middle: {states_text(above, line, late)}")
         print("\n".join(HEAD))
         print("\n".join(row(one, late) for one in found))
         print("variance of the position, %: flt, ionosphere, troposphere, local, map; satellites used")
@@ -308,9 +264,6 @@ def main() -> int:
         print(
             f"first level {(above.time[begin] - above.time[0]) / np.timedelta64(1, 's'):.0f} s after the first message"
         )
-        if options.folder:
-            of_noise = [one for one in found if one.local == "noise settings"]
-            print(f"wrote {picture(of_noise, above, line, options.folder / f'{name.split()[0].lower()}.png')}")
     return 0
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from plain_kernels import given, kernel_state, plain
-from posterior_score import bounds
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.kernels.tracking.constants import BRANCH_FLOOR, CODE_COMMON_M, MAP_BRANCH_M
 from railfix.track import Track
@@ -52,7 +52,7 @@ def test_laps_within_the_error_of_the_map_are_not_told_apart_with_certainty() ->
         stated.append(float(found.probability[-1]))
         right.append(bool(abs(found.arc_m[-1] - case.arc_m[-1]) < 0.25 * LAP_M))
     stated_of, right_of = np.array(stated), np.array(right)
-    low, high = bounds(int(right_of.sum()), len(right_of), risk=1e-3)
+    low, high = binomtest(int(right_of.sum()), len(right_of)).proportion_ci(0.999, method="exact")
     assert low <= stated_of.mean() <= high
     sure = stated_of > 0.99
     assert not (sure & ~right_of).any()

@@ -36,7 +36,7 @@ class MapOffsetLimits(Settings):
     least_samples: float = Field(default=3.0, gt=0)  #: Independent samples required before a decision: one minute.
     #: Probability that noise alone passes the test: of the note, of the status (chi-square, two degrees of freedom).
     #: The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic stays
-    #: below the threshold of the status, 13.8 (``tests/studies/integrity_tables.py``).
+    #: below the threshold of the status, 13.8 (``tests/references/results/bounds.txt``).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
     risk: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing an offset of the smallest detectable size.

@@ -73,7 +73,7 @@ CAUSES: Final = tuple(cause for cause in Sign if cause)  #: Causes in the order 
 class InterferenceLimits(Settings):
     """Limits of the signs of interference.
 
-    On the recordings no sign occurs; their largest statistics are printed by ``tests/studies/interference_trials.py``.
+    On the recordings no sign occurs; their largest statistics are in ``tests/references/results/interference.txt``.
     """
 
     use: Literal["on", "off"] = "on"

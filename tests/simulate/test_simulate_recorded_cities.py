@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from urban_comparison import VALIDATION_SEEDS, Sample, city, cn0_by_elevation, figures, simulated, weighted_median
-from urban_comparison import recordings as recorded_cities
+from city_samples import VALIDATION_SEEDS, Sample, city, cn0_by_elevation, figures, simulated, weighted_median
+from city_samples import recordings as recorded_cities
 
 pytestmark = pytest.mark.requirement("D4")
 

@@ -1,37 +1,19 @@
-"""What carrier phase buys: codes alone, Hatch-smoothed codes, float ambiguities; one setting for all.
-
-Run ``python tests/studies/carrier_score.py`` (or with a part of a log's name); ``python tests/studies/carrier_score.py
-slips`` measures the detection of slips put into the logs. Recordings are taken where they are beside the checkout.
-"""
+"""Positions of a log by codes alone, Hatch-smoothed codes and float ambiguities; slips put into a log."""
 
 from __future__ import annotations
 
-import sys
-import time as clock
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import polars as pl
 
-import paths
-import recordings_score
-import recordings_truth
+from level_cases import Case
 from phase_run import phase_run
-from pipeline_cases import clean_files
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.evaluate import along_track_error, interpolate_reference, score
-from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
-from railfix.io import read_navigation, read_observations
-from railfix.pipeline.config import Config, parse_config
+from railfix.evaluate import along_track_error
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.carrier import (
-    PhaseLimits,
     PhasePositions,
     Phases,
-    SlipReason,
     Slips,
     TrackedPhases,
     TrackJumps,
@@ -46,26 +28,10 @@ from railfix.positioning.normal_equations import position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, Ranges
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor_setup import make_processor
-from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
-from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-SETTINGS = parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}})
 #: Phase noise at the zenith [m]: tracking, multipath, delays that the models miss.
 PHASE_SIGMA_M = 0.01
-
-
-@dataclass(frozen=True)
-class Case:
-    """One log with its reference."""
-
-    name: str
-    observations: Observations
-    navigation: Navigation
-    trajectory: Trajectory
-    reference_ecef_m: np.ndarray
-    config: Config = SETTINGS
 
 
 @dataclass(frozen=True)
@@ -81,7 +47,6 @@ class Carried:
     hatch_arc_m: np.ndarray
     live: PhasePositions
     whole: PhasePositions
-    live_s: float
 
     def errors(self) -> dict[str, np.ndarray]:
         """Signed errors along the line of each form [m]."""
@@ -145,11 +110,10 @@ def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) 
     return phase, jumps
 
 
-def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
+def carried(case: Case) -> Carried:
     """All forms on one log, as a pipeline would call them."""
     obs = case.observations
-    processor = make_processor(case.config, case.navigation, {"front": case.trajectory})
-    result = processor.process({"front": obs})[0].antennas["front"]
+    result = case.solved()
     columns = result.columns
     names = obs.satellite[columns], obs.signal[columns]
     slips, _ = find_slips(obs)
@@ -160,7 +124,6 @@ def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     # The weights stay: what the floor and multipath leave is not averaged as white noise is.
     hatch = ranges_of(result, corrected, weight)
 
-    begin = clock.perf_counter()
     phase, jumps = on_track(case, result, slips, code_ranges.weight > 0)
     has = np.isfinite(slips.phase_m[:, columns])
     arcs, _ = number_arcs(slips.slip[:, columns] | jumps.jump, has, *names)
@@ -170,8 +133,7 @@ def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
         weight=np.where(np.isfinite(phase), (sine / PHASE_SIGMA_M) ** 2, 0.0),
         arc_id=arcs,
     )
-    live, _ = phase_positions(obs.time, code_ranges, phases, case.trajectory, result.arc_m, limits=limits)
-    took = clock.perf_counter() - begin
+    live, _ = phase_positions(obs.time, code_ranges, phases, case.trajectory, result.arc_m)
     return Carried(
         case=case,
         result=result,
@@ -182,7 +144,6 @@ def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
         hatch_arc_m=solved_on_line(hatch, case, result),
         live=live,
         whole=in_runs(obs.time, code_ranges, phases, case.trajectory, result.arc_m),
-        live_s=took,
     )
 
 
@@ -199,82 +160,10 @@ def in_runs(
     return replace(pieces[-1], **joined)
 
 
-def clean() -> list[Case]:
-    files = clean_files()
-    track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
-    truth = pl.read_csv(files["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
-    cases = []
-    for name in ("front", "rear"):
-        rows = truth.filter(pl.col("antenna") == name)
-        cases.append(
-            Case(
-                f"clean run {name}",
-                read_observations(files[name]),
-                read_navigation(files["nav"]),
-                antenna_trajectory(track, vehicle, name),
-                rows.select("x_m", "y_m", "z_m").to_numpy(),
-            )
-        )
-    return cases
-
-
-def recorded(name: str, observations: Path, navigation: Path, truth: tuple[np.ndarray, np.ndarray]) -> Case:
-    obs = read_observations(observations)
-    reference = interpolate_reference(obs.time, *truth)
-    return Case(name, obs, read_navigation([navigation]), recordings_score.trajectory_of(*truth), reference)
-
-
-def geonet(data: Path, station: str, azimuth_deg: float) -> Case:
-    folder = data / "static" / "rtklib_geonet2005"
-    obs = read_observations(folder / f"{station}0920.05o")
-    place = obs.header.approximate_ecef_m
-    line = recordings_score.straight_line(place, azimuth_deg)
-    reference = np.broadcast_to(place, (len(obs), 3))
-    return Case(
-        f"geonet {station} {azimuth_deg:.0f}", obs, read_navigation([folder / f"{station}0920.05n"]), line, reference
-    )
-
-
-def recordings(data: Path) -> list[Case]:
-    urban, phone = data / "kinematic" / "urbannav_tst", data / "kinematic" / "gsdc_pixel5_a"
-    japan = data / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
-    town = recordings_truth.urbannav_truth(urban)
-    log = "20210517.light-urban.tste.ublox"
-    cases = [
-        recorded("japan_mosaic", japan / "SEPT265G.21O", japan / "SEPT2650.21P", recordings_truth.japan_truth(japan)),
-        recorded("urbannav F9P", urban / f"{log}.f9p.obs", urban / "hksc137c.nav", town),
-        recorded("urbannav M8T", urban / f"{log}.m8t.GC.obs", urban / "hksc137c.nav", town),
-        recorded("gsdc_pixel5_a", phone / "Pixel5_a.21o", phone / "hour1180.21n", recordings_truth.gsdc_truth(phone)),
-    ]
-    return cases + [geonet(data, s, a) for s in ("0759", "3040") for a in (0.0, 45.0, 90.0, 135.0)]
-
-
-def scaled(found: PhasePositions, noise_scale: np.ndarray) -> np.ndarray:
-    """Sigma along the line with the receiver's noise scale."""
-    noise = found.noise_sigma_m
-    return np.sqrt((noise_scale * noise) ** 2 + (found.sigma_m**2 - noise**2))
-
-
-def slip_line(found: Carried) -> str:
-    """What ended arcs, of all phases used."""
-    columns = found.result.columns
-    used = found.code_ranges.weight > 0
-    has = used & np.isfinite(found.slips.phase_m[:, columns])
-    reason = found.slips.reason[:, columns]
-    counts = {
-        bit.name.lower(): int(np.count_nonzero(has & ((reason & bit) > 0))) for bit in SlipReason if bit.value > 1
-    }
-    counts["on track"] = int(np.count_nonzero(found.jumps.jump))
-    text = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
-    return f"    phases at {100 * has.sum() / max(used.sum(), 1):.0f} % of the codes; restarted: {text}"
-
-
 @dataclass(frozen=True)
 class Detection:
     """Slips put into a log: how many were found by the first test, by either, and what was flagged without any."""
 
-    cycles: int
-    injected: int
     by_receiver_tests: float
     by_either: float
 
@@ -311,56 +200,5 @@ def detections(found: Carried, sizes: tuple[int, ...] = (1, 2, 10, 1000), *, cou
         _, jumps = on_track(slipped, result, slips, found.code_ranges.weight > 0)
         first = slips.slip[:, result.columns][at, channel]
         either = first | jumps.jump[at, channel]
-        outcome.append(Detection(size, len(at), float(first.mean()), float(either.mean())))
+        outcome.append(Detection(float(first.mean()), float(either.mean())))
     return outcome
-
-
-def slip_table(cases: list[Case]) -> None:
-    """Detection rates of injected slips, and what the tests flag on the logs as they are."""
-    print(
-        f"{'log':18s} {'judged':>7s} {'flagged %':>9s} {'on track %':>10s}  found % of slips by 1, 2, 10, 1000 cycles"
-    )
-    for case in cases:
-        found = carried(case)
-        columns = found.result.columns
-        has = (found.code_ranges.weight > 0) & np.isfinite(found.slips.phase_m[:, columns])
-        reason = found.slips.reason[:, columns]
-        tests = int(SlipReason.DOPPLER | SlipReason.CODE)
-        judged = has & ((reason & ~tests) == 0)
-        flagged, jumped = judged & (reason != 0), judged & found.jumps.jump
-        rates = " ".join(f"{100 * d.by_receiver_tests:4.0f}/{100 * d.by_either:<4.0f}" for d in detections(found))
-        total = max(int(judged.sum()), 1)
-        print(
-            f"{case.name:18s} {total:7d} {100 * flagged.sum() / total:9.3f} {100 * jumped.sum() / total:10.3f}  {rates}"
-        )
-
-
-def main(only: Callable[[str], bool] = lambda _: True) -> int:
-    data = paths.DATA
-    cases = clean() + (recordings(data) if data.is_dir() else [])
-    if sys.argv[1:2] == ["slips"]:
-        slip_table([c for c in cases if c.name.startswith(("clean run front", "japan", "urban", "gsdc"))])
-        return 0
-    names = ("n", "mean m", "std m", "p50 m", "p95 m", "max m")
-    print(f"{'log':18s} {'form':6s} {names[0]:>5s} " + " ".join(f"{n:>7s}" for n in names[1:]) + "  error/sigma")
-    for case in cases:
-        if not only(case.name):
-            continue
-        found = carried(case)
-        errors = found.errors()
-        both = np.all([np.isfinite(e) for e in errors.values()], axis=0)
-        sigmas = {"code": found.result.along_sigma_m}
-        sigmas |= {n: scaled(p, found.result.noise_scale) for n, p in (("live", found.live), ("runs", found.whole))}
-        for name, error in errors.items():
-            s = score(error, both)
-            ratio = np.sqrt(np.mean((error[both] / sigmas[name][both]) ** 2)) if name in sigmas else np.nan
-            print(
-                f"{case.name:18s} {name:6s} {s.positions:5d} {s.mean_m:7.2f} {s.std_m:7.3f} {s.p50_m:7.3f} "
-                f"{s.p95_m:7.3f} {s.max_m:7.2f}  {ratio:6.2f}"
-            )
-        print(slip_line(found) + f"; live form {1e6 * found.live_s / len(case.observations):.0f} us an epoch")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(lambda name: not sys.argv[1:] or any(word in name for word in sys.argv[1:])))
