@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import cbor2
 import pytest
 
+from attacked_line import AttackedLine, run_sequence
+from changed_line import ChangedLine
 from disturbed_traffic import Conditions, traffic
 from ground_rules import take_out
 from network_made import made_network
@@ -35,7 +37,7 @@ from railfix.ground.state import (
     stop_trains,
     to_documents,
 )
-from railfix.ground.stops import CLOSED, close_section, open_section, release_train
+from railfix.ground.stops import CLOSED, close_section, open_section, overlaps_stopped, release_train
 from railfix.ground.supervision import Supervision
 from railfix.ground.traffic import line_with_loops
 from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
@@ -366,6 +368,46 @@ def test_trains_nearby_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any(train.stop is None and train.end_m > 0.0 for train in nearby[-1].trains.values())
     monkeypatch.setattr(NearbyTrains, "between", lambda _self, state, _low, _high: iter(state.trains.values()))
     assert course() == nearby
+
+
+@pytest.mark.parametrize("kind", [AttackedLine, ChangedLine])
+def test_trains_that_are_as_before_need_no_second_comparison(
+    kind: type[AttackedLine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each step stops the trains that a comparison of all trains with each other stops, located anew."""
+    stopped = 0
+
+    def compared(state: Interlocking, layout: Layout, **known: Any) -> Interlocking:
+        nonlocal stopped
+        found, anew = overlaps_stopped(state, layout, **known), NearbyTrains(state, layout)
+        assert found == overlaps_stopped(state, layout)
+        for low, high in (station.inner_m for station in layout.stations):
+            assert [*known["nearby"].between(state, low, high)] == [*anew.between(state, low, high)]
+            assert [*known["nearby"].between(state, high + 100.0, high + 101.0)] == [
+                *anew.between(state, high + 100.0, high + 101.0)
+            ]
+        stopped += found is not state
+        return found
+
+    monkeypatch.setattr("railfix.ground.supervision.overlaps_stopped", compared)
+    for seed in range(6):
+        run_sequence(seed, steps=100, kind=kind)
+    assert stopped
+
+
+def test_a_changed_train_is_as_a_replaced_one() -> None:
+    """Whatever changes, computed ends follow, and an unknown name is an error."""
+    train = interval(1, 1, 300.0, 1, 0)
+    assert train.span_m == (190.0, 305.0)
+    other: dict[str, Any] = {"direction": -1, "rear_m": 200.0, "front_m": 400.0, "end_m": 500.0, "stop": "by hand"}
+    for field in fields(TrainInterval):
+        value = {field.name: other.get(field.name)}
+        found, expected = train.changed(**value), replace(train, **value)
+        assert found == expected
+        if value[field.name] is not None:
+            assert (found.interval_m, found.span_m) == (expected.interval_m, expected.span_m)
+    with pytest.raises(TypeError, match="none of ende_m"):
+        train.changed(ende_m=1.0)
 
 
 def neighbours_of_stopped(state: Interlocking) -> set[int]:

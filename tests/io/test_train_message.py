@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 
 import cbor2
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from railfix.core.errors import SettingsError
 from railfix.io.train_message import (
     KEYS,
     LONGEST,
@@ -46,6 +48,23 @@ PLACED = TrainMessage(
     length_cm=4_000,
     complete=True,
 )
+
+
+@pytest.mark.parametrize("name", ["train", "chainage_cm", "direction", "length_cm", "session"])
+@pytest.mark.parametrize("value", [True, False])
+def test_a_truth_value_is_no_number(name: str, value: bool) -> None:
+    with pytest.raises(SettingsError, match=f"{name}: a number was expected"):
+        PLACED.replaced(**{name: value})
+    line = json.dumps({**json.loads(to_json(PLACED)), name: value})
+    with pytest.raises(MessageError, match=f"{name}: a number was expected"):
+        from_json(line)
+
+
+def test_the_bytes_are_canonical() -> None:
+    """Keys rise, and each number has its shortest form (RFC 8949, 4.2.1)."""
+    data = encode(PLACED)
+    assert data == cbor2.dumps(cbor2.loads(data), canonical=True)
+
 
 unsigned = st.integers(0, (1 << 63) - 1)
 signed = st.integers(-(1 << 62), (1 << 62) - 1)

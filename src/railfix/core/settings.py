@@ -6,9 +6,9 @@ import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from railfix.core.errors import SettingsError
 from railfix.core.notebook import html_table
@@ -31,8 +31,8 @@ def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
     return {name: matches[0] for name, matches in close.items() if matches}
 
 
-class Settings(BaseModel):
-    """Base of all settings: frozen, validated on construction, unknown names rejected."""
+class Checked(BaseModel):
+    """Base of settings and messages: frozen, validated on construction, unknown names rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
@@ -67,6 +67,15 @@ class Settings(BaseModel):
         of = f"{len(rows)} of {len(type(self).model_fields)} settings are not the defaults"
         return html_table(rows, caption=f"{type(self).__name__}: {of}")
 
+    def replaced(self, **changes: Any) -> Self:
+        """Return a copy with some settings changed; SettingsError where a value is out of range or a name unknown."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**values, **changes})
+
+
+class Settings(Checked):
+    """Base of all settings, which people write in files and on the command line."""
+
     @field_validator("*", mode="before")
     @classmethod
     def _as_written(cls, value: Any, info: ValidationInfo) -> Any:
@@ -78,17 +87,37 @@ class Settings(BaseModel):
             return value
         kind = cls.model_fields[str(info.field_name)].annotation
         if isinstance(value, bool):
-            parts = (kind, *get_args(kind))
-            if bool not in parts and (int in parts or float in parts):
+            if is_number(kind):
                 raise ValueError("a number was expected")
         elif get_origin(kind) is tuple:
             return (value,) if isinstance(value, Path) else tuple(filter(None, map(str.strip, value.split(","))))
         return value
 
-    def replaced(self, **changes: Any) -> Self:
-        """Return a copy with some settings changed; SettingsError where a value is out of range or a name unknown."""
-        values = {name: getattr(self, name) for name in type(self).model_fields}
-        return type(self)(**{**values, **changes})
+
+class Message(Checked):
+    """Base of messages, which programs exchange by the thousand: one pass over all values instead of one per field."""
+
+    _numbers: ClassVar[frozenset[str]] = frozenset()
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Note the fields that are numbers."""
+        cls._numbers = frozenset(name for name, field in cls.model_fields.items() if is_number(field.annotation))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _truth_for_a_number(cls, values: Any) -> Any:
+        """Reject true and false for a number, which pydantic accepts as 1 and 0."""
+        for name, value in values.items() if isinstance(values, dict) else ():
+            if (value is True or value is False) and name in cls._numbers:
+                raise ValueError(f"{name}: a number was expected")
+        return values
+
+
+def is_number(kind: Any) -> bool:
+    """Return whether the type of a field is a number, or a number or None, and no truth value."""
+    parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
+    return bool not in parts and (int in parts or float in parts)
 
 
 Model = TypeVar("Model", bound=BaseModel)

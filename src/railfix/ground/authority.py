@@ -9,10 +9,9 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field
 
-from railfix.core.errors import needs_extra
-from railfix.core.settings import Settings
+from railfix.core.settings import Message
 from railfix.ground.layout import MOST_PARTS
-from railfix.io.train_message import MessageError, validate_message
+from railfix.io.train_message import MessageError, cbor, validate_message
 
 #: Version of the messages; a receiver rejects others.
 VERSION: Final = 3
@@ -23,7 +22,7 @@ SpeedPart = tuple[Chainage, Chainage, Annotated[int, Field(ge=0, lt=1 << 31)]]
 GradientPart = tuple[Chainage, Annotated[int, Field(ge=-1000, le=1000)]]
 
 
-class Authority(Settings):
+class Authority(Message):
     """One authority message, sent after each report of the train, at a stop, and at least every second."""
 
     kind: ClassVar[int] = 1
@@ -46,10 +45,8 @@ class Authority(Settings):
 
     def encode(self) -> bytes:
         """Return the bytes of the message."""
-        with needs_extra():
-            import cbor2
-
-        return cbor2.dumps([self.kind, VERSION, *self.model_dump().values()], canonical=True)
+        data: bytes = cbor().dumps([self.kind, VERSION, *vars(self).values()])
+        return data
 
     @classmethod
     def decode(cls, data: bytes) -> Authority:
@@ -60,9 +57,7 @@ class Authority(Settings):
         MessageError
             The bytes are not an authority of this version.
         """
-        with needs_extra():
-            import cbor2
-
+        cbor2 = cbor()
         try:
             kind, version, *values = cbor2.loads(data)
         except (cbor2.CBORDecodeError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Floats, freeze_arrays
+from railfix.core.arrays import Floats, copy_with, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
@@ -175,19 +175,21 @@ def report_received(
     """
     if message.train != record.train:
         return record, Rejection.OTHER_TRAIN
-    session = message.session or 0
+    session, sequence, retired, counted_s = message.session or 0, record.sequence, record.retired, record.counted_s
     if session != record.session:
-        if session in record.retired:
+        if session in retired:
             return record, Rejection.EARLIER_START
-        retired = record.retired if record.sequence < 0 else (*record.retired[1 - _RETIRED :], record.session)
-        record = replace(record, session=session, sequence=-1, retired=retired, counted_s=None)
-    if message.sequence <= record.sequence:
+        if sequence >= 0:
+            retired = *retired[1 - _RETIRED :], record.session
+        sequence, counted_s = -1, None
+    if message.sequence <= sequence:
         return record, Rejection.REPEATED
-    if record.counted_s is not None:
-        most = limits.jump + limits.rate * (now_s - record.counted_s)
-        if message.sequence > record.sequence + most:
-            return replace(record, rejected=Rejection.FAR_AHEAD.value), Rejection.FAR_AHEAD
-    record, age_ns = replace(record, sequence=message.sequence, counted_s=now_s), message.sent_ns - message.time_ns
+    if counted_s is not None and message.sequence > sequence + limits.jump + limits.rate * (now_s - counted_s):
+        return replace(record, rejected=Rejection.FAR_AHEAD.value), Rejection.FAR_AHEAD
+    counted: dict[str, Any] = {
+        "session": session, "sequence": message.sequence, "retired": retired, "counted_s": now_s
+    }  # fmt: skip
+    age_ns = message.sent_ns - message.time_ns
     reason = None
     if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING):
         reason = Rejection.NO_PLACE
@@ -197,16 +199,15 @@ def report_received(
         reason = Rejection.NO_FRONT_END
     elif not -limits.clock_s * 1e9 <= age_ns <= limits.age_s * 1e9:
         reason = Rejection.TOO_OLD
-    record = replace(record, rejected=None if reason is None else reason.value)
     if reason is not None:
-        return record, reason
+        return replace(record, **counted, rejected=reason.value), reason
     assert message.chainage_cm is not None
     place, jump = message.chainage_cm / 100.0, record.jump_m
     if record.state in (TrainState.SIMULATED, TrainState.ERROR) and record.shown_m is not None:
         jump = message.facing * (place - record.shown_m)
-    after = replace(
-        record, state=TrainState.TRACKED, message=message, heard_s=now_s, measured_s=now_s - max(age_ns, 0) / 1e9,
-        shown_m=place, jump_m=jump,
+    after = copy_with(
+        record, **counted, rejected=None, state=TrainState.TRACKED, message=message, heard_s=now_s,
+        measured_s=now_s - max(age_ns, 0) / 1e9, shown_m=place, jump_m=jump,
     )  # fmt: skip
     return after, None
 

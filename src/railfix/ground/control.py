@@ -148,7 +148,7 @@ class ControlCentre:
             self.rejected["of another train"] += 1
             return
         trains = self.supervision.state.trains
-        before = self.supervision.records.get(number, TrainRecord(train=number))
+        before = self.supervision.records.get(number) or TrainRecord(train=number)
         reason = self.supervision.report(message, self.clock())
         after = self.supervision.records.get(number, before)
         if after.session != before.session and before.sequence >= 0:
@@ -279,14 +279,18 @@ class ControlCentre:
 
     def _note_routes(self) -> None:
         for number, train in self.supervision.state.trains.items():
-            before, self._routes[number] = self._routes.get(number, train.station), train.station
-            if train.direction * (train.station - before) > 0:
+            if (before := self._routes.get(number)) == train.station:
+                continue
+            self._routes[number] = train.station
+            if before is not None and train.direction * (train.station - before) > 0:
                 station = self.supervision.layout.stations[train.station].name
                 self.log(f"train {number}: route to {station}, track {train.tracks[train.station]}", train=number)
 
     def _pass_time(self, now: float) -> None:
         state, limits = self.supervision.state, self.supervision.centre
         for number, record in self.supervision.records.items():
+            if now - record.heard_s <= limits.lost_s:
+                continue  # it stays as it is
             rests = number in self.stops and state.trains[number].standstill  # it is not shown as running on
             curves = {} if rests else self.curves
             after = time_passed(record, now, curves=curves, authority_m=state.trains[number].end_m, limits=limits)

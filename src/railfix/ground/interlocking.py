@@ -22,24 +22,58 @@ from railfix.ground.state import Interlocking, InterlockingLimits, PointState, T
 class NearbyTrains:
     """Trains by the location of their intervals and routes, with one more route included.
 
-    They are computed once per step, so that the cost of a step grows with the number of trains, not of pairs.
+    The cost of a step grows with the number of trains, not of pairs. `update` locates only the trains again that are
+    elsewhere, or have another route.
     """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
-        self._blocks: dict[int, list[int]] = defaultdict(list)
-        last = len(layout.stations) - 1
+        self._blocks: dict[int, set[int]] = defaultdict(set)
+        self._located: dict[int, tuple[TrainInterval, range]] = {}  #: Records as located, and their blocks.
+        self.update(state)
+
+    def update(self, state: Interlocking) -> None:
+        """Locate the trains of a newer state."""
+        for number in self._located.keys() - state.trains.keys():
+            self._move(range(0), number, self._located.pop(number)[1])
         for number, train in state.trains.items():
-            ahead = layout.stations[min(max(train.station + train.direction, 0), last)]
-            furthest = ahead.end_m if train.direction > 0 else ahead.begin_m
-            low, high = train.span_m
-            for block in layout.blocks_between(min(low, furthest), max(high, furthest)):
-                self._blocks[block].append(number)
+            if (before := self._located.get(number)) is None:
+                known, blocks = train, range(0)
+            elif train is before[0]:
+                continue
+            else:
+                known, blocks = before
+            if before is None or _place(known) != _place(train):
+                self._move(after := self._blocks_of(train), number, blocks)
+                blocks = after
+            self._located[number] = train, blocks
+
+    def _blocks_of(self, train: TrainInterval) -> range:
+        """Return the blocks of a train, to the end of its next route."""
+        last = len(self._layout.stations) - 1
+        ahead = self._layout.stations[min(max(train.station + train.direction, 0), last)]
+        furthest = ahead.end_m if train.direction > 0 else ahead.begin_m
+        low, high = train.span_m
+        return self._layout.blocks_between(min(low, furthest), max(high, furthest))
+
+    def _move(self, blocks: range, number: int, before: range) -> None:
+        """Enter a train in its blocks, and take it out of those that it had before."""
+        if blocks == before:
+            return
+        for block in before:
+            self._blocks[block].discard(number)
+        for block in blocks:
+            self._blocks[block].add(number)
 
     def between(self, state: Interlocking, low_m: float, high_m: float) -> Iterator[TrainInterval]:
-        """Return the trains that may share some chainage with an interval."""
-        numbers = {n: None for block in self._layout.blocks_between(low_m, high_m) for n in self._blocks.get(block, ())}
-        return (state.trains[number] for number in numbers)
+        """Return the trains that may share some chainage with an interval, in the order of their numbers."""
+        numbers = {n for block in self._layout.blocks_between(low_m, high_m) for n in self._blocks.get(block, ())}
+        return (state.trains[number] for number in sorted(numbers))
+
+
+def _place(train: TrainInterval) -> tuple[object, ...]:
+    """Return what the blocks of a train follow from."""
+    return train.span_m, train.station, train.direction
 
 
 def stop_orders(state: Interlocking) -> dict[int, str]:
@@ -152,9 +186,10 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
-    path = layout.pieces(here.front_m, end, {**here.tracks, target: track})
-    if (bar := barred(state, path, layout)) is not None:
-        return f"{bar[0]} is {bar[1]}"
+    if state.bars:
+        path = layout.pieces(here.front_m, end, {**here.tracks, target: track})
+        if (bar := barred(state, path, layout)) is not None:
+            return f"{bar[0]} is {bar[1]}"
     for other in nearby.between(state, layout.stations[section].begin_m, layout.stations[section + 1].end_m):
         if other.train == here.train:
             continue
@@ -182,7 +217,7 @@ def comes_the_other_way(other: TrainInterval, direction: int, section: int, layo
     if other.direction == direction:
         return False
     between = layout.stations[section].end_m, layout.stations[section + 1].begin_m
-    routed = {section, section + 1} <= set(other.tracks) and not other.has_passed(*between)
+    routed = section in other.tracks and section + 1 in other.tracks and not other.has_passed(*between)
     return routed or other.overlaps(*between)
 
 
@@ -203,7 +238,7 @@ def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby
 
 
 def due_commands(
-    state: Interlocking, layout: Layout, stored: Interlocking
+    state: Interlocking, layout: Layout, stored: Interlocking, nearby: NearbyTrains | None = None
 ) -> tuple[Interlocking, dict[PointName, int]]:
     """Return the state after all due commands to points, and these commands: tracks by points.
 
@@ -216,7 +251,7 @@ def due_commands(
     }
     if not due:
         return state, {}
-    nearby, points, given = NearbyTrains(state, layout), dict(state.points), {}
+    nearby, points, given = nearby or NearbyTrains(state, layout), dict(state.points), {}
     for name, point in due.items():
         if point.lies:
             points[name] = replace(point, commanded=True)
@@ -269,7 +304,7 @@ def extend_authorities(
             continue
         end = _limit_m(state, train, layout, nearby, limits=limits)
         if train.direction * (end - train.end_m) > 0.0:
-            after[number] = replace(train, end_m=end)
+            after[number] = train.changed(end_m=end)
     return state
 
 
@@ -286,15 +321,15 @@ def _limit_m(
         # points under the train, locked by its passage, do not limit it
         if not leads(state.points[name], train, name[0]):
             end = min(end, near)
-    path = layout.pieces(train.rear_m, direction * end, train.tracks)
     first_m, last_m = sorted((train.rear_m, direction * end))
     taken = bars_ahead(state, layout)
     for other in nearby.between(state, first_m, last_m):
         if other.train not in (train.train, train.parted) and other.overlaps(first_m, last_m):
             taken += layout.pieces(*other.span_m, other.tracks)
-    for piece in taken:
-        if any(shares(piece, mine) for mine in path):
-            end = min(end, along(piece[1:], direction)[0])
+    if taken:
+        path = layout.pieces(train.rear_m, direction * end, train.tracks)
+        blocked = [piece for piece in taken if any(shares(piece, mine) for mine in path)]
+        end = min([end, *(along(piece[1:], direction)[0] for piece in blocked)])
     return direction * (end - limits.margin_m - limits.overlap_m)
 
 

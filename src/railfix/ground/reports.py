@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 from railfix.ground.layout import Layout
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
@@ -256,23 +256,23 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
     return d * min(back, d * known.rear_m), d * max(front, d * known.front_m)
 
 
-def _noted(report: PlacedReport) -> TrainInterval:
-    """Return the train with the data of a report with a position, contradicted or not; its interval is unchanged."""
+def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
+    """Return the train with the data of a report with a position, contradicted or not, and changes of its interval."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
-    return replace(
-        report.known,
-        session=message.session or 0,
-        sequence=message.sequence,
-        standstill=stands(message),
-        measured_ns=message.time_ns,
-        speed_mps=report.speed_mps,
-        reported_m=(low, high),
-        claimed_m=None,
-        contradiction=None,
-        held_end_m=report.held_m,
-        runs_by=_runs_by(report),
-    )
+    noted: dict[str, Any] = {
+        "session": message.session or 0,
+        "sequence": message.sequence,
+        "standstill": stands(message),
+        "measured_ns": message.time_ns,
+        "speed_mps": report.speed_mps,
+        "reported_m": (low, high),
+        "claimed_m": None,
+        "contradiction": None,
+        "held_end_m": report.held_m,
+        "runs_by": _runs_by(report),
+    }
+    return report.known.changed(**{**noted, **interval})
 
 
 def _runs_by(report: PlacedReport) -> int | None:
@@ -321,18 +321,18 @@ def report_received(
     if contradiction is not None:
         return _with_granted(with_train(state, stop_contradicted(report, contradiction)), message)
     confirmed, facing = confirms_rear(before, message), message.facing
-    rear, ahead, noted = report.rear_m, report.ahead_m, _noted(report)
+    rear, ahead = report.rear_m, report.ahead_m
     if report.turns and not (confirmed and layout.station_at(*sorted((rear, ahead))) == before.station):
-        return with_train(state, noted)
-    known = replace(noted, line=message.line, claimed_m=rear if confirmed else None)
+        return with_train(state, _noted(report))
+    known: dict[str, Any] = {"line": message.line, "claimed_m": rear if confirmed else None}
     if report.turns:
-        return with_train(state, _turn(known, facing, rear, ahead, layout))
+        return with_train(state, _turn(_noted(report, **known), facing, rear, ahead, layout))
     if confirmed and before.claimed_m is not None and before.stop is None:
         agreed = agreed_rear(facing, rear, before.claimed_m)
-        known = replace(known, rear_m=facing * furthest(facing, agreed, before.rear_m))
+        known["rear_m"] = facing * furthest(facing, agreed, before.rear_m)
     # the interval of a stopped train only grows
-    front = ahead if before.stop is None else facing * max(facing * ahead, facing * before.front_m)
-    return with_train(state, replace(known, front_m=front))
+    known["front_m"] = ahead if before.stop is None else facing * max(facing * ahead, facing * before.front_m)
+    return with_train(state, _noted(report, **known))
 
 
 def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:

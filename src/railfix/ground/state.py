@@ -9,10 +9,11 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 from pydantic import Field
 
+from railfix.core.arrays import copy_with
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.layout import PointName
@@ -72,6 +73,16 @@ class TrainInterval:
     held: bool = False  #: Whether a route was taken back: the next route is set by hand.
     parted: int | None = None  #: Train that was divided from the rear of this one, until they are apart.
 
+    def changed(self, **values: Any) -> Self:
+        """Return a copy with changes, like `dataclasses.replace` without its cost; TypeError for an unknown name."""
+        if not values.keys() <= _NAMES[TrainInterval]:
+            raise TypeError(f"a train has none of {', '.join(sorted(values.keys() - _NAMES[TrainInterval]))}")
+        copy = copy_with(self, **values)
+        if not values.keys().isdisjoint(("direction", "rear_m", "front_m", "end_m")):
+            for computed in ("interval_m", "span_m"):
+                copy.__dict__.pop(computed, None)
+        return copy
+
     @cached_property
     def interval_m(self) -> tuple[float, float]:
         """Rear end and furthest end of the occupied interval [m]."""
@@ -122,6 +133,12 @@ class PointState:
         return self.detected == self.wanted
 
 
+#: Fields of the records that are stored.
+_NAMES: Final = {
+    kind: dict.fromkeys(field.name for field in fields(kind)).keys() for kind in (TrainInterval, PointState)
+}
+
+
 class Restriction(NamedTuple):
     """Temporary speed restriction: highest speed of a train while any part of it is between two chainages."""
 
@@ -148,7 +165,7 @@ class Interlocking:
 
 def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
     """Return the state with the newer interval of a train."""
-    return replace(state, trains={**state.trains, train.train: train})
+    return copy_with(state, trains={**state.trains, train.train: train})
 
 
 def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
@@ -217,4 +234,4 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
 
 
 def _values(record: TrainInterval | PointState) -> dict[str, Any]:
-    return {field.name: getattr(record, field.name) for field in fields(record)}
+    return {name: getattr(record, name) for name in _NAMES[type(record)]}

@@ -7,10 +7,11 @@ late authority cannot lengthen it again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Final
 
+from railfix.ground.interlocking import NearbyTrains
 from railfix.ground.layout import Layout, Piece, PointName, overlap
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
@@ -30,20 +31,38 @@ def pieces_of(train: TrainInterval, layout: Layout) -> list[Piece]:
     return layout.pieces(*train.span_m, train.tracks)
 
 
-def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
-    """Return the state with overlapping trains stopped: the bounds of trains at rest may have grown."""
-    spans = sorted((*train.span_m, number) for number, train in state.trains.items())
-    for k, (_, high, number) in enumerate(spans):
-        for low, _, other in spans[k + 1 :]:
-            if low >= high:
-                break
-            first, second = state.trains[number], state.trains[other]
-            if (first.stop and second.stop) or first.parted == other or second.parted == number:
-                continue
-            if overlap(pieces_of(first, layout), pieces_of(second, layout)):
-                state = stop_trains(state, [number], f"its interval meets that of train {other}")
-                state = stop_trains(state, [other], f"its interval meets that of train {number}")
+def overlaps_stopped(
+    state: Interlocking,
+    layout: Layout,
+    *,
+    nearby: NearbyTrains | None = None,
+    checked: Mapping[int, TrainInterval] | None = None,
+) -> Interlocking:
+    """Return the state with overlapping trains stopped: the bounds of trains at rest may have grown.
+
+    Trains that are as in `checked`, the trains that an earlier call returned, are not compared with each other again.
+    """
+    nearby, checked = nearby or NearbyTrains(state, layout), checked or {}
+    pairs = set()
+    for number, train in state.trains.items():
+        if (known := checked.get(number)) is train or (known is not None and _occupation(known) == _occupation(train)):
+            continue
+        for other in nearby.between(state, *train.span_m):
+            if other is not train and other.overlaps(*train.span_m):
+                pairs.add(tuple(sorted([(*train.span_m, number), (*other.span_m, other.train)])))
+    for (*_, number), (*_, other_number) in sorted(pairs):
+        first, second = state.trains[number], state.trains[other_number]
+        if (first.stop and second.stop) or first.parted == other_number or second.parted == number:
+            continue
+        if overlap(pieces_of(first, layout), pieces_of(second, layout)):
+            state = stop_trains(state, [number], f"its interval meets that of train {other_number}")
+            state = stop_trains(state, [other_number], f"its interval meets that of train {number}")
     return state
+
+
+def _occupation(train: TrainInterval) -> tuple[object, ...]:
+    """Return what the comparison of a train with others follows from."""
+    return train.span_m, train.tracks, train.stop, train.parted
 
 
 def parted_cleared(state: Interlocking) -> Interlocking:

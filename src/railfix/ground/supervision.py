@@ -81,13 +81,18 @@ class Supervision:
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
     _asked_s: dict[PointName, float] = field(default_factory=dict)
+    _nearby: NearbyTrains = field(init=False)
+    _checked: Mapping[int, TrainInterval] = field(default_factory=dict)  #: Trains that have been compared in pairs.
+
+    def __post_init__(self) -> None:
+        self._nearby = NearbyTrains(self.state, self.layout)
 
     def report(self, message: TrainMessage, now_s: float) -> Rejection | None:
         """Process a report; return the reason of its rejection, None if it is accepted."""
         number = message.train
         if number not in self.state.trains:
             return Rejection.UNKNOWN_TRAIN
-        before = self.records.get(number, TrainRecord(train=number))
+        before = self.records.get(number) or TrainRecord(train=number)
         self.records[number], reason = record_received(before, message, now_s, limits=self.centre)
         if counts(reason):
             if self.state.skipped[1] <= max(message.authority or 0, message.brake_order or 0) <= self.state.granted:
@@ -206,7 +211,7 @@ class Supervision:
         """Give the due commands to points of a stored state; none before every train has reported."""
         if self.awaited:
             return
-        self.state, commands = due_commands(self.state, self.layout, stored)
+        self.state, commands = due_commands(self.state, self.layout, stored, self._locate())
         for point, track in commands.items():
             self.command(point, track)
 
@@ -233,7 +238,9 @@ class Supervision:
         for section, at_s in self.answered_s.items():
             if now_s - at_s > self.limits.detection_s and self.detected[section] is not None:
                 self.set_section_detected(section, None)
-        self.state = overlaps_stopped(parted_cleared(self.state), self.layout)
+        self.state = parted_cleared(self.state)
+        self.state = overlaps_stopped(self.state, self.layout, nearby=self._locate(), checked=self._checked)
+        self._checked = self.state.trains
         self.state = occupied_detected(self.state, self.layout, [n for n, found in self.detected.items() if found])
         for point, asked_s in list(self._asked_s.items()):
             if now_s - asked_s > self.limits.answer_s:
@@ -266,7 +273,7 @@ class Supervision:
         if not self.awaited:
             self._grant(now_s, stopped)
             stopped = stop_orders(self.state)
-        due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
+        due = self._list_due(now_s, stopped)
         if not due:
             return []
         granted, trains, stop = self.state.granted + 1, dict(self.state.trains), self.state.stopped
@@ -274,7 +281,7 @@ class Supervision:
             self.sent[number] = now_s, stop or number in stopped
             if not self.sent[number][1]:
                 self.granted_s[number] = now_s
-                trains[number] = replace(trains[number], runs_by=granted)
+                trains[number] = trains[number].changed(runs_by=granted)
         self.state = replace(self.state, granted=granted, trains=trains)
         self.heard.clear()
         return [self._authority(trains[number], stopped=self.sent[number][1]) for number in due]
@@ -282,8 +289,7 @@ class Supervision:
     def _grant(self, now_s: float, stopped: Mapping[int, str]) -> None:
         """Release points, set routes, and extend authorities."""
         self.state = release_points(self.state, now_s, self.layout, limits=self.limits)
-        nearby = NearbyTrains(self.state, self.layout)
-        due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
+        nearby, due = self._locate(), self._list_due(now_s, stopped)
         if self.routes == "automatic":
             for number in due:
                 if self._wants_route(self.state.trains[number]):
@@ -292,10 +298,22 @@ class Supervision:
             self.state, self.layout, limits=self.limits, trains=due, nearby=nearby, stopped=stopped
         )
 
-    def _is_due(self, number: int, now_s: float, stopped: Mapping[int, str]) -> bool:
-        sent_s, was_stopped = self.sent.get(number, (-math.inf, False))
-        stop = self.state.stopped or number in stopped
-        return number in self.heard or now_s - sent_s >= AUTHORITY_S - 1e-6 or stop != was_stopped
+    def _locate(self) -> NearbyTrains:
+        """Return the trains by location."""
+        self._nearby.update(self.state)
+        return self._nearby
+
+    def _list_due(self, now_s: float, stopped: Mapping[int, str]) -> list[int]:
+        """Return the trains that have reported, whose stop has changed, or that were sent nothing for `AUTHORITY_S`."""
+        stop, sent, least_s = self.state.stopped, self.sent, AUTHORITY_S - 1e-6
+        return [
+            number
+            for number in self.state.trains
+            if number in self.heard
+            or (last := sent.get(number)) is None
+            or now_s - last[0] >= least_s
+            or last[1] != (stop or number in stopped)
+        ]
 
     def _authority(self, train: TrainInterval, *, stopped: bool) -> Authority:
         end, record = train.end_m if train.asked_m is None else train.asked_m, self.records.get(train.train)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import json
 from enum import IntEnum, IntFlag
+from functools import cache
+from types import ModuleType
 from typing import Annotated, Any, Final, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from railfix.core.errors import InputFileError, needs_extra
-from railfix.core.settings import Model, Settings
+from railfix.core.settings import Message, Model
 
 VERSION: Final = 1  #: Version of the schema; a receiver rejects other major versions.
 LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected unread.
@@ -66,7 +68,7 @@ class Unknown(IntFlag):
     LENGTH = 4  #: The train's length.
 
 
-class TrainMessage(Settings):
+class TrainMessage(Message):
     """One position message."""
 
     train: Unsigned  #: Identity of the train.
@@ -129,20 +131,25 @@ class MessageError(InputFileError):
         super().__init__("position message", what)
 
 
-def encode(message: TrainMessage) -> bytes:
-    """Return CBOR of a message, always the same bytes for the same message; absent fields are left out."""
+@cache
+def cbor() -> ModuleType:
+    """Return the library of CBOR."""
     with needs_extra():
         import cbor2
+    return cbor2
 
-    values = {KEYS[name]: value for name, value in message.model_dump(mode="json").items() if value is not None}
-    return cbor2.dumps({_VERSION_KEY: VERSION, **values}, canonical=True)
+
+def encode(message: TrainMessage) -> bytes:
+    """Return CBOR of a message, always the same bytes for the same message; absent fields are left out."""
+    # keys rise in the order of the fields, so that this is the canonical form
+    values = {KEYS[name]: value for name, value in vars(message).items() if value is not None}
+    data: bytes = cbor().dumps({_VERSION_KEY: VERSION, **values})
+    return data
 
 
 def decode(data: bytes) -> TrainMessage:
     """Decode CBOR, skipping unknown keys; MessageError where it is not a message of this version."""
-    with needs_extra():
-        import cbor2
-
+    cbor2 = cbor()
     if len(data) > LONGEST:
         raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")
     try:
