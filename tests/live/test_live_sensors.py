@@ -244,37 +244,6 @@ def test_samples_wait_for_an_antenna_without_an_epoch(case: Ride, tmp_path: Path
     assert len(state.fusion["rear"].sensors.samples.inertial) < 500
 
 
-def test_lines_cut_anywhere_are_the_table(case: Ride) -> None:
-    rng = np.random.default_rng(1)
-    for sensor, rows in lines_of(case.samples).items():
-        text = f"{HEADERS[sensor]}\r\n".encode() + b"".join(line for _, line in rows[:500])
-        cuts = np.sort(rng.integers(0, len(text), 40)).tolist()
-        lines, samples = SensorLines(sensor=sensor, source="test"), SensorSamples()
-        for first, last in zip([0, *cuts], [*cuts, len(text)], strict=True):
-            sensed = lines.take(text[first:last])
-            assert sensed.skipped == 0
-            samples = samples.merge(sensed.samples)
-        expected = case.samples.tables[sensor]
-        for name, values in vars(samples.tables[sensor]).items():
-            np.testing.assert_array_equal(values, getattr(expected, name)[:500])
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "2024-03-05T03:10:02,x,1", "2024-03-05T03:10:02,5", "yesterday,5,1", ",5,1", "2024-03-05T03:10:00,5,1", "\xff",
-        "2024-03-05T03:10:02,inf,1", "2024-03-05T03:10:02,,1",
-    ],
-)  # fmt: skip
-def test_a_line_that_is_no_row_is_counted_and_left_out(line: str) -> None:
-    lines = SensorLines(sensor="tachometer", source="tcp://127.0.0.1:9")
-    text = f"# a comment\ntime_gpst,pulse,direction\n2024-03-05T03:10:01,4,1\n{line}\n2024-03-05T03:10:03,6,\n"
-    sensed = lines.take(text.encode("latin-1"))
-    assert (sensed.skipped, sensed.samples.tachometer.pulse.tolist()) == (1, [4, 6])
-    assert sensed.samples.tachometer.direction.tolist() == [1, 0]
-    assert sensed.until == np.datetime64("2024-03-05T03:10:03")
-
-
 @pytest.mark.slow
 def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, tmp_path: Path) -> None:
     """The ride's outputs over and over, each time later; from the eleventh on the radar reads 4 % more."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
-import math
 import os
 import pty
 import shutil
@@ -21,15 +19,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-import polars as pl
 import pytest
 from typer.testing import CliRunner
 
 import railfix
 from railfix.cli import app
 from railfix.core.errors import OutputError, SettingsError
-from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
+from railfix.io.train_message import TrainMessage, decode, from_json
 from railfix.live import sinks
 from railfix.live.console import Metrics, SessionLog
 from railfix.live.engine import LiveOutput
@@ -336,65 +332,6 @@ def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:
         asyncio.run(open_sink(f"packet0@{tmp_path}/x"))
 
 
-def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) -> None:
-    """Chainage, sigma, speed, level, amounts and status of every live message against `train` of `railfix run`."""
-    files = demo_files()
-    parts = {name: tmp_path / f"{name}.rnx" for name in ("front", "rear")}
-    for name, path in parts.items():
-        railfix.write_observations(railfix.read_observations(files[name])[:40], path)
-    common = ["--front", str(parts["front"]), "--rear", str(parts["rear"]), "--track", str(files["track"])]
-    common += ["--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
-    common += ["--reference", "centre"]
-    send = [f"json@{tmp_path / 'messages'}", f"train@{tmp_path / 'train'}", f"positions@{tmp_path / 'positions'}"]
-    words = [word for text in send for word in ("--send", text)]
-    done = RUNNER.invoke(app, ["live", *common, "--live", "no_input=skip", *words])
-    assert done.exit_code == 0, done.output
-    assert RUNNER.invoke(app, ["run", *common, "--out", str(tmp_path / "run")]).exit_code == 0
-    batch = {name: pl.read_parquet(tmp_path / "run" / f"{name}.parquet") for name in ("train", "positions")}
-    for name, table in batch.items():
-        rows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
-        found = {(row["time_gpst"], row["antenna"]): row for row in rows}
-        assert len(found) == len(rows) > 70
-        compared = 0
-        times = table["time_gpst"].dt.strftime("%Y-%m-%dT%H:%M:%S%.9f").to_list()
-        for time_gpst, row in zip(times, table.iter_rows(named=True), strict=True):
-            live = found.get((time_gpst, row["antenna"]))
-            if live is None:  # epochs without a single code, which receivers do not send
-                assert not math.isfinite(row["chainage_m"])
-                continue
-            for column, value in row.items():
-                if column == "time_gpst":
-                    continue
-                if isinstance(value, float):
-                    theirs = math.nan if live[column] is None else float(live[column])
-                    same = theirs == value or (math.isnan(theirs) and math.isnan(value))
-                    assert same or abs(theirs - value) < 1e-9, (column, value, theirs)
-                    compared += math.isfinite(value)
-                else:
-                    assert live[column] == value, column
-        assert compared > 1_100
-    rows = {
-        (time, row["antenna"]): row
-        for time, row in zip(
-            batch["train"]["time_gpst"].to_numpy().tolist(), batch["train"].iter_rows(named=True), strict=True
-        )
-    }
-    epoch = np.datetime64("1980-01-06", "ns").astype(np.int64)
-    checked = 0
-    for line in (tmp_path / "messages").read_text().splitlines():
-        message = from_json(line)
-        candidates = [rows.get((message.time_ns + int(epoch), antenna)) for antenna in ("front", "rear")]
-        mine = [row for row in candidates if row is not None and of_message(row, message)]
-        if message.chainage_cm is None:
-            assert all(row is None or not math.isfinite(row["chainage_m"]) for row in candidates)
-            continue
-        assert mine, message
-        assert (message.status is MessageStatus.COASTING) == (mine[0]["status"] == "coasting")
-        assert message.status is not MessageStatus.POSITION or mine[0]["status"] == "tracking"
-        checked += 1
-    assert checked > 25
-
-
 @pytest.mark.requirement("A8")
 def test_a_sink_that_cannot_be_written_ends_alone_until_none_is_left() -> None:
     class Target:
@@ -442,33 +379,6 @@ def test_an_output_on_a_full_disk_ends_alone(tmp_path: Path) -> None:
     )
     alone = RUNNER.invoke(app, [*words, "--send", "json@/dev/full"])
     assert alone.exit_code == 8
-
-
-def up_cm(value: float) -> int:
-    return math.ceil(value * 100.0 - 1e-9)
-
-
-#: The front end of the demonstration's vehicle ahead of its middle [m].
-FRONT_M = 11.6
-
-
-def of_message(row: dict[str, Any], message: TrainMessage) -> bool:
-    """Whether a message says what a row of the filter says, rounded: bounds up, 1 cm more for that of the place."""
-    if not math.isfinite(row["chainage_m"]):
-        return False
-    level = row["protection_level_m"]
-    bounds = (None, None)
-    if math.isfinite(row["over_reading_m"]):
-        bounds = (up_cm(row["over_reading_m"] + 0.01), up_cm(level))
-    said = (message.over_cm, message.protection_level_cm)
-    return (
-        message.chainage_cm == round((row["chainage_m"] + FRONT_M) * 100.0)
-        and message.sigma_cm == up_cm(row["along_sigma_m"])
-        and message.speed_cmps == round(row["speed_mps"] * 100.0)
-        and (said == bounds or bounds == (None, None))
-        and message.direction == {"falling": -1, "unknown": 0, "rising": 1}[row["direction"]]
-        and message.standstill == row["standstill"]
-    )
 
 
 # --- what a person sees -------------------------------------------------------

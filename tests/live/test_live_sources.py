@@ -417,27 +417,6 @@ def test_a_file_is_replayed_at_its_speed(log: bytes, tmp_path: Path) -> None:
     assert arrivals[-1] - arrivals[0] > 0.9 * 0.1 * (EPOCHS - 1) / 2.0
 
 
-@pytest.mark.slow
-def test_two_files_keep_their_distance_in_a_replay(tmp_path: Path) -> None:
-    """The rear log begins 4 s after the front one: its epochs are due with those of the front antenna, 1 s later."""
-    files = demo_files()
-    assert files["vehicle"] is not None
-    line, vehicle = railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"])
-    sources = {}
-    for name, first in (("front", 0), ("rear", 40)):
-        sources[name] = str(tmp_path / f"{name}.ubx")
-        Path(sources[name]).write_bytes(log_of(railfix.read_observations(files[name])[first:60]))
-    paths = {name: railfix.antenna_trajectory(line, vehicle, name) for name in sources}
-    settings = QUICK.model_copy(update={"period_s": 0.1, "pair_wait_s": 0.5})
-    machine = LiveEngine(
-        railfix.EpochProcessor(railfix.Config(), paths, navigation=railfix.read_navigation(files["nav"])), settings
-    )
-    asyncio.run(run_session(machine, sources, [], speed=1.0))
-    assert machine.counts["rear alone"] == machine.counts["late"] == 0
-    assert machine.counts["paired"] == 20
-    assert machine.counts["front alone"] == 40
-
-
 def test_a_packed_log_is_a_stream_too(log: bytes, tags: list[np.datetime64], tmp_path: Path) -> None:
     path = tmp_path / "log.ubx.gz"
     path.write_bytes(gzip.compress(log))
