@@ -17,11 +17,9 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotati
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits import SatelliteStates
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import Models
-from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.channels import channel_order, first_available
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel, FaultRate
@@ -370,26 +368,6 @@ def test_a_model_of_an_earlier_version_is_noted() -> None:
         "the file is of an earlier version, so make it again with railfix error-model"
     ]
     assert set(notes["new"]) < set(notes["old"])
-
-
-def test_phases_have_the_weight_of_their_elevation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weight of a phase: (sin(elevation) / sigma at the zenith)^2."""
-    caught: list[Any] = []
-    inner = carrier_stage.phase_positions
-
-    def phase_positions(time: np.ndarray, ranges: Ranges, phases: Any, *rest: Any, **limits: Any) -> Any:
-        caught.append(phases.weight)
-        return inner(time, ranges, phases, *rest, **limits)
-
-    monkeypatch.setattr(carrier_stage, "phase_positions", phase_positions)
-    observations = cases.clean_observations()["front"][:20]
-    result = cases.front_alone(observations, {"carrier": "float", "phase_sigma_m": 0.02, "screens": []})
-    (weight,) = caught
-    elevation = result.elevation_deg[:, result.columns]
-    used = weight > 0.0
-    assert used.sum() > 100
-    assert np.ptp(elevation[used]) > 40.0
-    assert weight[used] == pytest.approx((np.sin(np.radians(elevation[used])) / 0.02) ** 2)
 
 
 def test_a_run_with_sbas_adds_the_sbas_variance_to_that_of_the_noise_model(recordings: Path) -> None:

@@ -78,7 +78,6 @@ def test_readings_need_a_list_and_virtual_balises_levels(track: Track, tmp_path:
     with pytest.raises(SettingsError, match="--virtual-balises needs the levels of the filter"):
         load_balises(None, None, places, track, Config(filter="off"))
     both = load_balises(places, places, places, track, Config(filter="track"))
-    assert both is not None
     assert both.virtual.tolist() == [False, True]
     assert both.find_index(np.array(["A", "B"])).tolist() == [0, -1]
 

@@ -235,7 +235,6 @@ def test_two_workers_of_a_cluster_give_the_same_data_set(folder: Path, tmp_path:
     with subprocess.Popen(
         [sys.executable, "-c", CLUSTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as cluster:
-        assert cluster.stdout is not None
         address = cluster.stdout.readline().strip()
         words = [sys.executable, "-m", "railfix", "campaign", str(folder / "campaign.toml"), "--out"]
         done = subprocess.run(

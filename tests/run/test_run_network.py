@@ -160,9 +160,7 @@ def test_a_map_in_another_frame_is_moved_also_in_a_network(tmp_path: Path) -> No
         _, line, _ = open_inputs(inputs, ELLIPSOIDAL, Config(filter="off"))
         frames[name] = line
     shift = frames["jgd2011"].frame
-    assert shift is not None
     assert 0.1 < np.hypot(shift.east_m, shift.north_m) < 0.6
-    assert frames["jgd2011"].route is not None
     assert frames["jgd2011"].route.names == ["line 0", "main 0", "line 1"]
     assert not frames["jgd2011"].from_file
     # the line stands where the satellites have it, the route's positions where the map has it
@@ -405,7 +403,6 @@ def test_with_a_base_station_one_of_three_tracks_is_told_from_the_others(tmp_pat
     least = []
     for inputs, chosen in ((alone, ELLIPSOIDAL), (alone.replaced(base=(files["rear"],)), options)):
         found = open_inputs(inputs, chosen, Config())[1].route
-        assert found is not None
         least.append(float(found.probability.min()) if found.names == ["M"] else 0.0)
     assert least[0] < 0.99
     assert least[1] > 1.0 - Config().track_risk

@@ -276,7 +276,6 @@ def test_phases_of_the_roof_decide_at_a_millionth(roof: dict[str, StandstillCode
 
 def test_phases_of_the_roof_are_whole_wavelengths_at_its_place(roof: dict[str, StandstillCodes]) -> None:
     phases = roof["base"].phases
-    assert phases is not None
     mean = phases.mean(slice(0, 61), StandstillErrors())
     cycles = mean.difference_m / mean.wavelength_m
     assert len(cycles) > 20
@@ -285,7 +284,6 @@ def test_phases_of_the_roof_are_whole_wavelengths_at_its_place(roof: dict[str, S
 
 def test_a_slip_ends_the_part_of_a_satellite_that_is_used(roof: dict[str, StandstillCodes]) -> None:
     phases = roof["base"].phases
-    assert phases is not None
     whole = phases.mean(slice(0, 61), StandstillErrors())
     slipped = phases.difference_m.copy()
     slipped[25:, 3] += 5 * phases.wavelength_m[3]
@@ -352,7 +350,6 @@ def test_breaks_and_half_cycles_of_either_receiver_are_in_the_phases() -> None:
     place = np.asarray(front.header.approximate_ecef_m)
     codes = standstill_codes(front, read_navigation(files["nav"]), Config(filter="off"), base=(rear, place))
     phases = codes.phases
-    assert phases is not None
     assert phases.lost[10].all()
     known = np.isfinite(phases.difference_m)
     (own,) = np.flatnonzero(~known[15] & ~known[25] & known[14] & known[20])

@@ -21,8 +21,7 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean, s
 from railfix.ranges.cn0_curve_file import read_cn0_curve, write_cn0_curve
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 from railfix.ranges.cn0_curve_log import _notes, cn0_curve_from_log, satellite_elevation_deg
-from railfix.report.plots.screens import draw_cn0_curve, draw_screen
-from railfix.screens import ScreenPicture, cn0_screen
+from railfix.screens import cn0_screen
 
 pytestmark = pytest.mark.requirement("B1")
 
@@ -309,28 +308,3 @@ def test_a_day_of_open_sky(recordings: Path, tmp_path: Path) -> None:
 
 
 # -- pictures -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_pictures(tmp_path: Path) -> None:
-    samples = Cn0Samples()
-    samples.add(*sky(500))
-    curve = fit_cn0_curve(samples, fit=CurveFit(least_samples=5))
-    assert draw_cn0_curve(tmp_path / "a.png", curve, samples).read_bytes().startswith(b"\x89PNG")
-    rng = np.random.default_rng(0)
-    metric = rng.normal(0, 1, (50, 3))
-    metric[5] = np.nan
-    metric[7, 1] = 80.0
-    time = np.datetime64("2021-01-01", "ns") + np.arange(50) * np.timedelta64(100, "ms")
-    for sides in ("both", "above", "below"):
-        picture = ScreenPicture(
-            title="t", label="metric [m]", metric=metric, reject=np.abs(metric) > 1.5, limit=1.5, sides=sides
-        )
-        path = draw_screen(tmp_path / f"{sides}.png", picture, time, np.linspace(0, 100, 50))
-        assert path.read_bytes().startswith(b"\x89PNG")
-    empty = ScreenPicture(
-        title="t", label="m", metric=np.full((50, 1), np.nan), reject=np.zeros((50, 1), dtype=bool), limit=np.nan
-    )
-    draw_screen(tmp_path / "empty.png", empty, time)
-    with pytest.raises(OutputError):
-        draw_screen(tmp_path / "absent" / "x.png", empty, time)

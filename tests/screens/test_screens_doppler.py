@@ -260,25 +260,6 @@ def test_any_cutting_gives_the_same_bits(seed: int, size: int, mode: str, hold: 
         np.testing.assert_array_equal(a, b)
 
 
-@settings(max_examples=20)
-@given(seed=st.integers(0, 10_000))
-def test_order_of_satellites_and_a_common_clock_do_not_matter(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    time, code, doppler = scene(40, seed=seed, noise_m=0.3)
-    code[rng.random(code.shape) < 0.1] += 12.0
-    plain, _ = screened(time, code, doppler)
-    order = rng.permutation(5)
-    other, _ = screened(time, code[:, order], doppler[:, order], satellite=SATELLITES[order])
-    np.testing.assert_array_equal(plain.metric[:, order], other.metric)
-    np.testing.assert_array_equal(plain.reject[:, order], other.reject)
-    # a clock that wanders, told by the Dopplers as well
-    drift = rng.uniform(-300, 300)
-    moved, _ = screened(
-        time, code + drift * np.arange(40)[:, None] * 0.1, doppler - drift * L1 / SPEED_OF_LIGHT
-    )  # fmt: skip
-    np.testing.assert_allclose(moved.metric, plain.metric, atol=1e-6)
-
-
 def test_no_epochs_leave_the_state() -> None:
     time, code, doppler = scene(4)
     _, state = screened(time, code, doppler)
