@@ -11,7 +11,6 @@ import carrier_forms
 import level_cases
 from pipeline_cases import clean_files
 from railfix.evaluate import Score, score
-from railfix.run.processor_setup import make_processor
 
 
 @cache
@@ -81,24 +80,6 @@ def test_in_towns_it_does_no_harm(name: str, p50: float):
     assert got["live"].p95_m < 1.05 * got["code"].p95_m
     assert got["hatch"].p50_m < 1.0 * got["code"].p50_m
     assert got["hatch"].p95_m < 1.05 * got["code"].p95_m
-
-
-@pytest.mark.requirement("A5")
-@pytest.mark.usefixtures("recordings")
-def test_chunks_of_a_telephone_give_the_same():
-    """Arcs begin at three epochs of four."""
-    case = level_cases.cases()["Pixel"]
-    processor = make_processor(
-        level_cases.SETTINGS.replaced(carrier="float"), case.navigation, {"front": case.trajectory}
-    )
-    places = []
-    for size in (len(case.observations), 300, 50):
-        state, parts = None, []
-        for first in range(0, len(case.observations), size):
-            result, state = processor.process({"front": case.observations[first : first + size]}, state)
-            parts.append(result.antennas["front"].arc_m)
-        places.append(np.concatenate(parts))
-    assert np.nanmax(np.abs(np.diff(places, axis=0))) < 1e-9
 
 
 @pytest.mark.requirement("A5")

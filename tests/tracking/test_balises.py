@@ -72,17 +72,6 @@ def test_balises_sharpen_place_and_level_and_hold_them_in_a_tunnel(case: Ride, f
 
 
 @pytest.mark.requirement("E7")
-def test_any_cutting_of_the_log_gives_the_same(case: Ride, found: AlongTrack) -> None:
-    cut = case.run(filter_sources=SOURCES, sensors=READER, cuts=[1, 2, 37, 38, 95, *range(118, 142), 150])
-    np.testing.assert_allclose(cut.chainage_m, found.chainage_m, atol=1e-6)
-    np.testing.assert_array_equal(cut.tracked.used, found.tracked.used)
-    np.testing.assert_allclose(cut.tracked.level_m, found.tracked.level_m, rtol=1e-6)
-    assert [p.balise for p in cut.passings] == [p.balise for p in found.passings]
-    for one, other in zip(cut.passings, found.passings, strict=True):
-        assert abs(one.time - other.time) <= np.timedelta64(10, "ns")
-
-
-@pytest.mark.requirement("E7")
 @pytest.mark.parametrize("wrong", ["B006", "B012", "B013"])
 @pytest.mark.parametrize("shift", [1, -2])
 @pytest.mark.every(3)
