@@ -229,19 +229,6 @@ def mixed() -> tuple[Navigation, np.ndarray, np.ndarray]:
     return navigation(*rows), np.array([c[0] for c in channels]), np.array([c[1] for c in channels])
 
 
-def test_channels_do_not_depend_on_each_other_or_on_order_of_time() -> None:
-    nav, satellite, signal = mixed()
-    time = at(np.linspace(-5000, 5000, 300))
-    code = np.full((300, len(satellite)), CODE)
-    whole = satellite_states(time, satellite, signal, code, nav)
-    shuffled = np.random.default_rng(1).permutation(300)
-    for m in range(len(satellite)):
-        alone = satellite_states(time[shuffled], satellite[m : m + 1], signal[m : m + 1], code[:, :1], nav)
-        for item in fields(whole):
-            expected = getattr(whole, item.name)[shuffled, m : m + 1]
-            np.testing.assert_array_equal(getattr(alone, item.name), expected, item.name)
-
-
 def test_absent_codes_give_nan_and_no_mask() -> None:
     nav, satellite, signal = mixed()
     code = np.full((120, len(satellite)), np.nan)

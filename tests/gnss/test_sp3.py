@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -82,20 +81,6 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         position, _, clock = truth(t, name)
         assert np.abs(found.position_ecef_m[:, column] - position).max() <= 0.5001e-3, "written to the millimetre"
         assert np.abs(found.clock_s[:, column] - clock).max() <= 0.5001e-12
-
-
-@pytest.mark.requirement("A7")
-def test_reading_is_that_of_georinex(tmp_path: Path) -> None:
-    georinex = pytest.importorskip("georinex")
-    path = written(tmp_path, text(version="c"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        theirs = georinex.load_sp3(path, outfn=None)
-    ours = read_sp3(path)
-    assert theirs.sv.values.tolist() == ours.satellite.tolist()
-    np.testing.assert_array_equal(theirs.time.values.astype("M8[ns]"), ours.time)
-    np.testing.assert_allclose(theirs.position.values * 1e3, ours.position_ecef_m, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(theirs.clock.values * 1e-6, ours.clock_s, rtol=0, atol=1e-15)
 
 
 def test_packed_files_and_the_letterless_first_version(tmp_path: Path) -> None:

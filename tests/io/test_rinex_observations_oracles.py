@@ -10,8 +10,8 @@ import pytest
 
 from railfix.core.files import read_bytes
 from railfix.evaluate.public_data import DRIVE, DRIVE_FILES
-from railfix.gnss.observations import Observations, concatenate
-from railfix.io import read_observations, scan_observations
+from railfix.gnss.observations import Observations
+from railfix.io import read_observations
 from railfix.io.rinex.observations_lines import KINDS, find_signal
 
 pytestmark = [pytest.mark.requirement("A7"), pytest.mark.filterwarnings("ignore")]
@@ -62,15 +62,6 @@ def test_recordings_are_read_without_a_fault(recorded: Callable[[str], Path], na
     assert code.size
     assert code.min() > 1.6e7  # a receiver clock of 10 ms
     assert code.max() < 4.5e7  # geostationary, with a clock error
-
-
-def test_pieces_of_a_recording_are_the_whole(recorded: Callable[[str], Path]) -> None:
-    path = recorded(RECORDINGS["F9P"][0])
-    whole = read_observations(path)
-    for epochs in (1, 7, 1000):
-        joined = concatenate(list(scan_observations(path, epochs=epochs)))
-        for one, other in zip(arrays_of(joined), arrays_of(whole), strict=True):
-            assert one.tobytes() == other.tobytes()
 
 
 def compare_with_georinex(path: Path) -> int:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pyproj import Transformer
-from typer.testing import CliRunner
 
-from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track import Track, read_track
 from railfix.track.crs import WORKING_FRAME, kind_of_frame
 from railfix.track.frames import decimal_year, track_at
@@ -21,7 +17,6 @@ from railfix.track.georeference import georeference
 from railfix.track.track import Provenance
 
 pytestmark = pytest.mark.requirement("A9")
-RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
 
 #: PROJ's steps by hand: geocentric ETRF2014, NAD83(2011), GDA2020 to ITRF2014 and to ITRF2020. The 14 parameters are
 #: those of the EPSG entries named; signs as PROJ's position-vector convention has them.
@@ -178,70 +173,6 @@ def test_what_is_refused(tmp_path: Path) -> None:
         (tmp_path / f"{name}.csv").write_text(f"# crs: {crs}\nlatitude_deg,longitude_deg,height_m\n{rows}")
     with pytest.raises(MismatchError, match="different reference frames"):
         read_track([tmp_path / "a.csv", tmp_path / "b.csv"])
-
-
-@pytest.mark.slow
-def test_a_station_on_a_line_in_its_own_frame(recordings: Path, tmp_path: Path) -> None:
-    """ESBC (Esbjerg) known in the ITRF: a line in ETRS89 named rightly gives the error of one in WGS 84; named
-    wrongly the along-track error changes by the shift."""
-    folder = recordings / "static" / "ESBC_2020177"
-    observations = next(folder.glob("*MO.*"))
-    navigation = next(folder.glob("*MN.*"))
-    import railfix
-
-    station = railfix.read_observations(observations, end="2020-06-25T00:10").header.approximate_ecef_m
-    latitude, longitude, height = (float(v) for v in geodetic_from_ecef(station))
-    axes = enu_axes(latitude, longitude)
-    along = np.arange(-1000.0, 1001.0, 5.0)
-    direction = np.sin(np.radians(45.0)) * axes[0] + np.cos(np.radians(45.0)) * axes[1]
-    points = geodetic_from_ecef(station + along[:, None] * direction)
-    line = Track.from_geodetic(points[0], points[1], np.full(len(along), height))
-    itrf = replace(line, provenance=Provenance(frame=WORKING_FRAME))
-    back = Transformer.from_crs(WORKING_FRAME, "EPSG:9069", always_xy=True)
-    at = np.full(len(along), 2020.4809)
-    lon, lat, up, _ = back.transform(itrf.longitude_deg, itrf.latitude_deg, itrf.height_m, at)
-    lines = {
-        "itrf": (itrf, "EPSG:4979"),
-        "etrs89": ((lat, lon, up), "EPSG:9069"),
-        "wrong": ((lat, lon, up), "EPSG:4979"),
-    }
-    errors, shifts = {}, {}
-    for name, (coordinates, crs) in lines.items():
-        path = tmp_path / f"{name}.csv"
-        values = (
-            (coordinates.latitude_deg, coordinates.longitude_deg, coordinates.height_m)
-            if isinstance(coordinates, Track)
-            else coordinates
-        )
-        rows = [f"{a:.10f},{b:.10f},{c:.4f}" for a, b, c in zip(*values, strict=True)]
-        path.write_text(f"# crs: {crs}\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
-        words = ["run", "--front", str(observations), "--nav", str(navigation), "--track", str(path)]
-        words += ["--end", "2020-06-25T00:40:00", "--set", "protection=off", "--out", str(tmp_path / name)]
-        done = RUNNER.invoke(app, words)
-        assert done.exit_code == 0, done.output
-        import polars as pl
-
-        chainage = pl.read_parquet(tmp_path / name / "positions.parquet")["chainage_m"].to_numpy()
-        errors[name] = chainage - 1000.0
-        record = json.loads((tmp_path / name / "run.json").read_text())
-        shifts[name] = find(record, "shift_east_north_up_m")
-    assert np.nanmax(np.abs(errors["itrf"] - errors["etrs89"])) < 0.02
-    east, north, _ = shifts["etrs89"]
-    expected = np.sin(np.radians(45.0)) * east + np.cos(np.radians(45.0)) * north
-    assert expected > 0.6
-    assert np.nanmedian(errors["wrong"] - errors["itrf"]) == pytest.approx(expected, abs=0.03)
-    assert shifts["wrong"] == [0.0, 0.0, 0.0]
-
-
-def find(value: object, key: str) -> list[float]:
-    """The first value of a key anywhere in JSON."""
-    if isinstance(value, dict):
-        if key in value:
-            return list(value[key])
-        for item in value.values():
-            if (found := find(item, key)) is not None:
-                return found
-    return None  # type: ignore[return-value]
 
 
 def test_epochs_as_years() -> None:
