@@ -239,7 +239,6 @@ def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
 def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path: Path) -> None:
     with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
         control = centre(store, judged=True)
-        assert control.monitor is not None
         control.monitor = replace(control.monitor, stopped=False)
         control.judge(TriangleVerdict.SPOOFING, age_s=60.0)
         control.judge(TriangleVerdict.HEALTHY)
@@ -256,7 +255,6 @@ def test_the_worst_verdict_between_two_steps_counts_and_old_ones_do_not(tmp_path
 def test_spoofing_is_not_lost_behind_an_absent_fix(tmp_path: Path, later: TriangleVerdict) -> None:
     with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
         control = centre(store, judged=True)
-        assert control.monitor is not None
         control.monitor = replace(control.monitor, stopped=False)
         for verdict in (TriangleVerdict.SPOOFING, later):
             control.judge(verdict)

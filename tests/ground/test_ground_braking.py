@@ -159,8 +159,6 @@ def test_gradients_of_the_line_come_on_board_in_both_directions() -> None:
         train.note_position(end - 500.0 * direction, 10.0)
         level.note_position(1400.0, 10.0)
         on_slope, flat = train.supervised(), level.supervised()
-        assert on_slope is not None
-        assert flat is not None
         assert (on_slope.intervention_mps > flat.intervention_mps + 1.0) is better
         assert (on_slope.intervention_mps < flat.intervention_mps - 1.0) is not better
     many = replace_gradients(layout, 40)

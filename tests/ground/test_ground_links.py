@@ -139,17 +139,6 @@ def test_no_message_is_used_twice_and_none_older_after_a_newer(count: int) -> No
     assert receiver.threats[Threat.DELETION] == newest + 1 - len(used) - min(used)
 
 
-def test_both_links_lose_only_where_both_lose() -> None:
-    rng, receiver, lost = random.Random(1), FrameReceiver(sender=7), 0
-    for sequence in range(5000):
-        kept = [link for link in ("A", "B") if rng.random() > 0.3]
-        data = frame(sequence).encode()
-        uses = [receiver.receive(link, data, 0)[1] is not None for link in kept]
-        assert sum(uses) == bool(kept)
-        lost += not kept
-    assert receiver.threats[Threat.DELETION] == pytest.approx(lost, abs=1)
-
-
 def test_response_rate_and_round_trip_of_a_lossy_link() -> None:
     """Loss p each way: (1 - p)^2 answered; delay d each way: 2 d, whatever the answer waits at the other end."""
     rng, p, d, waits = random.Random(2), 0.2, 0.15, 0.4
@@ -531,7 +520,6 @@ def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
         else:
             for (number, _), protocol in centre._peers.items():
                 if number == 7:
-                    assert protocol.peer is not None
                     protocol.peer = protocol.peer._replace(ends=datetime(2020, 1, 1, tzinfo=UTC))
         rejected = centre.masquerades
         assert await _until(lambda: centre.masquerades >= rejected + 2, 5.0) < 5.0

@@ -329,7 +329,6 @@ def test_a_train_outside_its_interval_is_not_released(desk: Desk) -> None:
     desk.steps(1.0)
     desk.report(1, 1900.0)
     reason = desk.orders["release-train"]({"train": 1})
-    assert reason is not None
     assert "was last reported at 1695 to 1905 m, outside its interval" in reason
     assert "correct-train" in reason
     for _ in range(20):  # it reports on: the interval comes to cover its place

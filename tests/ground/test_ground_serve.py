@@ -87,7 +87,6 @@ def started(folder: Path, *options: str) -> subprocess.Popen[str]:
     words = [sys.executable, "-m", "railfix", "ground", "centre", str(folder / "line.toml"), "--page", "127.0.0.1:0"]
     words += ["--password", str(folder / "password"), "--for", "60", *options]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None
     line = process.stdout.readline()
     assert "http://127.0.0.1:" in line, line + process.stdout.read()
     return process
@@ -282,8 +281,6 @@ def test_a_train_ends_within_a_second(folder: Path, number: signal.Signals) -> N
     for host, port in addresses(folder).values():
         words += ["--centre", f"{host}:{port}"]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdin is not None
-    assert process.stdout is not None
     placed = SimulatedTrain(number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0))
     process.stdin.write(to_json(placed.message(0.0)) + "\n")
     process.stdin.flush()
@@ -406,7 +403,6 @@ def test_routes_and_the_release_by_hand(
     )
     seconds(1, None)
     again = restored(control.store, layout_state(), sent, now)  # as after a kill
-    assert again.monitor is not None
     assert (again.monitor.stopped, again.monitor.cause) == (True, TriangleVerdict.MONITOR_LOST)
     assert again.supervision.state.trains[1].end_m == 1920.0
     numbers = [a.number for a in sent]
@@ -489,7 +485,6 @@ def test_a_database_that_fails_is_an_alarm(
         now[0] += 0.3
         control.step()
     assert len(sent) == 2
-    assert control.database is not None
     assert "database is locked" in control.database
     assert sum("ALARM" in line for line in control.lines) == 1
     other.execute("ROLLBACK")
@@ -520,7 +515,6 @@ def test_postgresql_that_hangs_is_an_alarm_and_holds_up_no_order(folder: Path, t
         [sys.executable, "-m", "railfix", "ground", "centre", str(tmp_path / "line.toml"), "--page", "127.0.0.1:0",
          "--password", str(tmp_path / "password"), "--for", "60"], stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert process.stdout is not None
     browser = Browser(process.stdout.readline().split()[-1])
 
     def state() -> tuple[dict[str, Any], float]:
