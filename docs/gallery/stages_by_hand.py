@@ -34,8 +34,8 @@ def positions_by_hand(log, navigation, line, systems):
     low = screens.elevation_screen(codes.elevation_deg).reject
     code = np.where(low, np.nan, codes.used_code_m)
     used = positioning.weighted_ranges(codes.satellites.position_ecef_m, code, codes.sigma_m, channels.clock)
-    tied, state = positioning.tie_constellations(log.time, channels.clocks, used, near.ecef_m)
-    return tied.ranges, positioning.fix_on_line(tied.ranges, line, tied.tied)
+    tied, points, state = positioning.tie_constellations(log.time, channels.clocks, used, near.ecef_m)
+    return tied, positioning.fix_on_line(tied, line, points.tied)
 
 
 # %%

@@ -254,18 +254,18 @@ def test_fields_equal_float_of_their_text(texts: list[tuple[str, str]], cut: int
     line = line[: len(line) - 16 + cut]
     data = np.frombuffer(line.encode() + b"\n9" + b" " * observations_decode.PADDING, dtype=np.uint8)
     arguments = (data, np.zeros(1, dtype=np.int64), np.array([len(line)]), np.arange(len(texts)), np.ones(len(texts)))
-    fields = observations_decode.read_fields(*arguments)
+    value, lock, bad = observations_decode.read_fields(*arguments)
     for k in range(len(texts)):
         text = f"{line[16 * k : 16 * k + 16]:<16}"
         good = (not text[:14].strip() or NUMBER.fullmatch(text[:14])) and re.fullmatch("[ 0-9]{2}", text[14:])
-        assert bool(fields.bad[0, k]) == (not good)
+        assert bool(bad[0, k]) == (not good)
         if good and text[:14].strip():
-            assert fields.value[0, k] == float(text[:14])
-            assert math.copysign(1.0, fields.value[0, k]) == math.copysign(1.0, float(text[:14]))
+            assert value[0, k] == float(text[:14])
+            assert math.copysign(1.0, value[0, k]) == math.copysign(1.0, float(text[:14]))
         elif good:
-            assert np.isnan(fields.value[0, k])
+            assert np.isnan(value[0, k])
         if good:
-            assert fields.lock[0, k] == int(text[14].strip() or 0)
+            assert lock[0, k] == int(text[14].strip() or 0)
 
 
 VALUES = st.none() | THOUSANDTHS.filter(bool).map(lambda n: n / 1000)

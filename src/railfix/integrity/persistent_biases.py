@@ -65,7 +65,6 @@ class BiasLimits(NamedTuple):
 class PersistentBiases(NamedTuple):
     """Positions of T epochs without satellites with persistent errors."""
 
-    ranges: Ranges
     fix: LineFix
     model: LinearModel  #: Linear model of the positions.
     rejected: Masks  #: Shape (T, K).
@@ -80,7 +79,7 @@ def reject_persistent_biases(
     noise: Floats,
     states: Sequence[LastingErrorState],
     limits: BiasLimits,
-) -> tuple[PersistentBiases, list[LastingErrorState]]:
+) -> tuple[Ranges, PersistentBiases, list[LastingErrorState]]:
     """Return ranges, positions and model without satellites with persistent code errors, and the new states.
 
     P4 tests single epochs, which an error of twice the noise passes; here the clipped residuals are averaged over time.
@@ -104,7 +103,7 @@ def reject_persistent_biases(
     model = linear_model(ranges, antennas, fix.constrained.arc_m, section=fix.constrained.section)
     left_out = np.zeros(ranges.code_m.shape, dtype=np.bool_)
     if not lasting.most_satellites:
-        return PersistentBiases(ranges, fix, model, left_out), list(states)
+        return ranges, PersistentBiases(fix, model, left_out), list(states)
     windows = Windows.of(
         time, antennas.parts, [(state.time, state.age) for state in states],
         window_s=lasting.memory_s, least_epochs=lasting.memory_s,
@@ -132,7 +131,7 @@ def reject_persistent_biases(
         copy_with(state, time=when, age=age, channel=joined.channel, sums=sums[:, k].T) if len(time[rows]) else state
         for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
     ]
-    return PersistentBiases(ranges, fix, model, left_out), after_states
+    return ranges, PersistentBiases(fix, model, left_out), after_states
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:

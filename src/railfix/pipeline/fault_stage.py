@@ -31,11 +31,9 @@ from railfix.ranges.corrected import CorrectedRanges
 _LARGEST_VARIANCE: Final = 1e4
 
 
-class CheckedRanges(NamedTuple):
+class CheckedPositions(NamedTuple):
     """Positions after the exclusion of faults, T epochs."""
 
-    corrected: CorrectedRanges
-    ranges: Ranges
     fix: LineFix
     model: LinearModel  #: Linear model of the positions.
     raim: RaimResult
@@ -51,8 +49,8 @@ def check_ranges(
     fix: LineFix,
     config: Config,
     states: Sequence[AntennaState],
-) -> tuple[CheckedRanges, list[AntennaState]]:
-    """Return positions after the exclusion of persistent and then of single faults, and noise scales.
+) -> tuple[CorrectedRanges, Ranges, CheckedPositions, list[AntennaState]]:
+    """Return the ranges and positions after the exclusion of persistent and then of single faults, and noise scales.
 
     The robust scale, which RAIM uses, is estimated from mutually consistent ranges; the reported scale from the ranges
     after RAIM.
@@ -80,7 +78,7 @@ def check_ranges(
     on_line, usable = fit_on_line()
     raised, raised_sums = robust_scale(on_line, usable, [state.lasting.noise for state in states])
     limits = config.lasting_errors if on else config.lasting_errors.replaced(most_satellites=0)
-    (ranges, fix, model, lasting), lasting_states = reject_persistent_biases(
+    ranges, (fix, model, lasting), lasting_states = reject_persistent_biases(
         time, corrected.channels.names, ranges, antennas, fix, raised, [state.lasting for state in states],
         BiasLimits(limits, config.fix_limits),
     )  # fmt: skip
@@ -110,7 +108,7 @@ def check_ranges(
         )
         for k, (state, (when, age)) in enumerate(zip(states, windows.last, strict=True))
     ]  # fmt: skip
-    return CheckedRanges(corrected, ranges, fix, model, raim, scale, off_map, lasting), after
+    return corrected, ranges, CheckedPositions(fix, model, raim, scale, off_map, lasting), after
 
 
 @lru_cache

@@ -27,7 +27,7 @@ from railfix.integrity.protection.solution_separation import MapDeviation, Range
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.kernels.tracking.constants import AHEAD
 from railfix.pipeline.config import Config
-from railfix.pipeline.fault_stage import CheckedRanges
+from railfix.pipeline.fault_stage import CheckedPositions
 from railfix.pipeline.solution import ProtectionResult, Solution
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.line_fix import LineFix
@@ -111,10 +111,15 @@ def level_scale(scale: Floats, config: Config) -> Floats:
 
 
 def level_stage(
-    checked: CheckedRanges, antennas: AntennaRows, offset: MapOffset, config: Config
+    corrected: CorrectedRanges,
+    ranges: Ranges,
+    checked: CheckedPositions,
+    antennas: AntennaRows,
+    offset: MapOffset,
+    config: Config,
 ) -> tuple[ProtectionResult | None, Masks]:
     """Return the protection levels (None if off), and the epochs with possible positions beyond them, (T,)."""
-    corrected, ranges, fix, model, raim, scale, *_ = checked
+    fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
     section = np.maximum(fix.constrained.section, 0)

@@ -16,11 +16,12 @@ from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, channel_su
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
+from railfix.integrity.fault_exclusion import RaimResult
 from railfix.integrity.point_validation import validate_point
 from railfix.integrity.raim import LinearModel, reliability
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import OFF_MAP_S, Config
-from railfix.pipeline.fault_stage import CheckedRanges, check_ranges, contradict_map
+from railfix.pipeline.fault_stage import CheckedPositions, check_ranges, contradict_map
 from railfix.pipeline.level_stage import level_stage
 from railfix.pipeline.off_map import off_map_epochs
 from railfix.pipeline.processor_state import AntennaState
@@ -59,25 +60,26 @@ def position_stage(
     The ranges are given after the observation screens, the states by antenna.
     """
     time = corrected.time
-    points, offsets = tie_constellations(
-        time, corrected.channels.clocks, fit_ranges(corrected), corrected.near_ecef_m,
+    untied = fit_ranges(corrected)
+    ranges, points, offsets = tie_constellations(
+        time, corrected.channels.clocks, untied, corrected.near_ecef_m,
         [state.offsets for state in states], reference=CLOCK_GROUP[config.systems[0]], parts=antennas.parts,
         limits=TieLimits(config.single_point, config.robust_fit, config.clock_offsets),
     )  # fmt: skip
-    corrected = reject(corrected, points.gross, Reason.GROSS_ERROR)
-    fix = fix_on_line(points.ranges, antennas, points.tied, config.fix_limits)
+    corrected, conventional = reject(corrected, points.gross, Reason.GROSS_ERROR), without(untied, points.gross)
+    fix = fix_on_line(ranges, antennas, points.tied, config.fix_limits)
     corrected = reject(
         corrected, _alone_on_clock(corrected.reason, corrected.channels.groups, points.ties), Reason.ALONE_ON_ITS_CLOCK
     )
-    checked, states = check_ranges(corrected, points.ranges, antennas, fix, config, states)
-    corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
+    corrected, ranges, checked, states = check_ranges(corrected, ranges, antennas, fix, config, states)
+    fix, scale = checked.fix, checked.scale
     constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
     # ranges that are inconsistent in space contradict every map
-    unresolved = corrected.unsure | _contradict(fix.point, checked.ranges.space_redundancy, scale)
+    unresolved = corrected.unsure | _contradict(fix.point, ranges.space_redundancy, scale)
     off_map = checked.off_map & ~unresolved
 
     excluded = checked.lasting | checked.raim.excluded
-    agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
+    agreeing, free = _consistent(without(untied, points.disagreeing), points.free, excluded, corrected, scale, config)
     right_m = offset_from_line(free.ecef_m, constrained.arc_m, antennas)[:, 0]
 
     away, off_map_states = antennas.each_with_state(
@@ -90,26 +92,25 @@ def position_stage(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
     )  # fmt: skip
-    raim = checked.raim
-    if "raim" in config.screens and config.raim_protection == "on":
-        of_raim = reliability(model, limits=config.raim, scale=scale).protection_level_m
-        raim = copy_with(raim, protection_level_m=np.where(raim.faulty, np.nan, of_raim))
+    raim = _with_protection_level(checked, config)
     corrected = reject(corrected, raim.excluded, Reason.FAULT_EXCLUDED)
-    checked = checked._replace(corrected=corrected, raim=raim)
-    level, open_elsewhere = level_stage(checked, antennas, offset, config)
-    sigma, carriers = _published(checked, slips, antennas, config, [state.carrier for state in states])
+    checked = checked._replace(raim=raim)
+    level, open_elsewhere = level_stage(corrected, ranges, checked, antennas, offset, config)
+    sigma, carriers = _published(
+        corrected, ranges, checked, slips, antennas, config, [state.carrier for state in states]
+    )
     solution = Solution(
         point=points.point, consistent_ecef_m=free.ecef_m,
-        conventional_status=validate_point(points.point, points.untied, scale, limits=config.single_point),
+        conventional_status=validate_point(points.point, conventional, scale, limits=config.single_point),
         fix=fix, ties=points.ties, raim=raim, status=np.zeros(len(time), dtype=np.int8), noise_scale=scale,
         epoch_sigma_m=sigma.epoch_m, arc_m=sigma.arc_m, along_sigma_m=sigma.along_m, phase=sigma.phase,
         protection=level, map_offset=offset, off_map=away,
     )  # fmt: skip
     if sigma.phase is not None:
-        off_map = contradict_map(checked.ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
+        off_map = contradict_map(ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
     observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
     failed = off_map, raim.faulty | unresolved, open_elsewhere
-    counts = checked.ranges.n_used, checked.ranges.redundancy
+    counts = ranges.n_used, ranges.redundancy
     status = _status(observed, counts, solution, sigma.judged_m, failed, config)
     after = [
         copy_with(
@@ -118,6 +119,15 @@ def position_stage(
         for k, state in enumerate(states)
     ]  # fmt: skip
     return corrected, copy_with(solution, status=status), after
+
+
+def _with_protection_level(checked: CheckedPositions, config: Config) -> RaimResult:
+    """Return RAIM's result with its protection level, NaN where an unidentified fault remains, if the level is on."""
+    raim = checked.raim
+    if "raim" not in config.screens or config.raim_protection != "on":
+        return raim
+    of_raim = reliability(checked.model, limits=config.raim, scale=checked.scale).protection_level_m
+    return copy_with(raim, protection_level_m=np.where(raim.faulty, np.nan, of_raim))
 
 
 def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBiases) -> Masks:
@@ -167,14 +177,16 @@ class PublishedPositions(NamedTuple):
 
 
 def _published(
-    checked: CheckedRanges,
+    corrected: CorrectedRanges,
+    ranges: Ranges,
+    checked: CheckedPositions,
     slips: Slips | None,
     antennas: AntennaRows,
     config: Config,
     carriers: Sequence[CarrierState | None],
 ) -> tuple[PublishedPositions, Sequence[CarrierState | None]]:
     """Return the positions with their standard deviations, and the carrier-phase states."""
-    corrected, ranges, fix, scale = checked.corrected, checked.ranges, checked.fix, checked.scale
+    fix, scale = checked.fix, checked.scale
     constrained = fix.constrained
     own = epoch_sigma_m(ranges.redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m

@@ -117,15 +117,12 @@ def tie_clocks(
 
 
 class PointPositions(NamedTuple):
-    """3-D positions of T epochs, and the ranges with the estimated clocks."""
+    """3-D positions of T epochs and the inter-system biases."""
 
-    untied: Ranges  #: Position with a clock for each constellation.
-    ranges: Ranges  #: Position with the inter-system biases known so far.
-    point: SinglePoint  #: The conventional position, from the untied ranges.
+    point: SinglePoint  #: The conventional position, with a clock for each constellation.
     tied: SinglePoint  #: Conventional position from the ranges tied by known biases.
-    #: Ranges that agree with each other in space, and the positions from these ranges.
-    agreeing: Ranges
-    free: SinglePoint
+    free: SinglePoint  #: Position from the ranges that agree with each other in space.
+    disagreeing: Masks  #: The other ranges, shape (T, K).
     ties: InterSystemBiases
     gross: Masks  #: Ranges that are alone on their clock and contradict the known biases grossly, shape (T, K).
 
@@ -148,8 +145,8 @@ def tie_constellations(
     reference: str | None = None,
     parts: Sequence[slice] = (EVERY,),
     limits: TieLimits | None = None,
-) -> tuple[PointPositions, list[OffsetState]]:
-    """Return 3-D positions (P1 5), inter-system biases by the epochs before each, and the state after the last one.
+) -> tuple[Ranges, PointPositions, list[OffsetState]]:
+    """Return ranges tied by the inter-system biases known before each epoch, 3-D positions (P1 5), and the new states.
 
     Each further constellation costs one satellite for its clock, unless its bias is known to a metre. Biases
     are differences of the receiver clocks of positions from ranges that agree with each other, averaged over earlier
@@ -176,7 +173,7 @@ def tie_constellations(
     near = np.broadcast_to(np.asarray(near_ecef_m, dtype=np.float64), (len(ranges), 3))
     point = point_position(ranges, near, limits=limits.single_point)
     start = np.where(np.isnan(point.ecef_m), near, point.ecef_m)
-    agreeing, free = _agreeing(ranges, point, start, limits)
+    agreeing, free, disagreeing = _agreeing(ranges, point, start, limits)
     reference = reference or ("G" if "G" in clocks else clocks[0] if clocks else "G")
     ties, after = tie_clocks(
         time, clocks, reference, agreeing, free, states, parts=parts, limits=limits.clock_offsets
@@ -188,7 +185,7 @@ def tie_constellations(
     if len(ranges.groups) > 1:
         tied_ranges = replace(ranges, ties=ties)
         tied = _tie(tied_ranges, ties, point, start, limits.single_point)
-    return PointPositions(ranges, tied_ranges, point, tied, agreeing, free, ties, alone), after
+    return tied_ranges, PointPositions(point, tied, free, disagreeing, ties, alone), after
 
 
 def _tie(
@@ -205,13 +202,12 @@ def _tie(
 
 def _agreeing(
     ranges: Ranges, point: SinglePoint, start_ecef_m: Floats, limits: TieLimits
-) -> tuple[Ranges, SinglePoint]:
-    """Return the ranges that agree with each other in space, and the 3-D positions from these."""
-    fit = robust_fit(ranges, start_ecef_m, limits=limits.robust_fit)
-    dropped = (ranges.weight > 0) & ~fit.kept
+) -> tuple[Ranges, SinglePoint, Masks]:
+    """Return the ranges that agree with each other in space, the 3-D positions from these, and the other ranges."""
+    dropped = (ranges.weight > 0) & ~robust_fit(ranges, start_ecef_m, limits=limits.robust_fit).kept
     changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):
-        return ranges, point
+        return ranges, point, dropped
     agreeing = without(ranges, dropped)
     again = point_position(agreeing.take(changed), start_ecef_m[changed], limits=limits.single_point)
-    return agreeing, patch_rows(point, changed, again)
+    return agreeing, patch_rows(point, changed, again), dropped

@@ -9,7 +9,7 @@ any other form are read one at a time with `float`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -42,21 +42,6 @@ _KEEP: Final = np.array(
 )
 
 
-@dataclass(frozen=True)
-class Fields:
-    """Values of fields, shape (n, k): n satellite lines by k observation types."""
-
-    value: Floats  #: NaN where blank, and where `bad`.
-    lock: Bytes  #: Loss-of-lock digit, 0 where blank.
-    bad: Masks  #: Whether the field is neither blank nor a number, or one of its two indicators is not a digit.
-
-
-def join_fields(parts: Sequence[Fields]) -> Fields:
-    """Return the fields of the same satellites adjacent."""
-    arrays = ([getattr(part, name) for part in parts] for name in ("value", "lock", "bad"))
-    return Fields(*(np.concatenate(some, axis=1) for some in arrays))
-
-
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
     """Gather `count` fields of lines as pairs of little-endian 64-bit words (n, count, 2), blank beyond `length`."""
     width = FIELD_WIDTH * count
@@ -74,8 +59,14 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
     return words
 
 
-def read_fields(data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats) -> Fields:
-    """Read fields `index` of lines, divided by `divisor` (SYS / SCALE FACTOR), both shape (k,); rest as `gather`."""
+def read_fields(
+    data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
+) -> tuple[Floats, Bytes, Masks]:
+    """Return values, loss-of-lock digits and bad fields of n satellite lines by k observation types, shape (n, k).
+
+    A value is NaN where blank or bad, a digit 0 where blank. A field is bad that is neither blank nor a number, or one
+    of whose two indicators is not a digit. `index` and `divisor` (SYS / SCALE FACTOR), shape (k,); rest as `gather`.
+    """
     value, lock, odd = kernels.reading.decode_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
     row, column = np.nonzero(odd)
@@ -85,7 +76,7 @@ def read_fields(data: Bytes, start: Integers, length: Integers, index: Indices, 
         value[row, column] = read / divisor[column]
         lock[row[wrong], column[wrong]] = 0
         bad[row, column] = wrong
-    return Fields(value, lock, bad)
+    return value, lock, bad
 
 
 def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
@@ -144,8 +135,8 @@ def decode(
     for system in SYSTEMS:
         chosen = rows[rows.letter == ord(system)]
         if len(chosen.epoch) and (columns := header.columns(system)):
-            chosen, fields = _values(lines, chosen, system, columns, header, log)
-            parts.append((system, chosen, fields, columns))
+            chosen, value, lock = _values(lines, chosen, system, columns, header, log)
+            parts.append((system, chosen, value, lock, columns))
     return _scatter(parts, len(epochs))
 
 
@@ -240,8 +231,8 @@ def _without_repeats(lines: Lines, rows: DecodedRows, epochs: int, log: FaultLog
 
 def _values(
     lines: Lines, rows: DecodedRows, system: str, columns: tuple[SignalColumn, ...], header: RinexHeader, log: FaultLog
-) -> tuple[DecodedRows, Fields]:
-    """Parse the selected columns of the satellite lines; rows with faults are dropped and recorded."""
+) -> tuple[DecodedRows, Floats, Bytes]:
+    """Return rows, values and loss-of-lock digits of the chosen columns; rows with faults are dropped and recorded."""
     count = len(header.get_types(system) or ())
     width, before = (count, 3) if header.version >= 3.0 else (FIELDS_PER_LINE, 0)
     too_long = np.zeros(len(rows.line), dtype=np.bool_)
@@ -254,17 +245,19 @@ def _values(
         if here:
             index, divisor = np.array([c.index - first for c in here]), np.array([c.divisor for c in here])
             parts.append(read_fields(lines.data, start, length, index, divisor))
-    fields = parts[0] if len(parts) == 1 else join_fields(parts)
+    value, lock, bad = (
+        blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1) for blocks in zip(*parts, strict=True)
+    )
     log.faults(
         SATELLITES,
         lines.number[rows.line[too_long]],
         lambda i: f"the line of {_name(rows[too_long], i)} continues after its {count} declared observations",
     )
-    broken = fields.bad.any(axis=1) & ~too_long
+    broken = bad.any(axis=1) & ~too_long
     which = np.flatnonzero(broken)
 
     def message(i: int) -> str:
-        j = int(np.argmax(fields.bad[which[i]]))
+        j = int(np.argmax(bad[which[i]]))
         line, place = divmod(columns[j].index, width)
         text = lines.text(int(rows.line[which[i]]) + line)[before + FIELD_WIDTH * place :][:FIELD_WIDTH]
         return (
@@ -274,7 +267,7 @@ def _values(
 
     log.faults(SATELLITES, lines.number[rows.line[which]], message)
     fine = ~(broken | too_long)
-    return (rows, fields) if fine.all() else (rows[fine], take_rows(fields, fine))
+    return (rows, value, lock) if fine.all() else (rows[fine], value[fine], lock[fine])
 
 
 def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Masks:
@@ -287,23 +280,25 @@ def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Ma
     return result
 
 
-def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...]]], epochs: int) -> dict[str, Any]:
+def _scatter(
+    parts: list[tuple[str, DecodedRows, Floats, Bytes, tuple[SignalColumn, ...]]], epochs: int
+) -> dict[str, Any]:
     """Fill arrays over epochs and channels; channels without any observation are dropped."""
     satellites: list[str] = []
     signals: list[str] = []
     placed = []
-    for system, rows, fields, columns in parts:
+    for system, rows, value, digit, columns in parts:
         numbers, place = _number(rows.number)
         names = sorted({c.signal for c in columns})
-        placed.append((len(satellites) + place * len(names), rows, fields, columns, names))
+        placed.append((len(satellites) + place * len(names), rows, value, digit, columns, names))
         satellites += [f"{system}{n:02d}" for n in numbers.tolist() for _ in names]
         signals += names * len(numbers)
     shape = (epochs, len(satellites))
     kinds, lock = np.full((len(KINDS), *shape), np.nan), np.zeros(shape, dtype=np.uint8)
-    for base, rows, fields, columns, names in placed:
+    for base, rows, value, digit, columns, names in placed:
         cell = rows.epoch * shape[1] + base
         kind, signal = np.array([c.kind for c in columns]), np.array([names.index(c.signal) for c in columns])
-        kernels.reading.place_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
+        kernels.reading.place_fields(kinds, lock, cell, kind, signal, value, digit)
     used = channels_with_data(kinds, lock)
     keep = np.flatnonzero(used) if not used.all() else slice(None)
     names_of = {"satellite": np.array(satellites, dtype="<U3")[keep], "signal": np.array(signals, dtype="<U2")[keep]}
