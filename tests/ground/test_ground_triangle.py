@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-import static_monitors
+import static_fixes
 from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations, concatenate
@@ -441,7 +441,7 @@ def test_two_stations_of_a_recording_as_monitors(recordings: Path) -> None:
 @pytest.mark.slow
 def test_static_recordings_under_open_sky_give_no_false_alarm(recordings: Path) -> None:
     """One receiver at a time against its circle; an attenuated antenna at its cold start is another matter."""
-    found = static_monitors.recordings(recordings)
+    found = static_fixes.recordings(recordings)
     for name, (_, offset, _) in found.items():
         error = np.hypot(*offset.T)
         assert np.isfinite(error).mean() > 0.97, name

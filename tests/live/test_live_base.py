@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-from base_score import cases
+from base_cases import cases
 from railfix.cli import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK

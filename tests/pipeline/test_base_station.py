@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import base_score
+import base_cases
 import recordings_truth
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
@@ -131,7 +131,7 @@ def test_a_virtual_station_that_has_moved_begins_anew_with_its_smoothing(drive: 
 @pytest.mark.requirement("A12")
 def test_integers_of_two_antennas_on_a_roof_are_right(recordings: Path) -> None:
     """Also where the first places are off by decimetres, as codes are; the map is stated as 0.05 m and right."""
-    case = next(case for case in base_score.cases(recordings) if case.name.startswith("roof"))
+    case = next(case for case in base_cases.cases(recordings) if case.name.startswith("roof"))
     processor = EpochProcessor(
         parse_config({
             "filter": "off", "carrier": "fixed", "elevation": {"mask_deg": 15.0}, "map_plan_sigma_m": 0.05,

@@ -1,7 +1,8 @@
 """Run a study of a finished decision as it was: ``python tests/studies/at_commit.py COMMIT STUDY [WORDS ...]``.
 
 The figures of such a decision are those of the code of its day. The commit is checked out into a temporary folder
-with the recordings beside it, where the study runs on the commit's own source; its kernels are compiled for it.
+with the recordings beside it, and the study runs on the commit's own source, with the kernels compiled for it; files
+that its words name are those of the folder in which it is called.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ def main() -> None:
         subprocess.run([*git, "add", "--detach", "--quiet", str(folder), commit], check=True)
         try:
             environment = {**os.environ, "PYTHONPATH": str(folder / "src")}
-            command = [sys.executable, f"tests/studies/{study}.py", *words]
-            done = subprocess.run(command, cwd=folder, env=environment, check=False)
+            command = [sys.executable, str(folder / "tests" / "studies" / f"{study}.py"), *words]
+            done = subprocess.run(command, env=environment, check=False)
         finally:
             subprocess.run([*git, "remove", "--force", str(folder)], check=True)
     sys.exit(done.returncode)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import filter_score
+import belief_campaign
 import recordings_score
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
@@ -21,27 +21,20 @@ BOUNDS = {
     # The map cuts a bend of 10 s without a reference, beyond which laps 5 m apart are alike: it ends on another one.
     "japan": (0.6, 6.0, 6.5, 2.1),
 }
-RUNS = {
-    "m8t": recordings_score.urbannav_m8t,
-    "f9p": recordings_score.urbannav_f9p,
-    "pixel": recordings_score.gsdc,
-    "japan": recordings_score.japan,
-}
 
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "pixel" else n for n in BOUNDS])
 @pytest.mark.every(2)
 def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> None:
-    case = filter_score.rinex_case(name, RUNS[name], recordings)
-    found = case.run()
-    error = case.error(found)[case.observed]
+    found = belief_campaign.run(belief_campaign.cases(recordings)[name](), {})
+    error = found.straight_m
     p50, p95, largest, ratio = BOUNDS[name]
     assert np.isfinite(error).all()
     assert np.median(error) < p50
     assert np.percentile(error, 95) < p95
     assert error.max() < largest
-    assert np.percentile(error / found.sigma_m[case.observed], 95) < ratio
+    assert np.percentile(error / found.sigma_m, 95) < ratio
 
 
 @pytest.mark.requirement("E5", "C2")

@@ -1,8 +1,5 @@
 """Errors drawn against the protection level: noise alone, and one and two faults of the size that hurts most.
 
-Run ``python tests/studies/protection_brute_force.py`` for the tables of
-tests/references/results/protection-brute-force.txt (several minutes).
-
 Geometries are drawn (satellites, constellations, heading of the track, map error); their levels come from
 the code under test. The errors do not: every position, with all satellites and without each subset, is an
 operator from its own normal matrix with a column a clock and a row a prior, applied to drawn noise.
@@ -450,58 +447,3 @@ OFTEN: Final = RiskBudget(
     satellite_prior=dict.fromkeys("GEC", 0.02),
     local_prior=0.0,
 )
-
-
-def print_drawn(count: int, draws: int) -> None:
-    for number, (name, risk) in enumerate(BUDGETS.items()):
-        print(f"\nrisk {name}: {count} geometries drawn, {draws} epochs each of those with a level")
-        print(f"{'':34s}{'epochs':>11s}{'allowed':>11s}{'found':>9s}{'most':>9s}{'x 0.9':>9s}{'x 0.8':>9s}")
-        for kind, c in simulate(count, draws, 11 + number, risk).items():
-            tail = "".join(f"{s:9d}" for s in c.shrunk)
-            print(f"{kind:34s}{c.draws:11d}{c.allowed:11.1f}{c.found:9d}{c.most:9d}{tail}")
-
-
-def print_whole(count: int, draws: int) -> None:
-    print("\nall hypotheses at their worst sizes, drawn by importance: risk over what it may be")
-    print(f"{'risk':20s}{'epochs':>11s}{'level':>9s}{'+-':>9s}{'x 0.9':>9s}{'x 0.8':>9s}")
-    for number, (name, risk) in enumerate(BUDGETS.items()):
-        got = whole_risk(count, draws, 41 + number, risk)
-        tail = "".join(f"{got.share(k):9.3f}" for k in (1, 2))
-        print(f"{name:20s}{got.epochs:11d}{got.share():9.4f}{got.spread:9.4f}{tail}")
-
-
-def print_analytic(count: int) -> None:
-    risk = HOURLY
-    print("\nrisk of an hour 1e-7, all hypotheses at their worst sizes, over what it may be")
-    print(f"{'level x':>8s}{'geometries':>12s}{'median':>12s}{'largest':>12s}")
-    for factor in (1.0, *SHRUNK):
-        total = analytic(count, 29, risk, factor)
-        print(f"{factor:8.1f}{total.geometries:12d}{total.median:12.3g}{total.largest:12.3g}")
-
-
-def print_summed(count: int) -> None:
-    ratio = summed_levels(count, 29, HOURLY)
-    print(f"\nlevel where the tails are the risk (by halving), {len(ratio)} geometries")
-    print(f"{'over':24s}{'5 %':>8s}{'50 %':>8s}{'95 %':>8s}{'largest':>9s}")
-    for name, column in (("the level", ratio[:, 0]), ("the largest of parts", ratio[:, 1])):
-        low, middle, high = np.percentile(column, [5, 50, 95])
-        print(f"{name:24s}{low:8.3f}{middle:8.3f}{high:8.3f}{column.max():9.4f}")
-
-
-def print_excluding(draws: int) -> None:
-    got = excluding(draws, 5, OFTEN)
-    print("\nexclusion at work, 11 satellites, fault prior 0.02, risk 2e-3 a sample")
-    print(f"{'faults':>7s}{'probability':>13s}{'epochs':>9s}{'excluded':>10s}{'misled':>8s}{'by K sigma':>12s}")
-    for k in range(4):
-        row = f"{k:7d}{got.probability[k]:13.2e}{got.draws[k]:9.0f}{got.excluded[k]:10.0f}{got.misled[k]:8.0f}"
-        print(row + f"{got.careless[k]:12.0f}")
-    print(f"risk {got.risk(got.misled):.2e} of {OFTEN.risk_per_sample:.1e}", end="; ")
-    print(f"with K sigma alone {got.risk(got.careless):.2e}")
-
-
-if __name__ == "__main__":
-    print_drawn(2400, 5000)
-    print_whole(2400, 5000)
-    print_analytic(2400)
-    print_summed(2400)
-    print_excluding(50_000)

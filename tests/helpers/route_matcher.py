@@ -1,31 +1,26 @@
 """Positions on a network by the shortest routes between neighbouring ones: another matcher beside railfix's.
 
-``python tests/studies/route_matcher.py`` prints both on the logs of the measuring train. Its states are the nearest
-points of all tracks near a position; the cost of a sequence is that of the distances and of how far the shortest routes
-between its points differ from the straight distances (Newson & Krumm 2009, doi:10.1145/1653771.1653818), by networkx
-over places written out here. It keeps no probability, no common error and no track that the map does not have.
+Its states are the nearest points of all tracks near a position; the cost of a sequence is that of the distances and of
+how far the shortest routes between its points differ from the straight distances (Newson & Krumm 2009,
+doi:10.1145/1653771.1653818), by networkx over places written out here. It keeps no probability, no common error and no
+track that the map does not have.
 """
 
 from __future__ import annotations
 
-import csv
 from functools import cache
 from itertools import pairwise
 
 import networkx as nx
 import numpy as np
 
-from network_recordings import COLUMNS, FOLDER, known_tracks
 from railfix.track.network import Network
-from railfix.track.network_match import PlanLog, match, read_plan_positions
-from railfix.track.network_read import read_network
+from railfix.track.network_match import PlanLog
 
 #: Farthest track looked at, standard deviation of a position, and scale of a route's excess over the straight [m].
 WITHIN_M, SIGMA_M, EXCESS_M = 100.0, 2.0, 5.0
 #: Cost of a step that no route makes, and metres from the line of positions that count no more.
 NO_ROUTE, LARGEST = 200.0, 12.0
-#: Distance that counts as on the track [m].
-ON_M = 5.0
 
 
 class RouteMatcher:
@@ -82,26 +77,3 @@ def matched_track(network: Network, log: PlanLog) -> tuple[np.ndarray, np.ndarra
     track, offset = np.full(len(log.time), -1), np.full(len(log.time), np.inf)
     track[rows], offset[rows] = near.track[rows, column], near.offset_m[rows, column]
     return track, offset
-
-
-def main() -> None:
-    network = read_network([FOLDER / "network_airport.geojson"])
-    print("| log | positions | a track within 5 m | of railfix | of shortest routes | track known | railfix | routes |")
-    print("|---|---:|---:|---:|---:|---:|---:|---:|")
-    for path in sorted(FOLDER.glob("log_*.csv")):
-        log = read_plan_positions(path, columns=COLUMNS)
-        with path.open() as file:
-            fixed = np.array([row["position_type"] == "NARROW_INT3" for row in csv.DictReader(file)])
-        ours, (track, offset) = match(network, log), matched_track(network, log)
-        nearest = np.abs(network.near(log.latitude_deg, log.longitude_deg).offset_m[:, 0]) <= ON_M
-        known = known_tracks(network, log, fixed)
-        rows = known >= 0
-        print(
-            f"| {path.stem.split('_')[1]} | {len(rows)} | {nearest.mean():.3f} | "
-            f"{(np.abs(ours.offset_m) <= ON_M).mean():.3f} | {(np.abs(offset) <= ON_M).mean():.3f} | {rows.sum()} | "
-            f"{(ours.track == known)[rows].mean():.3f} | {(track == known)[rows].mean():.3f} |"
-        )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,15 +1,11 @@
 """Protection levels along a line over Japan for an hour of MSAS messages: geometry alone, no receiver.
 
-``python tests/studies/sbas_hour.py`` with the recordings beside the checkout prints the tables of
-``docs/level-results.md``. The lines are great circles with a point a kilometre; every ten seconds each satellite of
-the navigation file that MSAS corrects (issues of data matched) gives a range of its own sigma, and the level is that
-of a train at the point.
+The lines are great circles; every ten seconds each satellite of the navigation file that MSAS corrects (issues of data
+matched) gives a range of its own sigma, and the level is that of a train at the point.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +13,6 @@ from typing import Final
 
 import numpy as np
 
-import paths
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.gnss.orbits import satellite_states
 from railfix.integrity.protection import protection_level
@@ -28,7 +23,6 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.positioning.range_arrays import FILLER_SATELLITE_M, Ranges
 from railfix.ranges.channels import clock_groups
-from railfix.ranges.error_model import ErrorModel, read_error_model
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
 from railfix.ranges.sbas.sbas_sources import apply_long_term
@@ -36,19 +30,12 @@ from railfix.ranges.sbas.troposphere import rtca_troposphere_sigma_m
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Latitude, longitude [deg] of the ends.
-LINES: Final = {
-    "Tokyo to Osaka": ((35.681, 139.767), (34.733, 135.500)),
-    "Kyoto northward": ((34.986, 135.758), (35.886, 135.758)),
-}
 HEIGHT_M: Final = 50.0
 GPS: Final = np.array([f"G{number:02d}" for number in range(1, 33)])
 MASKS_DEG: Final = (5.0, 15.0, 20.0)
 ALARM_LIMITS_M: Final = (10.0, 20.0, 40.0)
 #: The messages have to come first: masks, types 7 and 10, grid [s].
 WARM_UP_S: Final = 600.0
-#: C/N0 that an error model is asked with: an open sky [dB-Hz].
-OPEN_SKY_DBHZ: Final = 42.0
 
 #: Sigma and largest bias of what multipath and receiver add, by elevation and azimuth from the direction of travel.
 Local = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -58,11 +45,6 @@ def by_noise(elevation_deg: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.n
     """Default noise settings at their reference C/N0: 1 m at the zenith by 1/sin(elevation), and a floor of 1 m."""
     sigma = code_sigma_m(np.full(elevation_deg.shape, np.nan), elevation_deg, noise=CodeNoise())
     return sigma, np.zeros(sigma.shape)
-
-
-def by_model(model: ErrorModel) -> Local:
-    """An error model of local errors at the C/N0 of an open sky."""
-    return lambda elevation, azimuth: model.at(elevation, azimuth, OPEN_SKY_DBHZ)
 
 
 @dataclass(frozen=True)
@@ -198,74 +180,3 @@ def _at_point(
 def warm(above: Sky) -> np.ndarray:
     """Epochs after the first ten minutes."""
     return above.time >= above.time[0] + np.timedelta64(int(WARM_UP_S), "s")
-
-
-def row(one: Levels, late: np.ndarray) -> str:
-    """Satellites, levels and availability with one mask."""
-    used, level, alone = one.used[:, late], one.level_m[:, late], one.fault_free_m[:, late]
-    share = " ".join(f"{100.0 * np.mean(level <= limit):5.1f}" for limit in ALARM_LIMITS_M)
-    without = " ".join(f"{100.0 * np.mean(alone <= limit):5.1f}" for limit in ALARM_LIMITS_M)
-    return (
-        f"{one.local:18s} {one.mask_deg:4.0f} {used.min():3d} {np.median(used):3.0f} {used.max():3d}  "
-        f"{_three(one.dilution[:, late], 2)}  {_three(alone, 1)}  {without}  {_three(level, 1)}  {share}"
-    )
-
-
-HEAD: Final = (
-    f"{'local errors':18s} mask        used        dilution            K sigma [m]   "
-    "availability %    with local faults   availability %",
-    f"{'':18s}  deg min med max    50   95   max    50   95   max     "
-    "10    20    40    50   95   max     10    20    40",
-)
-
-
-def _three(values: np.ndarray, digits: int) -> str:
-    good = values[np.isfinite(values)]
-    return f"{np.percentile(good, 50):5.{digits}f} {np.percentile(good, 95):5.{digits}f} {good.max():5.{digits}f}"
-
-
-def parts_row(one: Levels, late: np.ndarray) -> str:
-    """What the variance of the position consists of, and of the worst twentieth of the levels."""
-    variance, level = one.variance_m2[:, late].reshape(-1, 5), one.level_m[:, late].ravel()
-    worst = level >= np.nanpercentile(np.where(np.isfinite(level), level, np.nan), 95)
-    words = []
-    for which in (np.isfinite(level), worst & np.isfinite(level)):
-        share = 100.0 * variance[which].sum(axis=0) / variance[which].sum()
-        words.append(" ".join(f"{s:5.1f}" for s in share) + f"   {one.used[:, late].ravel()[which].mean():4.1f}")
-    return f"{one.local:18s} {one.mask_deg:4.0f}  {words[0]}    {words[1]}"
-
-
-def main() -> int:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", type=Path, help="error model of local errors, as well")
-    parser.add_argument("--spacing-km", type=float, default=1.0)
-    options = parser.parse_args()
-    data = paths.ROOT.parent / "shared" / "data"
-    if not data.is_dir():
-        print(f"the real recordings are not at {data}", file=sys.stderr)
-        return 1
-    above = sky(data)
-    late = warm(above)
-    print(*above.engine.notes, sep="\n")
-    local = {"noise settings": by_noise}
-    if options.model:
-        local["error model"] = by_model(read_error_model(options.model))
-    for name, ends in LINES.items():
-        line = great_circle(*ends, spacing_m=1000.0 * options.spacing_km)
-        found = levels(above, line, local)
-        print(f"\n{name}: {len(line.ecef_m)} points on {line.arc_m[-1] / 1000.0:.0f} km, {late.sum()} epochs")
-        print("\n".join(HEAD))
-        print("\n".join(row(one, late) for one in found))
-        print("variance of the position, %: flt, ionosphere, troposphere, local, map; satellites used")
-        print(f"{'local errors':18s} mask  all epochs{'':27s} the 5 % with the largest levels")
-        print("\n".join(parts_row(one, late) for one in found))
-        begin = np.argmax(np.isfinite(found[0].level_m).any(axis=0))
-        print(
-            f"first level {(above.time[begin] - above.time[0]) / np.timedelta64(1, 's'):.0f} s after the first message"
-        )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

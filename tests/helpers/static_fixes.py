@@ -1,8 +1,6 @@
-"""Static recordings as one-receiver monitors: how often would the circle of 12 m alarm without a fault?
+"""Horizontal errors of the fixes of static recordings.
 
-``python tests/studies/static_monitors.py`` prints for each recording the fixes, their horizontal errors, the epochs
-outside the circle and the stops that they would be (runs of them, ends 300 s apart or more). The point is the header's,
-or for recordings without one the median of the fixes themselves.
+The point is the header's, or for recordings without one the median of the fixes themselves.
 """
 
 from __future__ import annotations
@@ -17,8 +15,6 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.ground.fixes_at_stations import StationFixes, station_fixes, stream_fixes
 from railfix.io import read_navigation, read_observations
 from railfix.io.receiver.log import read_receiver_positions
-
-RADIUS_M = 12.0
 
 
 def of_log(log: Path, nav: Path, *, seconds: float | None = None) -> tuple[Datetimes, Floats, Integers]:
@@ -64,27 +60,3 @@ def recordings(data: Path = paths.DATA) -> dict[str, tuple[Datetimes, Floats, In
             data / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
         ),
     }  # fmt: skip
-
-
-def stops(time: Datetimes, outside: np.ndarray) -> int:
-    """Number of stops: a latched stop is released after 300 s inside."""
-    at = time[outside]
-    return 0 if not len(at) else 1 + int((np.diff(at) > np.timedelta64(300, "s")).sum())
-
-
-def main() -> None:
-    """Print the table."""
-    print(f"{'recording':40}{'epochs':>7}{'fixes':>8}{'p50':>7}{'p95':>7}{'max':>7}  outside {RADIUS_M:g} m   stops")
-    for name, (time, offset, satellites) in recordings().items():
-        error = np.hypot(*offset.T)
-        p50, p95, largest = np.nanpercentile(error, [50, 95, 100])
-        outside = error > RADIUS_M
-        few = f" ({satellites[outside].min()} to {satellites[outside].max()} satellites)" if outside.any() else ""
-        print(
-            f"{name:40}{len(time):7}{100 * np.isfinite(error).mean():7.1f}%{p50:7.2f}{p95:7.2f}{largest:7.2f}"
-            f"{int(outside.sum()):9}{stops(time, outside):8}{few}"
-        )
-
-
-if __name__ == "__main__":
-    main()
