@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from railfix.gnss.navigation import GlonassRecords, KeplerRecords
-
 rtk = pytest.importorskip("pyrtklib5", reason="pyrtklib5 (the oracle) is not installed")
 _SYSTEMS = {"G": rtk.SYS_GPS, "J": rtk.SYS_QZS, "E": rtk.SYS_GAL, "C": rtk.SYS_CMP, "R": rtk.SYS_GLO}
 
@@ -25,33 +23,6 @@ def instant(time: np.datetime64) -> Any:
 
 def satellite_number(name: str) -> int:
     return int(rtk.satno(_SYSTEMS[name[0]], int(name[1:]) + (192 if name[0] == "J" else 0)))
-
-
-def kepler_ephemeris(records: KeplerRecords, row: int) -> Any:
-    eph = rtk.eph_t()
-    eph.sat = satellite_number(str(records.satellite[row]))
-    eph.toe, eph.toc = instant(records.toe[row]), instant(records.toc[row])
-    eph.toes, eph.A = float(records.toe_sow_s[row]), float(records.sqrt_a[row]) ** 2
-    names = {
-        "f0": "af0_s", "f1": "af1", "f2": "af2", "e": "eccentricity", "M0": "m0", "deln": "delta_n", "OMG0": "omega0",
-        "i0": "i0", "omg": "omega", "OMGd": "omega_dot", "idot": "i_dot", "cuc": "cuc", "cus": "cus", "crc": "crc",
-        "crs": "crs", "cic": "cic", "cis": "cis",
-    }  # fmt: skip
-    for theirs, ours in names.items():
-        setattr(eph, theirs, float(getattr(records, ours)[row]))
-    return eph
-
-
-def glonass_ephemeris(records: GlonassRecords, row: int) -> Any:
-    eph = rtk.geph_t()
-    eph.sat = satellite_number(str(records.satellite[row]))
-    eph.toe = instant(records.toe[row])
-    eph.taun, eph.gamn = -float(records.clock_bias_s[row]), float(records.relative_frequency[row])
-    for i in range(3):
-        eph.pos[i] = float(records.position_ecef_m[row, i])
-        eph.vel[i] = float(records.velocity_ecef_mps[row, i])
-        eph.acc[i] = float(records.acceleration_ecef_mps2[row, i])
-    return eph
 
 
 def state(ephemeris: Any, time: np.datetime64, code_m: float) -> tuple[list[float], float]:

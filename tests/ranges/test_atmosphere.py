@@ -16,7 +16,7 @@ from railfix.core.arrays import read_only
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m, saastamoinen_delay_m
 
-REFERENCES = json.loads((Path(__file__).parents[1] / "references" / "orbits.json").read_text())
+REFERENCES = json.loads((Path(__file__).parents[1] / "references" / "delays.json").read_text())
 COEFFICIENTS = np.array(REFERENCES["klobuchar"])
 L1 = np.array([FREQUENCY_L1])
 

@@ -1,8 +1,8 @@
-"""Print reference numbers of orbits, clocks and delays, by pyrtklib5 (RTKLIB in C), for made records.
+"""Print reference numbers of delays, by pyrtklib5 (RTKLIB in C).
 
 Run from the repository's root, with pyrtklib5 installed:
 
-    python tests/references/make_orbit_references.py > tests/references/orbits.json
+    python tests/references/make_delay_references.py > tests/references/delays.json
 """
 
 from __future__ import annotations
@@ -20,25 +20,7 @@ sys.path.extend(str(Path(__file__).resolve().parents[1] / folder) for folder in 
 import orbit_cases
 import pyrtklib_orbits
 
-#: Seconds of the epochs after toe.
-KEPLER_S = (-7111.25, -1800.0, 0.0, 17.345678, 3600.0, 7111.5)
-GLONASS_S = (-1777.25, -60.0, -12.5, 0.0, 59.9, 1000.0, 1777.125)
-CODE_M = 24_123_456.789
 KLOBUCHAR = [1.1176e-08, 2.2352e-08, -1.1921e-07, -5.9605e-08, 1.2902e05, 1.6384e05, -1.9661e05, -2.6214e05]
-
-
-def states() -> list[dict[str, object]]:
-    found = []
-    kepler = orbit_cases.kepler(*[{"satellite": name} for name in orbit_cases.KINDS])
-    glonass = orbit_cases.glonass({"satellite": "R07"})
-    ephemerides = [(str(s), pyrtklib_orbits.kepler_ephemeris(kepler, i)) for i, s in enumerate(kepler.satellite)]
-    ephemerides += [("R07", pyrtklib_orbits.glonass_ephemeris(glonass, 0))]
-    for name, ephemeris in ephemerides:
-        for seconds in GLONASS_S if name == "R07" else KEPLER_S:
-            time = orbit_cases.TOE + np.timedelta64(round(seconds * 1e9), "ns")
-            position, clock = pyrtklib_orbits.state(ephemeris, time, CODE_M)
-            found.append({"satellite": name, "after_toe_s": seconds, "position_ecef_m": position, "clock_m": clock})
-    return found
 
 
 def delays() -> dict[str, list[dict[str, object]]]:
@@ -64,10 +46,8 @@ if __name__ == "__main__":
         json.dumps(
             {
                 "program": f"pyrtklib5 {version('pyrtklib5')}",
-                "made_by": "tests/references/make_orbit_references.py",
-                "code_m": CODE_M,
+                "made_by": "tests/references/make_delay_references.py",
                 "klobuchar": KLOBUCHAR,
-                "states": states(),
                 **delays(),
             },
             indent=0,
