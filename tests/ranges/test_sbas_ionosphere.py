@@ -143,35 +143,30 @@ def test_three_points_do_if_they_are_around_the_place(
         assert np.isnan(found.delay_m.item())
 
 
-def test_a_large_cell_serves_where_the_mask_has_no_small_one() -> None:
-    points = {(30, 120): (1.0, 0), (40, 120): (2.0, 0), (30, 130): (3.0, 0), (40, 130): (5.0, 0)}
-    found = overhead(grid({7: points}), 36.0, 122.0)
-    weights = np.array([0.8 * 0.4, 0.8 * 0.6, 0.2 * 0.4, 0.2 * 0.6])
+@pytest.mark.parametrize(
+    ("band", "places", "at", "east", "north"),
+    [
+        (7, [(35, 125), (45, 125), (35, 135), (45, 135)], (41.0, 127.0), 0.2, 0.6),
+        (9, [(65, 0), (70, 0), (65, 10), (70, 10)], (67.0, 4.0), 0.4, 0.4),
+        (9, [(60, 0), (65, 0), (60, 10), (65, 10)], (60.5, 4.0), 0.4, 0.1),
+    ],
+    ids=["large, beginning anywhere", "wider north of 60 degrees", "wider from 60 degrees on"],
+)
+def test_cells_of_other_sizes(
+    band: int, places: list[tuple[int, int]], at: tuple[float, float], east: float, north: float
+) -> None:
+    found = overhead(grid({band: dict(zip(places, FOUR, strict=True))}), *at)
+    weights = np.outer([1.0 - east, east], [1.0 - north, north]).ravel()
     assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
+
+
+def test_a_large_cell_serves_where_the_mask_has_no_small_one() -> None:
+    points = dict(zip([(30, 120), (40, 120), (30, 130), (40, 130)], FOUR, strict=True))
+    found = overhead(grid({7: points}), 36.0, 122.0)
+    assert found.delay_m.item() == pytest.approx([0.32, 0.48, 0.08, 0.12] @ np.array([1.0, 2.0, 3.0, 5.0]), abs=1e-9)
     # As soon as the mask has the small cell it is that one, monitored or not.
     small = {(35, 120): (0.0, 15), (40, 125): (0.0, 15), (35, 125): (0.0, 15)}
     assert overhead(grid({7: points | small}), 36.0, 122.0).state.item() == IonosphereState.NOT_MONITORED
-
-
-def test_large_cells_may_begin_at_any_point() -> None:
-    points = {(35, 125): (1.0, 0), (45, 125): (2.0, 0), (35, 135): (3.0, 0), (45, 135): (5.0, 0)}
-    found = overhead(grid({7: points}), 41.0, 127.0)
-    weights = np.array([0.8 * 0.4, 0.8 * 0.6, 0.2 * 0.4, 0.2 * 0.6])
-    assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
-
-
-def test_cells_are_wider_north_of_60_degrees() -> None:
-    points = {(65, 0): (1.0, 0), (70, 0): (2.0, 0), (65, 10): (3.0, 0), (70, 10): (5.0, 0)}
-    found = overhead(grid({9: points}), 67.0, 4.0)
-    weights = np.array([0.6 * 0.6, 0.6 * 0.4, 0.4 * 0.6, 0.4 * 0.4])
-    assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
-
-
-def test_cells_are_wider_from_60_degrees_on() -> None:
-    points = {(60, 0): (1.0, 0), (65, 0): (2.0, 0), (60, 10): (3.0, 0), (65, 10): (5.0, 0)}
-    found = overhead(grid({9: points}), 60.5, 4.0)
-    weights = np.array([0.6 * 0.9, 0.6 * 0.1, 0.4 * 0.9, 0.4 * 0.1])
-    assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
 
 
 def test_points_near_the_pole_are_interpolated_along_it_first() -> None:
