@@ -1,22 +1,22 @@
 """Simulated yards: trains at rest on parallel tracks, with the code errors of `StandstillErrors`.
 
-``python tests/helpers/yard_made.py 2000`` prints the calibration of the decisions and of a naive method.
+``python tests/helpers/yard_made.py 2000`` prints the calibration of the decisions.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
-from railfix.positioning.standstill_phase import CodePlace, MeanPhases
+from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.track_choice import (
     StandstillErrors,
-    StandstillFix,
     YardTrack,
     standstill_fix,
     track_posterior,
@@ -104,8 +104,7 @@ def decided(
 
     A track is missing in the map with the prior's probability, or as `unmapped` states.
 
-    `method` "naive" counts the 1 Hz samples as independent; "phase" has carrier phases, too, with `half_cycle` a
-    satellite of each antenna half a cycle off.
+    `method` "phase" has carrier phases, too, with `half_cycle` a satellite of each antenna half a cycle off.
     """
     rng = np.random.default_rng(seed)
     count = int(rng.integers(2, 13))
@@ -154,21 +153,9 @@ def decided(
             )  # fmt: skip
             assert fix is not None
             assert fix.place is not None
-            place, shrink = fix.east_north_m + shift, 1.0 / look if method == "naive" else 1.0
-            fixes.append(
-                StandstillFix(
-                    east_north_m=place,
-                    own_m2=fix.own_m2 * shrink,
-                    common_m2=fix.common_m2 * shrink,
-                    misfit=fix.misfit,
-                    freedom=fix.freedom,
-                    place=CodePlace(
-                        place_m=fix.place.place_m + np.append(shift, 0.0), covariance_m2=fix.place.covariance_m2
-                    ),
-                )
-            )
-        used = errors.replaced(map_sigma_m=0.0) if method == "naive" else errors
-        posterior = track_posterior(tracks, fixes, arms_m=arms, errors=used, phases=phases)
+            moved_place = replace(fix.place, place_m=fix.place.place_m + np.append(shift, 0.0))
+            fixes.append(replace(fix, east_north_m=fix.east_north_m + shift, place=moved_place))
+        posterior = track_posterior(tracks, fixes, arms_m=arms, errors=errors, phases=phases)
         for risk in RISKS:
             name = posterior.decision(risk=risk)
             if name and risk not in answers:
@@ -183,7 +170,6 @@ def main() -> None:
         ("base station", 0.05, "model"),
         ("no base station", 1.0, "model"),
         ("base station, carrier phases", 0.05, "phase"),
-        ("1 Hz samples as independent, no base station", 1.0, "naive"),
     ):
         rows = [decided(k, errors=errors, common_sigma_m=common, method=method) for k in range(yards)]
         for risk in RISKS:

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 
 import recordings_truth
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import geodetic_from_ecef
 from railfix.evaluate.public_data import DRIVE, DRIVE_FILES
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, carrier_frequency_hz
@@ -233,45 +233,3 @@ def test_single_point_with_the_same_choices(log: Log, tmp_path: Path, name: str,
     difference = np.linalg.norm(again[both] - place[row[both]], axis=1)
     _, p95 = percentiles(name, "same weights, records, delays", difference)
     assert p95 < min(same_p95_m, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("name", "p50_m", "p95_m"),
-    [
-        ("geonet 0759", 0.5, 1.0),
-        ("geonet 3040", 0.5, 1.0),
-        ("japan GJE", 1.0, 2.0),
-        pytest.param("esbc G", 1.5, 4.0, marks=pytest.mark.slow),
-        ("esbc GEC", 1.2, 2.5),
-    ],
-)
-@pytest.mark.every(5)
-def test_single_point_as_it_comes(log: Log, tmp_path: Path, name: str, p50_m: float, p95_m: float):
-    """Each with its own choices: further apart than 0.5 m, as far as these carry, and about as near to the truth.
-
-    At the two stations without C/N0 the nearest toe is better, by a fifth at the median; in Japan railfix is.
-    """
-    time, place, _ = rtklib(log, tmp_path)
-    found, trajectory, _ = positions(log, lambda navigation: navigation)
-    row = paired(found, time)
-    both = np.flatnonzero((row >= 0) & np.isfinite(found.point.ecef_m[:, 0]))
-    own, other = found.point.ecef_m[both], place[row[both]]
-    p50, p95 = percentiles(name, "own weights, records, delays", np.linalg.norm(own - other, axis=1))
-    assert p50 < p50_m
-    assert p95 < p95_m
-    (_, own_offset), (_, other_offset) = trajectory.nearest(own), trajectory.nearest(other)
-    own_p50, _ = percentiles(name, "railfix, distance from the line", own_offset)
-    other_p50, _ = percentiles(name, "RTKLIB, distance from the line", other_offset)
-    assert own_p50 < 1.25 * other_p50
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["geonet 0759", "geonet 3040", "esbc G", "esbc E", "esbc C", "esbc GEC"])
-def test_up_error_of_a_station(log: Log, name: str):
-    """Ionosphere and troposphere off would leave more than 10 m here."""
-    found, _, _ = positions(log, lambda navigation: navigation)
-    place = read_observations(log.observations).header.approximate_ecef_m
-    latitude, longitude, _ = geodetic_from_ecef(place)
-    up = (found.point.ecef_m - place) @ enu_axes(latitude, longitude)[2]
-    print(f"{name:12s} median up error {np.nanmedian(up):6.2f} m over {np.isfinite(up).sum()} epochs")
-    assert abs(np.nanmedian(up)) < 1.5
