@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import os
 import re
@@ -14,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bad_inputs import Desk
+from conftest import ROOT
 from railfix.cli import app
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
@@ -26,6 +28,10 @@ def desk(good: Desk) -> Desk:
     return good
 
 
+#: Words of commands that are wrong, the exit code, and a part of the sentence.
+BAD_WORDS = list(csv.DictReader((ROOT / "tests" / "references" / "bad_words.csv").open(encoding="utf-8")))
+
+
 def text_of(output: str) -> str:
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", output).split())
 
@@ -35,100 +41,7 @@ def text_of(output: str) -> str:
 
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
-    [
-        ("run --overwrite true", 2, "--overwrite is a switch and takes no value; leave true out"),
-        ("evaluate run --reference r --overwrite yes", 2, "--overwrite is a switch and takes no value"),
-        ("report run --out p.html --overwrite 1", 2, "--overwrite is a switch and takes no value; leave 1 out"),
-        ("run --overwrite=true", 2, "--overwrite"),
-        ("run --preset p1 --preset strict", 2, "--preset is given twice; give it once"),
-        ("run --out a --out=b", 2, "--out is given twice"),
-        ("simulate demo --seed 1 --seed 2 --out x", 2, "--seed is given twice"),
-        ("map check --max-gap 1 line.csv --max-gap 2", 2, "--max-gap is given twice"),
-        ("{log} --preset p1 --set preset=strict", 4, "the preset is given twice (--preset p1 and --set preset=strict)"),
-        ("{log} --set elevation.mask_deg=1 --set elevation.mask_deg=2", 4, "elevation.mask_deg is given 2 times"),
-        ("simulate demo --out x --set seed=1 --set seed=2", 4, "--set seed is given 2 times"),
-        ("{log} --set elevation.mask_deg", 4, "expected KEY=VALUE"),
-        ("{log} --set elevation.mask_degrees=1", 4, "unknown setting"),
-        ("{log} --set elevation=1", 4, "elevation"),
-        ("{log} --set elevation.mask_deg=high", 4, "elevation.mask_deg"),
-        ("{log} --set elevation.mask_deg=1e999", 4, "elevation.mask_deg"),
-        ("{log} --set elevation.mask_deg=nan", 4, "elevation.mask_deg"),
-        ("{log} --set systems=[]", 4, "systems"),
-        ("{log} --set systems=[1]", 4, "systems"),
-        ("{log} --set systems=X", 4, "systems"),
-        ("{log} --set a.b.c.d=1", 4, "unknown setting"),
-        ("{log} --set =1", 4, "expected KEY=VALUE"),
-        ("{log} --preset p2", 4, "unknown preset"),
-        ("{log} --screens doppler,doppler", 4, "name each screen once"),
-        ("{log} --screens radar", 4, "unknown screen"),
-        ("{log} --without radar", 4, "unknown screen"),
-        ("{log} --chunk 0", 4, "--chunk"),
-        ("{log} --chunk -5", 4, "--chunk"),
-        ("{log} --chunk 1.5", 2, "--chunk"),
-        ("{log} --start 2024-03-06 --end 2024-03-05", 4, "is not before --end"),
-        ("{log} --start 2024-13-05", 2, "--start"),
-        ("{log} --start 2524-03-05", 4, "--start: a GPS time from 1980 to 2261"),
-        ("{log} --start 2124-03-05", 5, "time span"),
-        ("{log} --crs EPSG:0", 4, "EPSG:0"),
-        ("{log} --height-datum sea", 4, "height_datum"),
-        ("{log} --geoid flat", 4, "geoid"),
-        ("{log} --reference centre", 4, "vehicle"),
-        ("{log} --config {desk}/line.csv", 3, "TOML"),
-        ("{log} --cn0-curve {desk}/line.csv", 3, "line.csv"),
-        ("{log} --error-model {desk}/line.csv", 3, "line.csv"),
-        ("{log} --sbas {desk}/line.csv", 3, "line.csv"),
-        ("{log} --sp3 {desk}/line.csv", 3, "line.csv"),
-        ("{log} --rear {desk}/front.obs", 3, "given twice"),
-        ("simulate demo --seconds 1e12 --out {out}", 4, "duration_s"),
-        ("simulate demo --seconds nan --out {out}", 4, "--seconds: Input should be a finite number"),
-        ("simulate demo --seconds -1 --out {out}", 4, "--seconds: Input should be greater than 0"),
-        ("simulate demo --seconds 0 --out {out}", 4, "--seconds: Input should be greater than 0"),
-        ("simulate demo --seed -1 --out {out}", 4, "seed"),
-        ("simulate demo --seed 1e3 --out {out}", 2, "--seed"),
-        ("simulate nothing --out {out}", 3, "nothing"),
-        ("simulate demo --only 1 --out {out}", 4, "single run"),
-        ("simulate demo --set line.length_m=1e300 --out {out}", 4, "line"),
-        ("simulate demo --set rate_hz=1e9 --out {out}", 4, "rate_hz"),
-        ("map check {desk}/line.csv --max-gap nan", 4, "--max-gap"),
-        ("map check {desk}/line.csv --mid-chord -1", 4, "--mid-chord"),
-        ("map from-positions {desk}/rtk.csv --out {out}.csv --spacing 1e300", 7, "0 of 200 positions left"),
-        ("map from-positions {desk}/rtk.csv --out {out}.csv --spacing 0", 4, "--spacing"),
-        ("map from-positions {desk}/rtk.csv --out {out}.csv --quality x", 4, "--quality"),
-        ("map from-positions {desk}/rtk.csv --out {out}.csv --column a", 4, "--column"),
-        ("map from-positions {desk}/rtk.csv --out {out}.csv --column a=b", 4, ""),
-        ("cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --out {out} --bin 0", 4, "--bin"),
-        ("cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --out {out} --bin nan", 4, "--bin"),
-        ("cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --out {out} --position 1,2", 4, "--position"),
-        ("cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --out {out} --position 1,2,nan", 4, "--position"),
-        ("cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --out {out} --position 91,2,3", 4, "--position"),
-        ("error-model {desk}/results --reference {desk}/truth.csv --out {out} --sectors 0", 4, "--sectors: Input"),
-        ("error-model {desk}/results --reference {desk}/truth.csv --out {out} --elevations 0", 4, "rising edges"),
-        ("error-model {desk}/results --reference {desk}/truth.csv --out {out} --least-blocks 0", 4, "--least-blocks"),
-        ("error-model {desk} --reference {desk}/truth.csv --out {out}", 3, "run.json"),
-        ("evaluate {desk}/results --reference {desk}/truth.csv --section-length nan", 4, "--section-length"),
-        ("evaluate {desk}/results --reference {desk}/truth.csv --alarm-limit 0", 4, "--alarm-limit"),
-        ("evaluate {desk}/results --reference {desk}/truth.csv --alarm-limit 5,x", 4, "--alarm-limit"),
-        ("evaluate {desk}/results --reference {desk}/truth.csv --seed -1", 4, "--seed"),
-        ("evaluate {desk}/results {desk}/results --reference auto", 4, "given twice"),
-        ("evaluate {desk} --reference {desk}/truth.csv", 3, "run.json"),
-        ("report {desk}/results {desk}/results --out {out}.html", 4, "given twice"),
-        ("report {desk}/line.csv --out {out}.html", 3, "expected the folder"),
-        ("plot-screens {desk} --out {out}", 3, "run.json"),
-        ("reference --rtk {desk}/rtk.csv --track {desk}/line.csv --out {out} --ratio nan", 4, "--ratio"),
-        ("reference --rtk {desk}/rtk.csv --track {desk}/line.csv --out {out} --max-gap inf", 4, "--max-gap"),
-        ("reference --rtk {desk}/rtk.csv --track {desk}/line.csv --out {out} --date 2024", 2, "--date"),
-        (
-            "reference --rtk {desk}/rtk.csv --rtk-rear {desk}/rtk.csv --track {desk}/line.csv --out {out}",
-            4,
-            "--vehicle",
-        ),
-        ("reference --track {desk}/line.csv --out {out}", 4, "--rtk"),
-        ("demo --out {desk}/line.csv", 8, "is a file"),
-        ("demo --out /proc/no/where", 8, "cannot be written"),
-        ("{log} --out /dev/null", 2, "--out is given twice"),
-        ("map from-positions {desk}/rtk.csv --out /proc/nowhere", 8, ""),
-        ("report {desk}/results --out {desk}", 8, "is a folder"),
-    ],
+    [(row["words"], int(row["exit"]), row["sentence"]) for row in BAD_WORDS],
 )
 @pytest.mark.every(2)
 def test_bad_words_end_with_one_sentence(desk: Desk, tmp_path: Path, words: str, code: int, sentence: str) -> None:

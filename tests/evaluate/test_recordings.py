@@ -1,6 +1,6 @@
 """The real recordings: one setting for all, screens of health and elevation only.
 
-The limits are those that the package must reach; ``python tests/studies/recordings_score.py`` prints the table.
+The limits are those that the package must reach.
 """
 
 from __future__ import annotations

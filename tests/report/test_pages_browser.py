@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from conftest import ROOT
+from long_run import long_run
 from network_made import made_network
 from railfix.cli import app
 from railfix.ground.demo import run_demo
@@ -28,7 +29,6 @@ from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track.network_read import check_network
 from report_page import browser
-from report_scale import long_run
 from test_campaign_page import campaign
 
 pytestmark = [

@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,63 +28,10 @@ from railfix.track.point_files import write_track_csv
 PAGE: Final = paths.ROOT / "docs" / "benchmarks.md"
 #: Heading of the section of the page that is written.
 HEADING: Final = "## Recordings: railfix, RTKLIB and 3-D positions"
-_URBANNAV: Final = {
-    "licence": "terms of the UrbanNav dataset",
-    "fetch": "UrbanNav dataset, Hong Kong, light urban (TST) of 2021-05-17",
-    "scenario": {
-        "date": "2021-05-17",
-        "place": "Hong Kong, Tsim Sha Tsui",
-        "environment": "between towers",
-        "vehicle": "car",
-        "rate_hz": 1.0,
-        "reference": "inertial reference, moved to the antenna",
-    },
-}
-#: What is known of each recording; data/README.md beside the checkout has more.
-ABOUT: Final[dict[str, dict[str, Any]]] = {
-    "m8t": {**_URBANNAV, "scenario": {**_URBANNAV["scenario"], "receiver": "u-blox NEO-M8T", "signals": "G C, L1"}},
-    "f9p": {**_URBANNAV, "scenario": {**_URBANNAV["scenario"], "receiver": "u-blox ZED-F9P", "signals": "G C R E J"}},
-    "pixel": {
-        "licence": "rules of the Google Smartphone Decimeter Challenge",
-        "fetch": "Google Smartphone Decimeter Challenge, Pixel 5 of 2021-04-28",
-        "scenario": {
-            "date": "2021-04-28",
-            "environment": "suburb",
-            "vehicle": "car",
-            "receiver": "phone Pixel 5",
-            "signals": "G R E, L1 L5",
-            "rate_hz": 1.0,
-            "reference": "NovAtel SPAN",
-        },
-    },
-    "japan": {
-        "licence": "MIT",
-        "fetch": "cssrlib-data, mosaic-X5 of 2021-09-22 with GEONET 3034",
-        "scenario": {
-            "date": "2021-09-22",
-            "environment": "open sky",
-            "vehicle": "car",
-            "receiver": "Septentrio mosaic-X5",
-            "signals": "G E J",
-            "rate_hz": 1.0,
-            "reference": "RTKLIB RTK, fixed",
-        },
-    },
-    "berlin": {
-        "licence": "CC BY-SA 4.0",
-        "fetch": "smartLoc dataset, TU Chemnitz, Berlin Potsdamer Platz",
-        "scenario": {
-            "date": "2016-06-06",
-            "place": "Berlin, Potsdamer Platz",
-            "environment": "deep city, corners of 90 degrees",
-            "vehicle": "car",
-            "receiver": "u-blox M8T",
-            "signals": "G R, L1",
-            "rate_hz": 5.0,
-            "reference": "RTK and inertial reference",
-        },
-    },
-}
+#: What is known of each recording.
+ABOUT: Final[dict[str, dict[str, Any]]] = tomllib.loads(
+    (paths.ROOT / "tests" / "references" / "recordings.toml").read_text(encoding="utf-8")
+)
 _TEXT: Final = """{heading}
 
 `{command}` on {date}, commit `{commit}`: cars with a satellite receiver,

@@ -1,18 +1,13 @@
-"""Scores on the real recordings: one setting for all, printed as a table.
-
-Run ``python tests/studies/recordings_score.py`` with the recordings beside the checkout.
-"""
+"""Runs of the real recordings with one setting for all, and their scores."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-import paths
 import recordings_truth
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
@@ -21,7 +16,6 @@ from railfix.evaluate import Score, along_track_error, interpolate_reference, sc
 from railfix.integrity.raim import Outcome as RaimOutcome
 from railfix.integrity.raim import exclude, linear_model
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.igg3_fit import map_information, robust_fit
@@ -44,12 +38,7 @@ TABLES = {
         {"filter": "off", "screens": ["elevation"], "elevation": {"mask_deg": 15.0}}
     ),
     "all screens, failed checks kept": parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}}),
-    "all screens, failed checks dropped": parse_config(
-        {"filter": "off", "failed_checks": "drop", "elevation": {"mask_deg": 15.0}}
-    ),
-    "all screens, and the filter along the track": parse_config({"filter": "track", "elevation": {"mask_deg": 15.0}}),
     "strict": parse_config({"filter": "off", "preset": "strict", "elevation": {"mask_deg": 15.0}}),
-    "p1 (its own mask, 20 deg)": parse_config({"filter": "off", "preset": "p1"}),
 }
 #: Screens of health and elevation only.
 SETTINGS = TABLES["health and elevation only"]
@@ -67,7 +56,6 @@ class Outcome:
     trajectory: Trajectory
     ranges: Ranges | None = None
     straight: Score | None = None
-    train: Score | None = None
 
 
 def trajectory_of(time: np.ndarray, ecef_m: np.ndarray) -> Trajectory:
@@ -84,12 +72,7 @@ def run_rinex(
     result, _ = processor.process({"front": read_observations(observations)})
     antenna = result.antennas["front"]
     reference = interpolate_reference(antenna.time, time, ecef)
-    found = outcome(name, antenna, reference, trajectory)
-    if not result.fusion:
-        return found
-    observed = np.isfinite(reference[:, 0]) & np.any((antenna.reason & 1) == 0, axis=1)
-    filtered = straight_distance(on_line_m(result.fusion["front"].tracked, trajectory), reference, trajectory)
-    return replace(found, train=score(filtered, observed))
+    return outcome(name, antenna, reference, trajectory)
 
 
 def outcome(name: str, antenna: AntennaResult, reference: np.ndarray, trajectory: Trajectory) -> Outcome:
@@ -274,40 +257,3 @@ RECORDINGS: dict[str, Callable[[Path, Config], Outcome]] = {
     "smartloc": smartloc,
     "japan": japan,
 }
-
-
-def print_table(data: Path, config: Config) -> None:
-    """All recordings with one configuration."""
-    head = "recording                  epochs  rate %   p50 m   p95 m   max m  wrong %"
-    print(f"{head}  | conventional: rate %  p50 m  p95 m  | straight: p50 m   p95 m   max m")
-    outcomes = [run(data, config) for run in RECORDINGS.values()]
-    stations = [geonet(data, station, azimuth, config) for station in ("0759", "3040") for azimuth in (0, 45, 90, 135)]
-    for o in [*outcomes, *stations]:
-        a, b = o.constrained, o.conventional
-        print(
-            f"{o.name:26s} {a.epochs:6d} {100 * a.rate:7.2f} {a.p50_m:7.2f} {a.p95_m:7.2f} {a.max_m:7.1f} "
-            f"{100 * a.wrong_place:8.2f}  | {100 * b.rate:20.2f} {b.p50_m:6.2f} {b.p95_m:6.2f}"
-            + (f"  | {o.straight.p50_m:15.2f} {o.straight.p95_m:7.2f} {o.straight.max_m:7.1f}" if o.straight else "")
-            + (f"  | filter {o.train.p50_m:6.2f} {o.train.p95_m:6.2f} {o.train.max_m:6.1f}" if o.train else "")
-        )
-    together = np.concatenate([o.error_m for o in stations])
-    pooled = score(together, np.ones(len(together), dtype=bool))
-    print(
-        f"{'geonet2005 all lines':26s} {pooled.epochs:6d} {100 * pooled.rate:7.2f} "
-        f"{pooled.p50_m:7.2f} {pooled.p95_m:7.2f}\n"
-    )
-
-
-def main() -> int:
-    data = paths.DATA
-    if not data.is_dir():
-        print(f"the real recordings are not at {data}", file=sys.stderr)
-        return 1
-    for title, config in TABLES.items():
-        print(title)
-        print_table(data, config)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
