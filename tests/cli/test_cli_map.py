@@ -122,8 +122,15 @@ def test_map_from_positions_says_what_became_of_them(tmp_path: Path, recordings:
     log = next((recordings / "kinematic").glob("japan_mosaic*")) / "rtklib_rtk_ref_l1_GE.pos"
     code, printed = call("from-positions", log, "--out", tmp_path / "course.csv", "--name", "course")
     assert code == 0
-    for said in ("360 positions", "dropped 17 of insufficient quality", "standing still", "bridged by a straight line"):
+    for said in (
+        "360 positions",
+        "dropped: 17 of insufficient quality",
+        "standing still",
+        "bridged by a straight line",
+    ):
         assert said in printed
+    assert printed.count("the direction turns by") == 1, "many errors are one line with the first of them"
+    assert len(printed.splitlines()) <= 10
     track = read_track(tmp_path / "course.csv")
     assert track.name == "course"
     assert len(track) > 200
@@ -177,7 +184,7 @@ def test_an_outlier_is_dropped_and_its_map_passes_the_check(tmp_path: Path) -> N
     path = positions(tmp_path, outlier=True, quality=None)
     code, printed = call("from-positions", path, "--out", tmp_path / "made.csv")
     assert code == 0, printed
-    assert "dropped 1 out of reach of the others" in printed
+    assert "dropped: 1 out of reach of the others" in printed
     assert read_track(tmp_path / "made.csv").chainage_m[-1] == pytest.approx(600.0, abs=0.1)
     assert call("check", tmp_path / "made.csv")[0] == 0
 

@@ -29,7 +29,7 @@ from railfix.track import (
     read_track,
     write_track_csv,
 )
-from railfix.track.quality import needed_spacing_m
+from railfix.track.quality import error_note, needed_spacing_m
 
 app = command_group(
     "map", help="Check a track map, make one from positions or of a network, and put positions on a network."
@@ -287,16 +287,15 @@ def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None
     console.print(f"{rows} positions, {len(track)} points kept, {track.chainage_m[-1]:,.1f} m")
     show_notes(console, track.provenance.notes)
     quality = check_track(track)
-    console.print(f"map check: {plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}")
-    for finding in quality.errors[:MOST_FINDINGS]:
-        console.print(f"error: {finding.sentence}")
     if quality.errors:
+        show_notes(console, error_note(quality))
         console.print(
             "a larger --spacing smooths noisy positions; a road turns more sharply than the checks allow a line"
         )
-    for reason, count in thinned.dropped.items():
-        if count:
-            console.print(f"dropped {count} {reason}")
+    else:
+        console.print(f"map check: 0 errors, {plural(quality.warnings, 'warning')}")
+    if dropped := ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count):
+        console.print(f"dropped: {dropped}")
     for point, distance in zip(thinned.jumps[:MOST_FINDINGS], thinned.jump_m[:MOST_FINDINGS], strict=True):
         console.print(
             f"gap of {distance:.1f} m at chainage {track.chainage_m[point]:.1f} m, bridged by a straight line"
