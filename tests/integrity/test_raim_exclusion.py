@@ -66,6 +66,11 @@ def check_against_trying(case: oracle.Problem, model: LinearModel, limits: RaimL
     ),
 )
 @example(seed=4147, system=SYSTEMS[5], faults={2: 7.0}, scale=1.0, limits=RaimLimits(mode="fixed"))
+@example(seed=0, system=SYSTEMS[0], faults={2: 14.0}, scale=1.0, limits=RaimLimits(mode="fixed"))
+@example(
+    seed=0, system=SYSTEMS[6], faults={1: 150.0}, scale=1.0, limits=RaimLimits(separation_risk=1.0, min_redundancy=2)
+)
+@example(seed=0, system=SYSTEMS[0], faults={0: 60.0, 2: -90.0}, scale=1.0, limits=RaimLimits(max_excluded=1))
 @settings(max_examples=40)
 def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     systems, ties = system

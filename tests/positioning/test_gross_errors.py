@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers import synthetic
-from helpers.pipeline_cases import clean_navigation, clean_observations, clean_truth
+from helpers.pipeline_cases import clean_navigation, clean_observations
 from railfix.gnss.observations import Observations
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
@@ -18,18 +18,12 @@ from railfix.positioning.gross_errors import gross_in_space, least_absolute
 
 pytestmark = pytest.mark.requirement("A6")
 
-#: Epochs of the made run, a minute apart, and the largest error that clean epochs of it have [m].
+#: Epochs of the made run, 25 s apart.
 EPOCHS = slice(0, 2000, 250)
-CLEAN_M = 8.0
 
 
 def observed() -> Observations:
     return clean_observations()["front"][EPOCHS.start : EPOCHS.stop : EPOCHS.step]
-
-
-def truth() -> np.ndarray:
-    front = clean_truth().filter(clean_truth()["antenna"] == "front")
-    return front.select("x_m", "y_m", "z_m").to_numpy()[EPOCHS]
 
 
 def located(observations: Observations) -> Located:
@@ -38,26 +32,10 @@ def located(observations: Observations) -> Located:
     return locate(observations, received, config, ChannelBook(config))
 
 
-def errors(found: Located) -> np.ndarray:
-    return np.linalg.norm(found.ecef_m - truth(), axis=1)
-
-
 def with_errors(observations: Observations, satellites: list[str], size_m: float) -> Observations:
     wrong = np.isin(observations.satellite, satellites)
     sign = np.where(np.arange(len(wrong)) % 2 == 0, 1.0, -1.0)
     return replace(observations, code_m=observations.code_m + wrong * sign * size_m)
-
-
-@pytest.mark.parametrize("satellites", [["G10"], ["E05", "G01"], ["E11", "G15", "J02"]])
-def test_a_larger_error_never_costs_availability_or_accuracy(satellites: list[str]) -> None:
-    clean = errors(located(observed()))
-    assert np.isfinite(clean).all()
-    assert clean.max() < CLEAN_M
-    for size in (50.0, 200.0, 1e3, 3e4, 2.99792458e5, 3e7):
-        found = located(with_errors(observed(), satellites, size))
-        assert (found.no_position == NoPosition.NONE).all(), size
-        assert errors(found).max() < CLEAN_M, size
-        assert found.n_used.max() <= 22 - len(satellites)
 
 
 def test_least_absolute_position_is_a_minimum_and_ignores_one_error() -> None:
