@@ -18,9 +18,6 @@ from railfix.cli import app
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
 from railfix.live import engine, session
-from railfix.live.forms import nmea_bytes
-from railfix.live.settings import LiveSettings
-from railfix.live.stream import single_epochs
 from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of, rawx
 
@@ -106,24 +103,6 @@ def test_the_end_of_a_paced_replay_has_its_message(epochs: dict[str, Observation
     times = [json.loads(line)["time_ns"] for line in (tmp_path / "m.json").read_text().splitlines()]
     last = int((epochs["front"].time[29] - GPS_EPOCH).astype(np.int64))
     assert times[-1] == last
-
-
-def test_a_speed_that_is_not_known_is_blank_in_nmea(epochs: dict[str, Observations]) -> None:
-    """Without the filter a message has no speed, and RMC none: not 0 knots."""
-    files = demo_files()
-    line = railfix.antenna_trajectory(
-        railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"]), "front"
-    )
-    processor = railfix.EpochProcessor(
-        railfix.Config(filter="off"), {"front": line}, navigation=railfix.read_navigation(files["nav"])
-    )
-    live = engine.LiveEngine(processor, LiveSettings())
-    live.push("front", single_epochs(epochs["front"][:1])[0], now_ns=0)
-    (output,) = live.poll(now_ns=engine.END_NS)
-    assert output.message.speed_cmps is None
-    fields = next(text for text in nmea_bytes(output).decode().splitlines() if "RMC" in text).split(",")
-    assert fields[2] == "A"
-    assert fields[7] == ""
 
 
 @pytest.mark.parametrize("speed", [5.0, 10.0])

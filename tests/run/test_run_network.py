@@ -15,8 +15,8 @@ from network_around import Around, network_around, write_network
 from network_made import made_network, made_run, segment, to_degrees, write_stations
 from railfix.cli import app
 from railfix.core.errors import MismatchError
-from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.evaluate import evaluate_run, interpolate_reference
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.evaluate import evaluate_run
 from railfix.evaluate.evaluation_inputs import EvaluationOptions, read_run
 from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
@@ -192,45 +192,6 @@ def test_a_network_elsewhere_is_a_sentence(tmp_path: Path, recordings: Path) -> 
     inputs = demo_inputs().replaced(track=(folder / "network_airport.geojson",), heights=OF_LOG)
     with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log was recorded"):
         run_files(inputs, Config(filter="off"), out=tmp_path / "results")
-
-
-@pytest.mark.slow
-def test_an_openstreetmap_extract_and_a_log_give_positions(tmp_path: Path) -> None:
-    """Two ways of the line on which the demo drove, without heights, and a platform: what was driven is found."""
-    line = read_track(demo_inputs().track)
-    points = np.stack([line.longitude_deg, line.latitude_deg], axis=-1)
-    middle = len(points) // 2
-    ways = {
-        "way/1": ({"railway": "rail", "name": "Line"}, points[: middle + 1]),
-        "way/2": ({"railway": "rail"}, points[middle:]),
-        "way/3": ({"railway": "platform"}, points[:3] + 1e-4),
-    }
-    features = [
-        {"type": "Feature", "id": name, "properties": {"@id": name} | tags,
-         "geometry": {"type": "LineString", "coordinates": place.tolist()}}
-        for name, (tags, place) in ways.items()
-    ]  # fmt: skip
-    path = tmp_path / "area.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    files = demo_inputs()
-    logs = ["--front", str(files.front[0]), "--nav", str(files.nav[0])]
-    words = ["run", *logs, "--track", str(path), "--out", str(tmp_path / "results")]
-    missing = CliRunner().invoke(app, words)
-    assert missing.exit_code == 3
-    assert "(--heights): log" in missing.output
-    result = CliRunner().invoke(app, [*words, "--heights", "log"])
-    assert result.exit_code == 0, result.output
-    record = json.loads((tmp_path / "results" / "run.json").read_text())
-    assert record["line"]["track"]["sigma_plan_m"] == 2.0
-    assert record["line"]["track"]["sections"] == [f"{path} (way/1 Line)", f"{path} (way/2)"]
-    rows = pl.read_parquet(tmp_path / "results" / "train.parquet").filter(pl.col("x_m").is_not_null())
-    reference = pl.read_csv(demo_truth(), comment_prefix="#").filter(pl.col("antenna") == "front")
-    times = reference["time_gpst"].to_numpy().astype("datetime64[ns]")
-    there = interpolate_reference(rows["time_gpst"].to_numpy(), times, reference.select("x_m", "y_m", "z_m").to_numpy())
-    latitude, longitude, _ = geodetic_from_ecef(there)
-    axes = enu_axes(latitude, longitude)[:, :2]
-    error = np.einsum("tij,tj->ti", axes, rows.select("x_m", "y_m", "z_m").to_numpy() - there)
-    assert np.nanmedian(np.hypot(*error.T)) < 3.0
 
 
 def test_memory_of_the_track_is_kept_without_positions() -> None:
