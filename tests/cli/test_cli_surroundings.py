@@ -29,7 +29,7 @@ def desk(good: Desk) -> Desk:
 
 
 #: Words of commands that are wrong, the exit code, and a part of the sentence.
-BAD_WORDS = list(csv.DictReader((ROOT / "tests" / "references" / "bad_words.csv").open(encoding="utf-8")))
+BAD_WORDS = list(csv.DictReader((ROOT / "tests/references/bad_words.csv").read_text(encoding="utf-8").splitlines()))
 
 
 def text_of(output: str) -> str:
