@@ -2,9 +2,9 @@
 Positions as the epochs arrive
 ==============================
 
-``EpochProcessor.process`` returns a state, which the next call takes. A log can therefore be cut anywhere, down to
-single epochs as a receiver sends them; the positions are those of the whole log. :doc:`Live positions </live>` do this
-with the streams of receivers.
+``EpochProcessor.process`` returns a state, which is passed to the next call. A log can therefore be cut anywhere, down
+to single epochs as a receiver sends them; the positions are those of the whole log. :doc:`Live positions </live>` are
+computed in this way from the streams of receivers.
 """
 
 from time import perf_counter

@@ -3,8 +3,8 @@ Make a track map from positions
 ===============================
 
 One run with accurate positions (RTK) is enough for a map. Here the ground truth of the demonstration, with noise of
-two centimetres, stands in for RTK positions. ``railfix map from-positions`` and ``railfix map check`` do this with
-files.
+two centimetres, stands in for RTK positions. ``railfix map from-positions`` and ``railfix map check`` do the same
+with files.
 """
 
 # %%

@@ -16,8 +16,8 @@ data = railfix.to_xarray(result["front"], result.fusion["front"])
 data
 
 # %%
-# The residual is the corrected pseudorange less what the position on the line and the receiver clock explain.
-# Reflected signals arrive late, so the residuals of low satellites spread more, and upward.
+# The residual is the corrected pseudorange less the range computed from the position on the line and the receiver
+# clock. Reflected signals arrive late, so the residuals of low satellites have a larger spread, mostly upward.
 
 used = data.reason == 0
 figure, ax = pyplot.subplots(layout="constrained")

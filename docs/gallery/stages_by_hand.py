@@ -95,6 +95,6 @@ for name, (own_log, own_navigation, own_line, systems) in cases.items():
 }
 
 # %%
-# The pipeline adds what needs earlier epochs: the receiver's noise scale, the test for persistent range errors, and
-# the test of the map, whose result is part of its protection levels. The :doc:`filter </filter>` is
-# ``railfix.tracking.track``.
+# The pipeline adds the tests and estimates that require earlier epochs: the receiver's noise scale, the test for
+# persistent range errors, and the test of the map, whose result is part of its protection levels. The
+# :doc:`filter </filter>` is ``railfix.tracking.track``.

@@ -2,8 +2,9 @@
 A tachometer in a tunnel
 ========================
 
-Without satellites the filter predicts the position, and its standard deviation grows. A tachometer bounds it. This
-example simulates the demonstration run with a tachometer and compares the filter with and without it.
+Without satellites the filter predicts the position, and its standard deviation grows. A tachometer bounds the
+standard deviation. This example simulates the demonstration run with a tachometer and compares the filter with and
+without it.
 """
 
 import tempfile
@@ -36,7 +37,7 @@ for name, run_inputs in (("satellites", inputs), ("with tachometer", inputs.repl
     runs[name] = pl.read_parquet(folder / name / "train.parquet").join(truth, on=["time_gpst", "antenna"])
 
 # %%
-# The tunnel lies at 450 to 520 m. The band is the standard deviation that the filter states.
+# The tunnel is at 450 to 520 m. The band is the standard deviation that the filter states.
 
 figure, axes = pyplot.subplots(2, sharex=True, sharey=True, layout="constrained")
 for ax, (name, table) in zip(axes, runs.items(), strict=True):

@@ -41,21 +41,21 @@ plots.plot_screen_over_time(screens["elevation"].picture, screens["elevation"].t
 
 # %%
 # **Doppler.** The change of a pseudorange between epochs is compared with its Doppler, which multipath disturbs far
-# less.
+# less than the pseudorange.
 
 plots.plot_screen_over_time(screens["doppler"].picture, screens["doppler"].time)
 
 
 # %%
-# **Antenna pair.** The pseudoranges of two antennas on one roof differ by what their spacing explains. A larger
-# difference is multipath at one of them.
+# **Antenna pair.** The pseudoranges of two antennas on one roof differ by an amount that follows from their spacing. A
+# larger difference is multipath at one of the antennas.
 
 plots.plot_screen_over_chainage(screens["antenna_pair"].picture, screens["antenna_pair"].chainage_m)
 
 
 # %%
 # By default these two screens do not reject (``verdict = "weigh"``): they increase the standard deviation of a
-# suspected observation by what they measured. This keeps the geometry where few satellites are left.
+# suspected observation by the measured error. This keeps the geometry where few satellites are left.
 #
 # **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds its fault-free distribution.
 
@@ -81,8 +81,8 @@ plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainag
 # Effect on rate and errors
 # -------------------------
 #
-# ``ablate_files`` reads the log once, and positions it with all screens, with none, with each alone, and with all but
-# each.
+# ``ablate_files`` reads the log once, and positions it with all screens, with none, with each screen alone, and with
+# all screens except each.
 
 inputs = demo_inputs().replaced(truth=demo_truth())
 ablation = ablate_files(inputs, config, out=Path(tempfile.mkdtemp()) / "effects")
@@ -92,4 +92,5 @@ effects.filter(pl.col("antenna") == "front").select(columns)
 
 
 # %%
-# The columns ``coordinates_*`` are of all positions, the columns ``ok_*`` of those that passed every check.
+# The columns ``coordinates_*`` have the errors of all positions, the columns ``ok_*`` those of positions that passed
+# every check.
