@@ -1,7 +1,4 @@
-"""Frames of five continents, their definitions, and how far railfix puts them from those.
-
-``python tests/helpers/frame_cases.py`` prints the table of `tests/references/results/frames.md`.
-"""
+"""Frames of five continents, their definitions, and how far railfix puts them from those."""
 
 from __future__ import annotations
 
@@ -112,22 +109,3 @@ def moved(name: str) -> FrameCase:
         rate = np.radians(np.array(ROTATION[plate] if plate else (0.0, 0.0, 0.0)) / 3.6e6)
         expected = at + np.cross(rate, at) * (YEAR - epoch)
     return FrameCase(place, by_railfix, expected, shift)
-
-
-def main() -> None:
-    """Print the table."""
-    print("| frame | place | moved by [m] | from its definition [m] | definition |")
-    print("|---|---|---:|---:|---|")
-    for name, (code, (latitude, longitude), definition) in FRAMES.items():
-        case = moved(name)
-        if isinstance(definition, int):
-            words = f"PROJ from EPSG:{definition}"
-        else:
-            itrf, epoch, plate = definition
-            words = f"ITRF{itrf} of {epoch:g}" + (f", plate {plate}" if plate else "")
-        size = float(np.linalg.norm(case.moved - case.place))
-        print(f"| {name} ({code}) | {latitude:g}, {longitude:g} | {size:.3f} | {case.off_m:.4f} | {words} |")
-
-
-if __name__ == "__main__":
-    main()

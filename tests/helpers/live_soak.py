@@ -1,18 +1,13 @@
 """A day of a live session as fast as it goes: memory, messages, what is kept of ephemerides and SBAS messages.
 
-    python tests/studies/live_soak.py [--hours 24] [--rate 0.2] [--sbas] [--channels 2]
-
 Two antennas of a simulated train that runs to and fro on a line of 36 km, with the filter along the track; ephemerides
 come when they are sent, messages go into a file, the state is encoded every 360 epochs. Prints memory hour by hour.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import resource
-import sys
-import tempfile
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
@@ -142,30 +137,3 @@ def simulated(folder: Path, hours: float, rate_hz: float, *, sbas: bool) -> dict
     line, run = LineSettings(length_m=36_000.0), RunSettings(cruise_mps=25.0)
     scenario = Scenario(duration_s=hours * 3600.0, rate_hz=rate_hz, line=line, run=run, **values)
     return write_run(scenario, folder / "run", packing="plain")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hours", type=float, default=24.0)
-    parser.add_argument("--rate", type=float, default=0.2, help="epochs a second")
-    parser.add_argument("--sbas", action="store_true")
-    parser.add_argument(
-        "--channels", type=int, choices=(1, 2), default=1, help="2: a second process checks each message"
-    )
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        left = soak(
-            Path(folder), hours=options.hours, rate_hz=options.rate, sbas=options.sbas, channels=options.channels
-        )
-    numbers = left.pop("sequence")
-    missing = numbers != list(range(1, left["epochs"] + 1))
-    print({name: value for name, value in left.items() if name != "memory_mb"})
-    print(f"{len(numbers)} messages of {left['epochs']} epochs, {'numbers are missing' if missing else 'none missing'}")
-    memory = left["memory_mb"]
-    if len(memory) > 2:
-        print(f"memory after 2 h {memory[1]:.1f}, at the end {memory[-1]:.1f}, most {max(memory):.1f} MB")
-    sys.exit(missing)
-
-
-if __name__ == "__main__":
-    main()
