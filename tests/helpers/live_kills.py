@@ -1,20 +1,18 @@
-"""``railfix live --state`` killed again and again: ``python tests/studies/live_kills.py [KILLS]``.
+"""``railfix live --state`` killed again and again.
 
 A receiver at a TCP port sends the demonstration's epochs, whether a session reads them or not. SIGKILL ends the session
-at a random instant, also before its first message; it is started again at once with its state file. Printed, and
-counted as lost: messages whose number was sent before, lines that are no message, state files that are not used, and
-messages whose bounds do not contain the true front end. `first position`: message of a session with its first position.
+at a random instant, also before its first message; it is started again at once with its state file. Counted as lost:
+messages whose number was sent before, lines that are no message, state files that are not used, and messages whose
+bounds do not contain the true front end.
 """
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import os
 import random
 import socketserver
 import sys
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -25,7 +23,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-import paths  # noqa: F401
 from railfix import read_observations
 from railfix.__main__ import main as main_of_railfix
 from railfix.core.timescale import GPS_EPOCH
@@ -153,28 +150,3 @@ def kill_sessions(folder: Path, kills: int, *, seed: int = 1) -> list[tuple[Path
     receiver.shutdown()
     receiver.server_close()
     return sessions
-
-
-def main() -> None:
-    """Print what was counted and lost."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kills", type=int, nargs="?", default=100)
-    given = parser.parse_args()
-    left, lost, begun = given.kills, Counter[str](), time.monotonic()
-    while left > 0:
-        with tempfile.TemporaryDirectory() as name:
-            sessions = kill_sessions(Path(name), left, seed=left)
-            counted, again, first = count_sessions(sessions)
-        left -= len(sessions)
-        lost.update(again)
-        print(
-            f"{len(sessions)} kills, {counted['messages']} messages, {counted['continued']} sessions continued; "
-            f"first position in message {', '.join(f'{k}: {n}' for k, n in sorted(Counter(first).items()))}",
-            flush=True,
-        )
-    print(f"{time.monotonic() - begun:.0f} s; lost: " + ", ".join(f"{name} {n}" for name, n in lost.items()))
-    raise SystemExit(int(any(lost.values())))
-
-
-if __name__ == "__main__":
-    main()
