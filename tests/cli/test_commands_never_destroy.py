@@ -78,7 +78,7 @@ def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, 
     before = contents(desk.folder)
     code, output = call(desk, command, out)
     assert (code, contents(desk.folder)) == (8, before)
-    assert "exists already; name another one, or give --overwrite" in " ".join(output.split())
+    assert "exists already; give another file, or add --overwrite" in " ".join(output.split())
     for name in TO_FILE[command]:
         code, output = call(desk, command, desk.folder / name, "--overwrite")
         assert (code, contents(desk.folder)) == (8, before)
@@ -140,11 +140,11 @@ def test_inputs_of_a_run_and_two_outputs_of_one_name_are_left(good: Desk, desk: 
     out = desk.folder / "one.rnx"
     code, output = call(desk, "convert {desk}/front.obs --out {out} --nav-out {out}", out, "--overwrite")
     assert (code, contents(desk.folder)) == (8, before), output
-    assert "is named by --out and by --nav-out" in " ".join(output.split())
+    assert "is given by --out and by --nav-out" in " ".join(output.split())
     words = "live --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --log {out}"
     code, output = call(desk, words, desk.folder / "truth.csv")
     assert (code, contents(desk.folder)) == (8, before), output
-    assert "is no log of railfix live" in " ".join(output.split())
+    assert "is not a log of railfix live" in " ".join(output.split())
 
 
 # -- leftovers ----------------------------------------------------------------------------------------------
@@ -194,10 +194,14 @@ def test_a_file_in_a_folder_that_cannot_be_used_is_refused(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("kind", "name", "words"),
     [
-        ("page", "report.pdf", r"an HTML page is written; name a file that ends in .html or .htm; .* print the page"),
-        ("page", "report", r"name a file that ends in .html"),
-        ("csv", "line.csv.gz", r"name a file that ends in .csv"),
-        ("picture", "network.pdf", r"name a file that ends in .png or .svg"),
+        (
+            "page",
+            "report.pdf",
+            r"an HTML page is written; give a file name that ends in .html or .htm; .* print the page",
+        ),
+        ("page", "report", r"give a file name that ends in .html"),
+        ("csv", "line.csv.gz", r"give a file name that ends in .csv"),
+        ("picture", "network.pdf", r"give a file name that ends in .png or .svg"),
     ],
 )
 def test_the_ending_of_an_output_is_that_of_its_kind(tmp_path: Path, kind: FileKind, name: str, words: str) -> None:

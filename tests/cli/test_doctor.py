@@ -82,7 +82,7 @@ def test_networks_orbits_and_maps_without_heights_are_no_problem(desk: Path, tmp
         "without heights: the heights of the log's own positions are used (--heights log)",
         "a network of 2 tracks, of which a run finds the route",
     )
-    assert all("km from the place in the header" in problem for problem in found.problems)
+    assert all("km from the position in the header" in problem for problem in found.problems)
     assert "--heights log" in found.command
 
 
@@ -120,7 +120,7 @@ def test_what_is_missing_or_does_not_fit_is_named(desk: Path, tmp_path: Path) ->
     far.write_text("latitude_deg,longitude_deg,height_m\n47,8,400\n47.001,8,400\n")
     result = RUNNER.invoke(app, ["doctor", *(str(path) for path in (desk / "front.obs", far, notes))])
     assert result.exit_code == 5, result.output
-    for words in ("notes[maps].md: not recognised", "no navigation file", "km from the place in the header"):
+    for words in ("notes[maps].md: not recognised", "no navigation file", "km from the position in the header"):
         assert words in result.output
     assert "run: railfix" not in result.output
     assert RUNNER.invoke(app, ["doctor", str(tmp_path / "none.obs")]).exit_code == 3

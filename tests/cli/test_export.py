@@ -459,7 +459,7 @@ def test_formats_share_a_style_and_a_style_of_the_user_is_kept(results: Path, tm
 def test_another_ending_is_refused_with_those_there_are(results: Path, tmp_path: Path) -> None:
     code, said = refused(results, tmp_path / "run.shp")
     assert code == 8
-    assert "name a file that ends in .kml or .gpx or .geojson or .gpkg or .parquet or .mcap" in said
+    assert "give a file name that ends in .kml or .gpx or .geojson or .gpkg or .parquet or .mcap" in said
 
 
 @pytest.mark.parametrize(

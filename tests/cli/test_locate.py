@@ -138,4 +138,4 @@ def test_a_receiver_log_needs_no_navigation_file_where_it_has_ephemerides(good: 
     words = ["locate", "--log", str(good.folder / "front.obs"), "--out", str(tmp_path / "a.pos")]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 4
-    assert "nav (--nav) is missing; name the navigation file, which RINEX observations need" in result.stderr
+    assert "nav (--nav) is missing; give the navigation file, which RINEX observations need" in result.stderr

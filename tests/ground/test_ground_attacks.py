@@ -146,7 +146,7 @@ def test_the_first_report_is_of_where_the_train_stands(state: Interlocking) -> N
     """The train has had no fresh authority, so it has not moved since its file was written."""
     state = replace(state, trains={1: replace(state.trains[1], measured_ns=None)})
     found = after(state, report(1, 3446.0), report(2, 3446.0), report(3, 3446.0, speed_cmps=0, standstill=True))
-    assert found.trains[1].stop == "the train is 436 m or more ahead of where it is known to be"
+    assert found.trains[1].stop == "the train is 436 m or more ahead of its recorded position or interval"
     assert found.trains[1].rear_m == 2795.0
     assert found.trains[1].front_m == 3451.0  # it may be there all the same
     released, reason = release_train(found, 1, LINE)
@@ -203,9 +203,9 @@ def test_intervals_that_grow_into_each_other_stop_both(state: Interlocking) -> N
     """Train 2 stands behind train 1, and its bound grows to 900 m."""
     wide = report(30, 1990.0, train=2, under_cm=90_000, over_cm=500, speed_cmps=0, standstill=True)
     found = overlaps_stopped(after(state, wide), LINE)
-    assert found.trains[2].stop == "its interval meets that of train 1"
-    assert found.trains[1].stop == "its interval meets that of train 2"
-    assert release_train(found, 2, LINE)[1] == "the interval of train 2 meets another one"
+    assert found.trains[2].stop == "its interval overlaps the interval of train 1"
+    assert found.trains[1].stop == "its interval overlaps the interval of train 2"
+    assert release_train(found, 2, LINE)[1] == "the interval of train 2 overlaps the interval of another train"
 
 
 def centre(store: Store, **values: Any) -> ControlCentre:
@@ -230,7 +230,9 @@ def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
         for wait_s, refused in ((0.0, True), (1.0, True), (61.0, True), (3.0, False)):
             now[0] += wait_s
             reason = orders["release-train"]({"train": 1})
-            assert (reason is not None and reason.startswith("train 1 is silent, and stands, whole: ")) == refused
+            assert (
+                reason is not None and reason.startswith("train 1 does not report, but is at rest and complete: ")
+            ) == refused
         assert orders["release-train"]({"train": 1}) == "train 1 is not stopped"
         assert orders["stop-all"]({}) is None
         assert stop_orders(control.supervision.state) == {1: "stopped by hand"}
@@ -337,11 +339,11 @@ trains = [{ number = 1, station = "A", track = 1, direction = 1, front_m = 300, 
 
 
 def test_a_state_of_an_older_version_is_refused(state: Interlocking) -> None:
-    with pytest.raises(InputFileError, match="older version of railfix; name another database"):
+    with pytest.raises(InputFileError, match="older version of railfix; give another database"):
         from_documents({"interlocking": '{"trains": [], "points": [], "stopped": false, "granted": 3}'})
     texts = to_documents(state)
     older = {name: str(text).replace('"runs_by"', '"unbraked"') for name, text in texts.items()}
-    with pytest.raises(InputFileError, match="older version of railfix; name another database"):
+    with pytest.raises(InputFileError, match="older version of railfix; give another database"):
         from_documents(older)
 
 

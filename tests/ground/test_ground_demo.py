@@ -357,7 +357,7 @@ def test_orders_in_a_browser(demo: tuple[dict[str, Any], dict[str, Any]]) -> Non
 
     def route(values: dict[str, Any], by: str) -> str | None:
         asked.append((values, by))
-        return "train 1 comes the other way"
+        return "train 1 comes from the opposite direction"
 
     orders = {"route": route, "release": lambda _, by: None if by == "operator" else f"given by {by}"}
     app = page_app(lambda: demo[1], orders, sessions=Sessions(password="secret"))
@@ -377,7 +377,7 @@ def test_orders_in_a_browser(demo: tuple[dict[str, Any], dict[str, Any]]) -> Non
         assert press("login") == "done"
         page.wait_for_selector("#desk", state="visible")
         page.select_option("#train", "2")
-        assert press("route") == "train 1 comes the other way"
+        assert press("route") == "train 1 comes from the opposite direction"
         assert press("release") == "done"
         press("logout")
         page.wait_for_selector("#desk", state="hidden")

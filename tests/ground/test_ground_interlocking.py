@@ -108,7 +108,7 @@ def test_a_route_by_hand(state: Interlocking, monkeypatch: pytest.MonkeyPatch) -
     assert (moved, reason) == ((), None)
     assert extend_authorities(routed, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(2350.0 - 20.0)
     # now train 2 may neither have the section nor, without that rule, the points
-    assert route_requested(routed, 2, LAYOUT)[2] == "train 1 comes the other way"
+    assert route_requested(routed, 2, LAYOUT)[2] == "train 1 comes from the opposite direction"
     assert route_requested(replace(state, stopped=True), 1, LAYOUT)[2] == "satellite positioning is suspended"
     take_out(monkeypatch, "direction")
     assert "locked" in (route_requested(routed, 2, LAYOUT)[2] or "")
@@ -133,7 +133,7 @@ def test_a_follower_ends_before_the_safe_rear_of_the_train_ahead(state: Interloc
     ahead = replace(interval(3, 1, 1500.0, 1, 0), tracks={0: 1, 1: 1}, station=1)
     state = replace(state, trains={1: state.trains[1], 3: ahead})
     routed, _, reason = route_requested(state, 1, LAYOUT)
-    assert "taken by train 3" in (reason or "")  # it has no route onwards yet
+    assert "reserved by train 3" in (reason or "")  # it has no route onwards yet
     follower = replace(state.trains[1], tracks={0: 1, 1: 1}, station=1)
     points = {name: PointState(locked={1: None, 3: None}) for name in LAYOUT.points()}
     both = replace(routed, trains={1: follower, 3: ahead}, points=points)
@@ -489,7 +489,7 @@ def test_a_closed_section_stops_its_trains_until_it_is_open() -> None:
     assert both.trains[1].stop == "A is closed"
     assert both.bars == {("A", CLOSED), ("A to B", CLOSED)}
     assert from_documents(to_documents(both)) == both
-    assert release_train(both, 1, LAYOUT)[1] == "the section where train 1 is or may run is closed: A"
+    assert release_train(both, 1, LAYOUT)[1] == "section A, where train 1 is or may run, is closed"
     opened = open_section(both, "A")
     free, reason = release_train(opened, 1, LAYOUT)
     assert reason is None

@@ -98,7 +98,7 @@ class Desk:
         """The order by one person, and by another."""
         first = self.orders[order](values, "anna")
         assert first is not None
-        if "order it again" not in first:
+        if "repeat the order" not in first:
             return first
         return self.orders[order](values, "ben")
 
@@ -209,7 +209,7 @@ def test_after_a_start_nothing_is_commanded_under_a_train(desk: Desk) -> None:
         desk.centre.supervision.set_detected(name, 2 if name == (0, 1) else 1)
     desk.steps(1.0)
     assert desk.commands == []
-    assert desk.state.trains[1].stop == "points of its route lie otherwise"
+    assert desk.state.trains[1].stop == "points of its route are detected in another position"
 
 
 def test_an_older_copy_moves_no_points_of_a_route_that_it_does_not_know(tmp_path: Path) -> None:
@@ -260,10 +260,10 @@ def test_a_train_that_has_turned_holds_what_an_older_copy_does_not_know(desk: De
     desk.start()
     desk.report(2, 2900.0, facing=-1, authority=900, authority_end_cm=120_000)
     assert desk.state.skipped[0] < 900 < desk.state.granted
-    assert "the train holds authority 900" in (desk.state.trains[2].stop or "")
+    assert "the train has authority 900" in (desk.state.trains[2].stop or "")
     assert min(desk.state.trains[2].interval_m) == 1200.0
     desk.report(1, 205.0, facing=-1, authority=1, authority_end_cm=5_000)
-    assert desk.state.trains[1].stop == "the train holds an authority beyond its interval, to 50 m"
+    assert desk.state.trains[1].stop == "the train has an authority that ends beyond its interval, at 50 m"
     assert desk.state.trains[1].rear_m == 50.0
     assert desk.state.trains[1].direction == 1
 
@@ -309,7 +309,7 @@ def test_nothing_is_granted_after_a_start_until_every_train_is_heard(desk: Desk)
     assert {number: known.end_m for number, known in desk.state.trains.items()} == ends
     assert any("nothing is granted until" in alarm for alarm in desk.centre.alarms)
     desk.report(1, 1500.0, authority=900, authority_end_cm=245_000, speed_cmps=1000, direction=1, standstill=False)
-    assert "the centre's database ends at" in (desk.state.trains[1].stop or "")
+    assert "the newest in the centre's database is" in (desk.state.trains[1].stop or "")
     assert desk.state.trains[1].interval_m[1] == 2450.0  # what it may still run to is occupied
     assert desk.state.granted >= 900
     desk.steps(0.2)
@@ -366,7 +366,7 @@ def test_an_order_frees_a_line_that_a_wrong_report_has_stopped(desk: Desk, wrong
     assert "reason: one to" in (desk.orders["correct-train"]({**values, "reason": " "}, "anna") or "")
     assert "train 2 reports 2695 to 2905 m" in (desk.twice("correct-train", {**values, "front_m": 2900}) or "")
     alone = desk.orders["correct-train"](values, "anna")
-    assert "order it again in 3 to 60 s" in (alone or "")
+    assert "repeat the order in 3 to 60 s" in (alone or "")
     assert desk.orders["correct-train"](values, "anna") is not None  # at once, by the same person
     assert desk.orders["correct-train"](values, "ben") is None
     assert desk.state.trains[2].span_m == (2690.0, 2906.0)
@@ -468,7 +468,8 @@ def test_a_train_is_entered_anywhere_and_removed(desk: Desk) -> None:
         "train": 9, "length_m": 100, "rear_m": 1000, "front_m": 1120, "direction": 1, "track": 1, "reason": "a crane",
     }  # fmt: skip
     assert "no room for a train" in (desk.twice("enter-train", {**values, "front_m": 1050}) or "")
-    assert desk.twice("enter-train", {**values, "rear_m": 300, "front_m": 500}) == "the interval of train 1 is there"
+    overlapping = desk.twice("enter-train", {**values, "rear_m": 300, "front_m": 500})
+    assert overlapping == "the interval overlaps the interval of train 1"
     assert desk.twice("enter-train", values) is None
     assert desk.orders["release-train"]({"train": 9}, "anna") is not None  # silent: once more
     desk.now += 4.0

@@ -200,5 +200,5 @@ trains = [{{ number = 1, station = "West", track = 1, direction = 1, front_m = 3
     used = re.search(r"reports used\W+(\d+)", output)
     rejected = re.search(r"reports rejected\W+(.+?)\s*│", output)
     # the filter has no place with a bound in the first seconds
-    without = re.fullmatch(r"none|without a place (\d+)", rejected.group(1))
+    without = re.fullmatch(r"none|without a position (\d+)", rejected.group(1))
     assert int(used.group(1)) >= 8 - int(without.group(1) or 0) >= 4

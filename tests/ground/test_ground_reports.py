@@ -106,7 +106,7 @@ def test_a_wrong_change_of_ends_in_the_next_station_frees_no_track(monkeypatch: 
         assert (turned.trains[1].direction, turned.trains[1].stop, turned.trains[1].span_m) == (1, None, (95.0, 2305.0))
         return route_requested(turned, 2, LINE)[2]
 
-    assert reason() == "track 2 of B is taken by train 1"
+    assert reason() == "track 2 of B is occupied or reserved by train 1"
     take_out(monkeypatch, "tracks kept")
     assert reason() is None
 
@@ -134,8 +134,16 @@ def test_a_wrong_change_of_ends_in_the_next_station_sets_no_other_track(monkeypa
             "the train has changed ends and is beyond its interval",
             4300.0,  # 4405 m are further than it can have got
         ),
-        ({"authority": 8, "authority_end_cm": 300_000}, "holds authority 8, the centre's database ends at 7", 4000.0),
-        ({"authority": 7, "authority_end_cm": 410_000}, "authority beyond its interval, to 4100 m", 4100.0),
+        (
+            {"authority": 8, "authority_end_cm": 300_000},
+            "has authority 8, the newest in the centre's database is 7",
+            4000.0,
+        ),
+        (
+            {"authority": 7, "authority_end_cm": 410_000},
+            "an authority that ends beyond its interval, at 4100 m",
+            4100.0,
+        ),
     ],
 )
 def test_more_contradictions(state: Interlocking, changes: dict[str, Any], reason: str, furthest_m: float) -> None:
@@ -148,7 +156,7 @@ def test_more_contradictions(state: Interlocking, changes: dict[str, Any], reaso
 def test_a_train_that_runs_by_its_newest_report_is_not_released(state: Interlocking) -> None:
     """It stood; the report that is contradicted says that it runs."""
     found = after(state, report(1, 3000.0, speed_cmps=0, standstill=True), report(2, 2900.0, direction=-1))
-    assert release_train(found, 1, TWO)[1] == "train 1 does not stand still"
+    assert release_train(found, 1, TWO)[1] == "train 1 is not at rest"
 
 
 def test_a_detection_from_before_the_last_command_counts_for_nothing() -> None:

@@ -255,7 +255,7 @@ def test_an_address_that_is_in_use_is_named(folder: Path, tmp_path: Path, taken:
         page = f"{host}:{port}" if taken == "page" else "127.0.0.1:0"
         done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--page", page, "--for", "1"])
     assert done.exit_code == 4
-    named = f"cannot listen at {host}:{port} (Address already in use); end the program that does"
+    named = f"cannot listen at {host}:{port} (Address already in use); end the program that listens there"
     assert named in " ".join(done.output.split())
 
 
@@ -416,7 +416,7 @@ def test_routes_and_the_release_by_hand(
         again.supervision.set_detected(name, 2 if name == (1, -1) else 1)
     again.step()
     assert again.moved == []  # type: ignore[attr-defined]
-    assert again.supervision.state.trains[1].stop == "points of its route lie otherwise"
+    assert again.supervision.state.trains[1].stop == "points of its route are detected in another position"
     assert again.supervision.state.trains[2].stop is None
 
 
@@ -459,9 +459,9 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
     assert shown["place"] == ""  # without a reference run
     assert lost["place"] == "A to B, 10 %"  # P5 3.1: 400 m, the stations stop at 250 and 1750 m
-    assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed: A"
+    assert orders["release-train"]({"train": 1}) == "section A, where train 1 is or may run, is closed"
     assert orders["open-section"]({"section": "A"}) is None
-    assert (orders["release-train"]({"train": 1}) or "").startswith("train 1 is silent")
+    assert (orders["release-train"]({"train": 1}) or "").startswith("train 1 does not report")
     second(delivered=True)
     assert orders["release-train"]({"train": 1}) is None  # it has reported
     assert second(delivered=True)["stop"] is None
@@ -496,7 +496,7 @@ def test_a_database_that_fails_is_an_alarm(
     assert control.store.records()[1].sequence == 1
     told = [text for _, _, text in control.store.log()]
     assert "train 1: heard" in told
-    assert "the database is written again" in control.lines[-1]
+    assert "the database can be written again" in control.lines[-1]
 
 
 @pytest.mark.slow
@@ -563,7 +563,7 @@ def test_postgresql_that_hangs_is_an_alarm_and_holds_up_no_order(folder: Path, t
         assert asyncio.run(order_to_stop()) == "stopped by hand"
         server.go_on()
         wait(alarm=False, most_s=15.0)
-        assert "the database is written again" in " ".join(state()[0]["log"])
+        assert "the database can be written again" in " ".join(state()[0]["log"])
         process.terminate()
         process.communicate()
         with Store(Server.ADDRESS) as store:
@@ -599,7 +599,7 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
     done = subprocess.run(command, input=line, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0
     assert done.stderr.startswith(
-        ("railfix ground train: no authority came", "railfix ground train: nothing was reported")
+        ("railfix ground train: no authority was received", "railfix ground train: nothing was reported")
     )
 
 
@@ -607,7 +607,7 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
     ("change", "words"),
     [
         (("track = 1", "track = 3"), "trains.0.track"),
-        (("front_m = 300", "front_m = 90"), "does not stand between the points of A (60 to 440 m): with its"),
+        (("front_m = 300", "front_m = 90"), "is not between the points of A (60 to 440 m): with its"),
         (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B, C)"),
         (("listen", "lisen"), "unknown setting lisen"),
         ((":", ";"), "HOST:PORT was expected"),

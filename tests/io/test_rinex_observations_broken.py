@@ -92,7 +92,7 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "count no number": (edit(good_3, 9, "0  2", "0  x"), "number of satellites '  x' is no number", 9, 5, 5),
     "count of two parts": (edit(good_3, 9, "0  2", "02 2"), "number of satellites '2 2' is no number", 9, 5, 5),
     "epoch line short": (edit(good_3, 9, "  0  2", ""), "shorter than 35 characters", 9, 5, 5),
-    "time runs ahead": (edit(good_3, 12, "2021", "2051"), "out of order by more than 20 epochs or an hour", 12, 5, 5),
+    "time runs ahead": (edit(good_3, 12, "2021", "2051"), "is more than 20 epochs or one hour out of order", 12, 5, 5),
     "INTERVAL no number": (inserted(good_3, 4, record("     o.1", "INTERVAL")), "'o.1' cannot be read", 4, 6, 6),
     "position no number": (
         inserted(good_3, 4, record("  1.0  2.0  x.0 *", "APPROX POSITION XYZ")),

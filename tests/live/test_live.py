@@ -163,8 +163,8 @@ def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
     assert sum(output.result is not None for output in outputs) == 60 - skipped
     told = [text for text in engine.reports if "behind" in text or "skipped" in text]
     assert told == [
-        "2.4 s behind the receivers: epochs are skipped up to the present",
-        "at the present again, 22 epochs were skipped",
+        "processing is 2.4 s behind the receivers: epochs are skipped until it is up to date",
+        "processing is up to date again; 22 epochs were skipped",
     ]
     stepped = LiveEngine(processor("front"), settings)
     times = [tag_ns(epoch) + (3000 * MS if k >= 10 else 0) for k, epoch in enumerate(epochs)]

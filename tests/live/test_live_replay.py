@@ -156,5 +156,5 @@ def test_two_outputs_have_two_files(tmp_path: Path) -> None:
     for more in (["--state", str(target)], ["--log", str(target)], ["--send", f"nmea@{target}"]):
         ended = RUNNER.invoke(app, [*command, *more, "--overwrite"])
         assert ended.exit_code == 8
-        assert "named for two outputs" in " ".join(ended.output.split())
+        assert "given for two outputs" in " ".join(ended.output.split())
         assert not target.exists()

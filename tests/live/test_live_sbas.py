@@ -96,7 +96,7 @@ def test_what_sbas_in_live_needs(log: dict[str, Path], tmp_path: Path) -> None:
     ]
     nothing = RUNNER.invoke(app, [*words, "--sbas", "stream", "--set", "sbas_prn=137"])
     assert nothing.exit_code == 4
-    assert "RINEX logs carry no SBAS" in nothing.output
+    assert "RINEX logs contain no SBAS" in nothing.output
 
 
 def test_messages_of_two_receivers_count_once(log: dict[str, Path]) -> None:

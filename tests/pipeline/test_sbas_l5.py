@@ -110,7 +110,7 @@ def test_results_say_what_was_asked_and_used(folder: Path) -> None:
     assert record["protection"]["kind"] == "sbas"
     said = " ".join(record["notes"])
     assert "frequencies: one requested, ionosphere-free codes used instead" in said
-    assert "SBAS on L5 asked for: corrections of MSAS PRN 137 used" in said
+    assert "SBAS on L5 requested: corrections of MSAS PRN 137 used" in said
     table = pl.read_parquet(folder / "l5" / "observations.parquet").filter(pl.col("reason") == 0)
     assert set(table["satellite"].str.slice(0, 1)) == {"G", "E", "C"}
     ratio = (154 / 115) ** 2

@@ -145,7 +145,7 @@ def test_what_the_command_line_notes_is_a_warning_in_python_once(made: dict[str,
     assert warned(lambda: run(on_track)) == [TRACK_AS_PATH]
     no_ionosphere = replace(made["navigation"], klobuchar={})
     (ionosphere,) = warned(lambda: run(navigation=no_ionosphere))
-    assert ionosphere.startswith("ionosphere: klobuchar asked for")
+    assert ionosphere.startswith("ionosphere: klobuchar requested")
     late = replace(made["log"], time=made["log"].time + np.timedelta64(3, "D"))
     assert "front: no epoch has a position: no navigation record is valid then; is it of another day?" in warned(
         lambda: run(log=late)
@@ -201,10 +201,10 @@ def test_results_are_short_as_text_and_a_table_in_a_notebook(name: str, made: di
 
 def test_a_track_off_the_earth_is_no_track() -> None:
     track = railfix.read_track(FILES["track"])
-    with pytest.raises(ValueError, match="no place on Earth"):
+    with pytest.raises(ValueError, match="not a position on the Earth"):
         railfix.Track.from_geodetic(track.longitude_deg, track.latitude_deg, track.height_m)
     for places in (track.ecef_m / 1e3, np.zeros((5, 3))):
-        with pytest.raises(ValueError, match="no place on Earth"):
+        with pytest.raises(ValueError, match="not a position on the Earth"):
             railfix.Track.from_ecef(places)
 
 

@@ -195,7 +195,7 @@ def test_what_no_bin_knows_is_nan() -> None:
         ),
         ("railfix error model 2", "railfix error model 1", "of format 'railfix error model 1', .* make it again"),
         ('covers = "local"', 'covers = "all"', "entry covers: Input should be 'local' or"),
-        ("sectors = 4", "sectors = 3", "entry before.count: 75 values were expected, one a bin, got 100"),
+        ("sectors = 4", "sectors = 3", "entry before.count: 75 values were expected, one per bin, got 100"),
         ("sectors = 4", "sectors = 0", "entry bins.sectors: Input should be greater"),
         ("15.0,", "95.0,", "entry bins.elevation_deg"),
         ("[before]", "[early]", "unknown entry early; known are after, before"),

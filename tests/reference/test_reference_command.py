@@ -160,11 +160,11 @@ def test_what_is_left_out_is_said(bench: Bench, tmp_path: Path) -> None:
         ({"rtk": None, "rtk_rear": None}, 4, "no positions are given"),
         ({"nav": None}, 4, "Doppler speeds need both observations"),
         ({"vehicle": None}, 4, "name its file with --vehicle"),
-        ({"pulses": "nowhere.csv"}, 3, "nowhere.csv: there is no such file; check what --pulses names"),
+        ({"pulses": "nowhere.csv"}, 3, "nowhere.csv: there is no such file; check the path given by --pulses"),
         ({"spacing": -1.0}, 4, "--spacing: Input should be greater than 0"),
         ({"pulse": 0.0}, 4, "--pulse: Input should be greater than 0"),
         ({"ratio": 50.0}, 7, "fewer than two good fixes"),
-        ({"pulse": 500.0}, 5, "does the counter wrap, or is the distance of a pulse wrong?"),
+        ({"pulse": 500.0}, 5, "does the counter wrap, or is the distance per pulse wrong?"),
     ],
 )
 def test_what_is_wrong_is_said_and_leaves_nothing(

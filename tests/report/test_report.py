@@ -328,7 +328,7 @@ def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) ->
     moved = pl.when(pl.col("row") == row).then(pl.col("chainage_m") + 99.0).otherwise(pl.col("chainage_m"))
     for status, sentence in (
         ("ok", "The largest error on the map exceeds the conventional one: "),
-        ("inconsistent", "further positions failed a check and carry its status ("),
+        ("inconsistent", "further positions failed a check and have its status ("),
     ):
         marked = pl.when(pl.col("row") == row).then(pl.lit(status)).otherwise(pl.col("status").cast(pl.String))
         table.with_columns(chainage_m=moved, status=marked).drop("row").write_parquet(mine / "positions.parquet")
@@ -477,7 +477,11 @@ def test_the_run_tells_how_long_its_chunks_took(summary: RunSummary, page: Page)
     ("arguments", "code", "said"),
     [
         (["{run}", "--out", "{tmp}/none/report.html"], 8, "does not exist"),
-        (["{run}", "--out", "{tmp}/report.pdf"], 8, "name a file that ends in .html or .htm; for a PDF file, print"),
+        (
+            ["{run}", "--out", "{tmp}/report.pdf"],
+            8,
+            "give a file name that ends in .html or .htm; for a PDF file, print",
+        ),
         (["{tmp}/nowhere", "--out", "{tmp}/report.html"], 3, "there is no such folder"),
         (["{tmp}", "--out", "{tmp}/report.html"], 3, "positions"),
         (["{run}", "{run}", "--out", "{tmp}/report.html"], 4, "given twice"),

@@ -211,7 +211,7 @@ def test_the_filter_has_a_row_and_one_without_each_of_its_sources(truth: Path, t
     [
         (["--screens", "rain"], 4, "unknown screen 'rain'"),
         (["--truth", "nowhere.csv"], 3, "nowhere.csv"),
-        (["--set", "min_satellites=3000"], 7, "not one position"),
+        (["--set", "min_satellites=3000"], 7, "there is no position"),
     ],
 )
 def test_errors_have_their_exit_codes(tmp_path: Path, options: list[str], code: int, words: str) -> None:

@@ -73,7 +73,7 @@ def test_the_place_is_the_one_given_or_that_of_the_header() -> None:
         (0.0, 0.0, ""),
         (59.0, 0.0, ""),
         (-3.0, 0.0, "of 2026-01-01 00:00 to 00:00 and the logs of 2025-12-31 23:59 to 23:59"),
-        (120.0, 0.0, "have no time in common; give one that overlaps"),
+        (120.0, 0.0, "have no time in common; give a log that overlaps"),
         (0.0, 2e5, "200 km from the line, expected 100 km at most"),
     ],
 )

@@ -157,7 +157,7 @@ def test_a_wrong_campaign_is_one_sentence(
 
 def test_a_folder_with_other_files_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
-    with ThreadPoolExecutor(1) as executor, pytest.raises(OutputError, match="nor that of a campaign"):
+    with ThreadPoolExecutor(1) as executor, pytest.raises(OutputError, match="not the folder of a campaign"):
         run_campaign(folder / "campaign.toml", out=tmp_path, executor=executor)
 
 
@@ -192,7 +192,7 @@ def test_a_worker_that_is_gone_is_a_failed_row(folder: Path, tmp_path: Path) -> 
     with Broken(1) as executor:
         table = run_campaign(folder / "campaign.toml", out=tmp_path / "out", executor=executor)
     assert table["status"].to_list() == ["done", "failed", "failed", "failed"]
-    assert "worker process is gone" in table["error"][1]
+    assert "worker process has ended" in table["error"][1]
     assert table["folder"][0] == "runs/train=A/day=2024-03-05"
 
 

@@ -372,5 +372,5 @@ def test_a_run_says_what_speaks_against_its_levels(whole: RunSummary, tmp_path: 
     small = Config.model_validate({"risk": {"local_prior": 0.02}, "protection": "on"})
     summary = run_files(demo_inputs(), small, out=tmp_path / "out")
     assert summary.record["antennas"]["front"]["protection_level"]["without_budget"] > 1000
-    assert any("epochs without a protection level" in note for note in summary.notes)
+    assert any("epochs have no protection level" in note for note in summary.notes)
     assert not any("RAIM has excluded" in note for note in summary.notes)

@@ -48,7 +48,7 @@ SCRIPTS: Final[dict[str, tuple[list[str], str]]] = {
     "release_outside": (
         ["python release_outside.py"],
         "known to be .* stop None .* stop None .* c[.] .* 2795[.][.]3405 .* released by hand: None"
-        ".* route of 2 -> train 1 comes the other way .* held",
+        ".* route of 2 -> train 1 comes from the opposite direction .* held",
     ),
     "restore_points": (["python restore_points.py"], "lost their detection .* commands to points: \\[\\]"),
     "dbfail": (
@@ -59,8 +59,8 @@ SCRIPTS: Final[dict[str, tuple[list[str], str]]] = {
     # the train is freed by the order `correct-train`: test_an_order_frees_a_line_that_a_wrong_report_has_stopped
     "quick": (
         ["python quick.py"],
-        "brake_reason 40.0 m/s where .* brake_reason 60.0 m/s where .* False 20.0 the train stands, and runs at 20.0"
-        ".* None Rejection.FAR_AHEAD Rejection.FAR_AHEAD None",
+        "brake_reason 40.0 m/s, above the .* brake_reason 60.0 m/s, above the .* False 20.0 "
+        "the report states standstill and a speed of 20.0 .* None Rejection.FAR_AHEAD Rejection.FAR_AHEAD None",
     ),
     "clockback": (
         [

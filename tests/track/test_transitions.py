@@ -168,7 +168,7 @@ def test_a_transition_that_does_not_end_in_its_radius_is_refused(tmp_path: Path)
     places = {"Start": origin, "PI": shifted(origin, 60.0, 0.0), "End": shifted(origin, 100.0, 9.0)}
     text = '<Spiral length="100" radiusStart="INF" radiusEnd="400" rot="ccw" spiType="cubic">'
     text += "".join(point(name, place) for name, place in places.items()) + "</Spiral>"
-    with pytest.raises(InputFileError, match=r"not that of its radius \(1\.9"):
+    with pytest.raises(InputFileError, match=r"does not match its radius \(1\.9"):
         read_segments(landxml(tmp_path / "a.xml", text), MapReading())
 
 

@@ -27,22 +27,22 @@ class _Program(LazyCommands):
         "doctor": "Examine files: identify each, check that they fit together, print the command to run.",
         "explain": "Explain one epoch of a run: its satellites, sigma, level and status.",
         "export": "Write positions of a run for maps: KML, GPX, GeoJSON, GeoPackage, GeoParquet.",
-        "campaign": "Position many logs side by side, resumable.",
-        "benchmark": "Run a folder of cases, judge railfix and other programs by the same code.",
+        "campaign": "Position many logs in parallel; an interrupted campaign is continued.",
+        "benchmark": "Run a folder of cases, and evaluate railfix and other programs by the same code.",
         "demo": "Position the demonstration log and compare it with its ground truth.",
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
         "evaluate": "Compute errors of runs against references.",
-        "reference": "Build a reference trajectory from fixed positions, gaps bridged.",
+        "reference": "Build a reference trajectory from fixed positions, with gaps bridged.",
         "live": "Position a train from its receivers' streams as they arrive.",
         "locate": "Compute 3-D positions from a log, without a track map.",
-        "which-track": "Decide on which track a train at rest stands.",
+        "which-track": "Decide on which track a train at rest is.",
         "convert": "Write receiver logs as RINEX files.",
         "cn0-curve": "Fit the mean C/N0 over elevation of an antenna and receiver.",
         "error-model": "Model the pseudorange errors of a line from runs with references.",
         "plot-screens": "Plot each screen's metric against its limit.",
         "simulate": "Simulate runs with ground truth.",
         "report": "Write an HTML report on runs.",
-        "ground": "Monitor satellites by a reference triangle, demonstrate the ground side.",
+        "ground": "Monitor satellites with a reference triangle; supervise trains from the ground.",
         "map": "Check a track map, make one, or put positions on a network.",
     }
     modules: ClassVar[Mapping[str, str]] = {
@@ -85,7 +85,7 @@ def railfix(
             "--version",
             callback=lambda asked: _print_version(asked=asked),
             is_eager=True,
-            help="Print the version with its commit and end.",
+            help="Print the version with its commit and exit.",
         ),
     ] = False,
 ) -> None:
@@ -104,14 +104,14 @@ def railfix(
     - 2: the command line was misused (unknown option, missing argument)
     - 3: an input file is missing, unreadable, or not what it should be
     - 4: a setting is misspelt, out of range, or contradicts another
-    - 5: the inputs are readable but do not match each other (other day, other place)
+    - 5: the inputs are readable but do not match each other (another day, another location)
     - 6: the track map was checked and has errors
-    - 7: not a single position: none in the results, or none in the inputs that can be used
+    - 7: there is no position: none in the results, or no usable position in the inputs
     - 8: the output cannot be written
     - 9: two channels of a live session gave different answers to the same input
 
-    128 and the number of a signal: the program was ended by that signal (143 SIGTERM, 141 the reader of its
-    output ended first).
+    128 plus the number of a signal: the program was ended by that signal (143: SIGTERM; 141: the reader of its output
+    ended first).
 
     An error is one sentence on the standard error output; it leaves no results behind. Files that exist are
     replaced only with `--overwrite`, and an input is never replaced.

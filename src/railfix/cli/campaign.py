@@ -74,7 +74,7 @@ def campaign(
     hive-partitioned data set), `campaign.csv` with one row per run, and `campaign.html`, a page on all of them: lines,
     errors (with `reference`) and levels by run, and the worst ten epochs with their explanations. A run that fails is
     a row with its error.
-    Runs whose results exist, for the same inputs and settings, are not repeated.
+    Runs whose results for the same inputs and settings exist are not repeated.
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
@@ -135,7 +135,7 @@ def _end(number_of_signal: int, _frame: object) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Yield the executor, and the errors that report a lost worker process.
+    """Yield the executor, and the types of errors that report a lost worker process.
 
     SettingsError: the scheduler does not exist, or `distributed` is not installed.
     """
@@ -172,8 +172,8 @@ def benchmark(
 ) -> None:
     r"""Run the cases of a folder with one configuration, and compare them with other programs.
 
-    `case.toml` of a case names its files, relative to its folder, each with its SHA-256; a file with another one is
-    refused. `files` has the names of the options of `railfix run`, and the ground truth:
+    `case.toml` of a case names its files, relative to its folder, each with its SHA-256; a file with a different
+    SHA-256 is rejected. `files` has the names of the options of `railfix run`, and the ground truth:
 
         licence = "CC BY 4.0"
         fetch = "https://example.org/town.zip"
@@ -191,13 +191,14 @@ def benchmark(
         [sha256]
         "rover.rnx" = "2c26b46b..."
 
-    `positions` are those of other programs (RTKLIB, NMEA, CSV), moved to the nearest point of the line and evaluated by
-    the same code, like RTKLIB's single point where `rnx2rtkp` is installed. `scenario` describes the recording as EN
-    16803-2 requires for record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`. A
-    case with `held_out` is for the benchmark alone: settings derived from its files are rejected.
+    `positions` are positions of other programs (RTKLIB, NMEA, CSV). They are moved to the nearest point of the line and
+    evaluated by the same code, as are RTKLIB's single-point positions where `rnx2rtkp` is installed. `scenario`
+    describes the recording as EN 16803-2 requires for record and replay; `options` and `evaluation` are options of
+    `railfix run` and `railfix evaluate`. A case with `held_out` is for the benchmark alone: settings derived from its
+    files are rejected.
 
-    DIR receives `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that exists,
-    for the same inputs and settings, is not repeated.
+    DIR receives `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that exists
+    for the same inputs and settings is not repeated.
 
     Example: `railfix benchmark cases --out benchmark`
 
@@ -237,17 +238,17 @@ def ablate(
     r"""Compare choices of screens on a log: all screens, none, each alone, all but each.
 
     The logs are read once. Screens that are off in the settings stay off, and screens that cannot be run (no second
-    antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are checked in every case;
+    antenna, no C/N0 curve) are left out and reported. Validity and health of the satellites are checked in every case;
     `none` is these checks alone, without an elevation mask.
 
-    With `--filter track` there are rows for the filter along the track too: with every available source (codes, phases,
-    Dopplers, and the sensors given), and without each of them except codes, all screens on.
+    With `--filter track` there are rows for the filter along the track too, with all screens on: with every available
+    source (codes, phases, Dopplers, and the sensors given), and without each source except codes.
 
-    For each choice: the rate of epochs with coordinates and of status ok, satellites used, the median
-    standard deviation along the line; with `--truth` also the errors along the line (over 50 m counts as
-    a wrong position), of all epochs with coordinates, of ok epochs, of epochs without satellites, and the
-    95th percentile of the error over its stated sigma. `ablation.csv` in DIR has all figures, with the conventional
-    position; `ablation.json` has the record.
+    For each choice the table shows the fractions of epochs with coordinates and of epochs of status ok, the satellites
+    used, and the median standard deviation along the line. With `--truth` it also shows the errors along the line (an
+    error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs without satellites,
+    and the 95th percentile of the error over its stated sigma. `ablation.csv` in DIR has all figures, with the
+    conventional position; `ablation.json` has the record.
 
     Example:
 

@@ -1,4 +1,4 @@
-"""Commands that are loaded when they are called, and end with one sentence and a documented exit code."""
+"""Commands that are loaded when they are called, and report an error by one sentence and a documented exit code."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ class Command(TyperCommand):
     def _check_switch(ctx: Any, name: str, args: list[str]) -> None:
         for before, after in pairwise(args):
             if before == name and after.lower() in _YES_NO:
-                ctx.fail(f"{name} is a switch and takes no value; leave {after} out")
+                ctx.fail(f"{name} is a switch and has no value; leave {after} out")
 
 
 class Commands(TyperGroup):
-    """A group whose commands end with one sentence and the exit code of the error's class."""
+    """A group whose commands report an error by one sentence and the exit code of the error's class."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; an error that the user can fix is reported in one sentence."""
@@ -85,7 +85,9 @@ class Commands(TyperGroup):
         except RailfixError as error:
             _end(error)
         except MemoryError:
-            _end(SettingsError("this needs more memory than there is; give a shorter time or fewer epochs at a time"))
+            _end(
+                SettingsError("this needs more memory than is available; give a shorter time or fewer epochs at a time")
+            )
         except RuntimeError as error:
             loop = _LOOP.match(str(error))
             if loop is None:
@@ -146,7 +148,7 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program; a reader of its output that stops reading is no error."""
+    """Run the program; it is no error if a reader of its output stops reading."""
     if number := getattr(signal, "SIGPIPE", None):
         signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

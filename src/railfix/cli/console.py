@@ -37,7 +37,8 @@ _MOST: Final = 5
 #: Most lines that a run prints without ``--verbose``.
 _MOST_LINES: Final = 12
 _ANTENNAS: Final = ("front", "rear")
-#: Errors whose 95th percentile exceeds this many stated standard deviations (2.0 for normal ones) do not match.
+#: If the 95th percentile of the errors exceeds this many stated standard deviations (2.0 for normal errors), the stated
+#: standard deviation is too small.
 _OVERCONFIDENT: Final = 3.0
 
 
@@ -56,16 +57,16 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Return each run's and antenna's accuracy and whether its stated figures are true; the worst first."""
+    """Return each run's and antenna's accuracy, and whether its stated sigma fits the errors; the worst first."""
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
-        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} better ones, in the tables below"]
+        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} with smaller errors, in the tables below"]
     paths, references = ({str(getattr(run, what)) for run in evaluation.runs} for what in ("path", "reference"))
     if len(paths) == len(references) == 1:
         run, reference = shlex.quote(paths.pop()), shlex.quote(references.pop())
         return [*texts, f"next: railfix report {run} --reference {reference} --out report.html"]
-    return [*texts, "next: railfix report draws runs beside each other, with the same references"]
+    return [*texts, "next: railfix report compares the runs in one page, with the same references"]
 
 
 def describe_errors(evaluation: Evaluation) -> str:
@@ -93,7 +94,7 @@ def describe_errors(evaluation: Evaluation) -> str:
 
 
 def _judge(row: Mapping[str, Any]) -> str:
-    """Return one run and antenna in a sentence."""
+    """Return a sentence on the errors of one run and antenna."""
     from railfix.evaluate.accuracy import WRONG_PLACE_M
 
     run, train, _ = str(row["run"]).partition(" (train)")
@@ -106,11 +107,11 @@ def _judge(row: Mapping[str, Any]) -> str:
     )
     if row["max_at_chainage_m"] is not None:
         text += f" at chainage {row['max_at_chainage_m']:.0f} m"
-    text += f"; {row['wrong_places']:,} at a wrong place (over {WRONG_PLACE_M:g} m)"
+    text += f"; {row['wrong_places']:,} at a wrong position (over {WRONG_PLACE_M:g} m)"
     ratio = row["normalised_p95"]
     if ratio is not None:
         true = "fits" if ratio <= _OVERCONFIDENT else "is too small for"
-        text += f"; the stated sigma {true} the errors (95 % within {ratio:.1f} of it)"
+        text += f"; the stated sigma {true} the errors (95 % within {ratio:.1f} times sigma)"
     return text
 
 
@@ -120,7 +121,7 @@ def prepare_kernels() -> None:
         import_module("railfix.live.warm_up").prepare_kernels()
 
 
-#: Width of tables where the output is no terminal, so that no cell is cut or folded.
+#: Width of tables where the output is not a terminal, so that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
 #: Number of map findings printed; further findings are only counted.
 MOST_FINDINGS: Final = 40

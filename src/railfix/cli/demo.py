@@ -28,12 +28,12 @@ from railfix.simulate.demonstration import demo_inputs, demo_truth
 def demo(
     *,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent.")
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the results; it is created if it does not exist.")
     ] = Path("railfix-demo"),
     real: Annotated[
         bool,
         typer.Option(
-            "--real", help="Take a recorded drive in place of the simulated run; it is downloaded once (53 MB)."
+            "--real", help="Use a recorded drive instead of the simulated run; it is downloaded once (53 MB)."
         ),
     ] = False,
     overwrite: OverwriteOption = False,
@@ -46,14 +46,14 @@ def demo(
     map, and the conventional ones (3-D single point of unscreened ranges, moved to the nearest point of the
     line), with the ground truth, as `railfix report` does.
 
-    Into DIR come `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet`,
+    DIR receives `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet`,
     `run.json`, the folder `unscreened` of the run for the conventional positions, and `report.html`, the page
     to open in a browser.
 
-    With `--real` the log is a car's drive of 20 minutes through a town, of the wheel `gnss-benchmark` (MIT) in the
-    package index, which pip downloads and which is kept unpacked in the user's cache. The map is made of its ground
-    truth, which RTKLIB computes where it is installed. `railfix benchmark` compares the positions with it, and with
-    RTKLIB's; the case is in the folder `drive` of DIR, the result in `benchmark`.
+    With `--real` the log is a car's drive of 20 minutes through a town. It is part of the wheel `gnss-benchmark` (MIT)
+    of the package index, which pip downloads and which is kept unpacked in the user's cache. The map is made from the
+    drive's ground truth, which RTKLIB computes where it is installed. `railfix benchmark` compares the positions with
+    the ground truth, and with RTKLIB's positions; the case is in the folder `drive` of DIR, the result in `benchmark`.
 
     Example: `railfix demo --out first-look`
 
@@ -83,7 +83,7 @@ def demo(
     if evaluation is not None:
         console.print(describe_errors(evaluation))
     console.print(
-        f"{plural(summary.notes, 'note')} on what this run does not promise: {out / 'run.json'}; --verbose shows all"
+        f"{plural(summary.notes, 'note')} on the limitations of this run: {out / 'run.json'}; --verbose shows all"
     )
     console.print(f"the log, its track map, vehicle and ground truth: {inputs.front[0].parent}")
     console.print(f"the report, to open in a browser: {page}")

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Numbers of rows of sections, and of epochs with an error beyond the level, that are shown; the files have all.
+#: Largest numbers of sections, and of epochs with an error beyond the level, that are shown; the files have all rows.
 _MOST_SECTIONS: Final = 20
 _MOST_BEYOND: Final = 5
 
@@ -85,7 +85,8 @@ def evaluate(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folder that `railfix run` wrote.")],
     inputs: EvaluationInputs,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder for the files; without it the tables alone.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for the files; without it only tables are printed."),
     ] = None,
     files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     options: EvaluationOptions,
@@ -94,11 +95,11 @@ def evaluate(
 ) -> None:
     r"""Compute errors of runs along the line against references, and statistics of them.
 
-    The error is the distance along the line from the reference to the position, + toward the end of
-    the line whichever way the train runs. Tables are of the positions on the map, of those with status ok, and of
+    The error is the distance along the line from the reference to the position, positive toward the end of the line in
+    either direction of travel. There are tables of the positions on the map, of the positions with status ok, and of
     conventional positions (3-D single point, moved to the nearest point of the line), each over its own epochs and over
-    common ones; by antenna, section, environment, speed, satellites used, with and without satellites, and status; for
-    several runs also by configuration and line.
+    the common epochs; by antenna, section, environment, speed, satellites used, with and without satellites, and
+    status; for several runs also by configuration and line.
 
     `evaluation.json` in DIR has all figures, options and hashes of the inputs, `errors.parquet` one row per epoch and
     antenna; further files are `tables.csv`, `intervals.csv` and, where a run has protection levels, `levels.csv`,
@@ -160,7 +161,7 @@ def reference(
     *,
     out: OutOption,
 ) -> None:
-    r"""Build the reference trajectory of the antennas: fixed positions on the track, gaps between them bridged.
+    r"""Build the antennas' reference trajectory from fixed positions on the track, and bridge the gaps between them.
 
     Positions are rejected if they are not fixed, have a low ratio, lie off the antenna's trajectory, disagree with the
     distance travelled, or if the two antennas are not as far apart as on the vehicle. The others are matched to the
@@ -171,8 +172,8 @@ def reference(
     - `fixes.csv`: every position with its test result and measurements
     - `reference.json`: versions, hashes of the inputs, settings given and used, counts by reason, gaps
 
-    Gaps that are too long and instants of too large a standard deviation are left out, counted and named. All times are
-    GPS time.
+    Gaps that are too long and instants of too large a standard deviation are left out, counted and reported. All times
+    are GPS time.
 
     Example:
 
@@ -236,7 +237,7 @@ def error_model(
     read = [path for run in runs if (run / "run.json").is_file() for path in read_record(run).inputs.paths]
     check_outputs((out, "any"), overwrite=overwrite, inputs=[*reference, *beside.base, *in_runs, *read])
     if own := [file for file in beside.base if file.resolve() in [path.resolve() for path in read]]:
-        raise SettingsError(f"--base {own[0]}: is a log of the run itself; give that of a reference station")
+        raise SettingsError(f"--base {own[0]}: is a log of the run itself; give the log of a reference station")
     position = beside.base_position
     place = None if position is None else parse_position(position, "--base-position")
     inputs = [
@@ -250,21 +251,22 @@ def error_model(
 
 
 def priors_text(rate: FaultRate) -> str:
-    """Print the priors that a run with this model assumes."""
+    """Return a sentence on the priors that a run with this model assumes."""
     if not rate.bounds_priors:
         return (
             f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: the levels of runs with this model stay "
             "indicative, unless risk.local_prior and risk.side_prior are given"
         )
     return (
-        f"Runs with this model (--error-model) take risk.local_prior = {rate.upper:.2g} and risk.side_prior = "
+        f"Runs with this model (--error-model) use risk.local_prior = {rate.upper:.2g} and "
+        "risk.side_prior = "
         f"{rate.side_upper:.2g} as measured, unless they are given"
     )
 
 
 def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     console = TableConsole()
-    base = model.source.base or "none: errors of satellites and atmosphere are in the model"
+    base = model.source.base or "none: satellite and atmospheric errors are in the model"
     console.print(
         f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres"
     )
@@ -273,15 +275,16 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     show_table(console, plain_table(head, [list(row) for row in summary(model)]))
     if (rate := model.faults) is not None:
         console.print(
-            f"local faults: {rate.faulty} of {rate.ranges:,} used ranges beyond {rate.beyond_sigma:g} sigma of the "
-            f"level ({rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} blocks; at most {rate.upper:.2g} with "
-            f"95 % confidence); two satellites at a time {rate.together:.1f} times as often as independent ones, low "
-            f"ones of one side of the track in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at "
-            f"most {rate.side_upper:.2g}). {priors_text(rate)}"
+            f"local faults: {rate.faulty} of {rate.ranges:,} used ranges exceed {rate.beyond_sigma:g} sigma of the "
+            f"level (fraction {rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} blocks; at most "
+            f"{rate.upper:.2g} with 95 % confidence). Two satellites are faulty together {rate.together:.1f} times as "
+            "often as independent satellites would be. Low satellites on one side of the track are faulty together in "
+            f"{rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at most {rate.side_upper:.2g}). "
+            f"{priors_text(rate)}"
         )
         if stretches := ", ".join(f"[{start:g}, {end:g}]" for start, end in rate.no_level_m):
             console.print(
-                f"local faults are more frequent than on the line at chainages [m] {stretches}: runs that take the "
+                f"local faults are more frequent than on the line at chainages [m] {stretches}: runs that use the "
                 "priors of this model have no level there"
             )
 
@@ -305,7 +308,7 @@ def cn0_curve(
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Position of the antenna, in degrees and metres, within some kilometres; from the header without it.",
+            help="Position of the antenna, in degrees and metres, within some kilometres; by default from the header.",
         ),
     ] = None,
     bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
@@ -314,9 +317,10 @@ def cn0_curve(
 ) -> None:
     """Fit the mean C/N0 over elevation of one antenna and receiver.
 
-    Record about a day under open sky with the antenna and the receiver of the train: the curve belongs to the
-    two together. One curve is fitted per constellation and signal; the file names its inputs. Positioning then
-    rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor applies.
+    Record about a day under open sky with the antenna and the receiver of the train: the curve is valid for this
+    antenna and receiver only. One curve is fitted per constellation and signal; the file names its inputs. Positioning
+    then rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor
+    applies.
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 

@@ -34,7 +34,7 @@ def ground() -> None:
     """Monitor satellite positioning from the ground, and demonstrate the ground side.
 
     A reference triangle of three receivers finds satellite faults, disturbances and failed receivers; a control centre
-    supervises trains over two encrypted links, gives each the distance it may run and sets points.
+    supervises trains over two encrypted links, gives each train the distance that it may run, and sets points.
     """
 
 
@@ -42,18 +42,20 @@ class MonitorChoices(Settings):
     """Logs of `railfix ground monitor` and the folder of its results."""
 
     nav: tuple[Path, ...] = option(
-        "RINEX navigation file; repeat it for several. Streams may bring their own.", (), metavar="FILE"
+        "RINEX navigation file; repeat it for several. Streams may contain their own navigation records.",
+        (),
+        metavar="FILE",
     )
     out: Path = option("Folder for monitor.csv and triangle.png.", metavar="DIR")
     point: tuple[str, ...] = option(
-        "Known point of a receiver, in the order of the logs; from the headers of the logs without it.",
+        "Known point of a receiver, in the order of the logs; by default from the headers of the logs.",
         (),
         metavar="LAT,LON,HEIGHT",
     )
     fixes: bool = option("The logs are positions of the receivers, computed elsewhere (RTK, PPP-RTK, CLAS).", False)
-    live: bool = option("Judge streams as they arrive, once a second.", False)
+    live: bool = option("Evaluate streams as they arrive, once per second.", False)
     for_s: float | None = option("With --live: end after this time.", None, name="--for", metavar="S", ge=0)
-    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
 
 
 @app.command("monitor", cls=Command)
@@ -67,15 +69,15 @@ def monitor(
         list[str],
         typer.Argument(
             metavar="OBS OBS OBS",
-            help="RINEX observation files of the three receivers; with --fixes logs of positions (.pos, NMEA, CSV); "
-            "with --live streams, as of `railfix live`.",
+            help="RINEX observation files of the three receivers; with --fixes logs of positions (.pos, NMEA, "
+            "CSV); with --live streams, as for `railfix live`.",
         ),
     ],
 ) -> None:
-    """Judge satellite positioning by three receivers at known points.
+    """Monitor satellite positioning with three receivers at known points.
 
     Single-point fixes from the same satellites are compared with the points by circles, and the vectors between the
-    fixes with those between the points. The first cause that stops the trains is latched and printed.
+    fixes with the vectors between the points. The first cause that stops the trains is latched and printed.
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
 
@@ -83,7 +85,7 @@ def monitor(
 
     Example: `railfix ground monitor --fixes a.pos b.pos c.pos --point ... --point ... --point ... --out monitor`
 
-    With --live the logs are streams, judged as they arrive until they end; monitor.csv grows with them.
+    With --live the logs are streams, evaluated as they arrive until they end; monitor.csv grows with them.
 
     Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
@@ -99,9 +101,9 @@ def monitor(
     if len(choices.point) not in (0, 3):
         raise SettingsError(f"--point was given {len(choices.point)} times; give it once for each receiver")
     if choices.live and choices.fixes:
-        raise SettingsError("--live judges streams of observations; --fixes is for logs of positions")
+        raise SettingsError("--live evaluates observation streams; --fixes is for logs of positions")
     if choices.live and not choices.point:
-        raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
+        raise SettingsError("--point is missing: streams contain no known points; give it once for each receiver")
     try:
         _monitor(logs, choices, limits=limits, times=times)
     except OSError as error:
@@ -164,7 +166,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
 
 async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[StationFixes]:
-    """Yield the fixes of the receivers: of logs at once, of streams epoch by epoch."""
+    """Yield the receivers' fixes: from logs all epochs in one object, from streams one epoch at a time."""
     from railfix.ground.fixes_at_stations import read_fixes, stream_fixes
     from railfix.io import read_navigation
     from railfix.live.sources import check_source
@@ -187,7 +189,10 @@ class KeyChoices(Settings):
     train: tuple[int, ...] = option("Trains, from 1.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
     renew: Literal["add", "renew"] = option(
-        "Make new ones for the centre and these trains; those before stay valid until their end.", "add", name="--renew"
+        "Make new keys and certificates for the centre and these trains; the previous certificates stay "
+        "valid until they expire.",
+        "add",
+        name="--renew",
     )
 
 
@@ -196,14 +201,16 @@ class KeyChoices(Settings):
 def keys(
     choices: KeyChoices,
     *,
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; made where absent.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; it is created if it does not exist.")
+    ],
 ) -> None:
     """Make keys and certificates of a centre and its trains; add trains, and renew certificates.
 
-    An authority signs them. Its key (authority.key) stays in DIR; the centre gets authority.pem and its own two files,
-    each train authority.pem and its own two files. In a DIR with an authority trains are added. The serial number of
-    each is printed: in revoked.txt of the centre's folder it revokes that certificate. Keys can be read by their owner
-    alone.
+    A certificate authority signs the certificates. Its key (authority.key) stays in DIR; the centre gets authority.pem
+    and its own two files, each train authority.pem and its own two files. If DIR has a certificate authority already,
+    trains are added. The serial number of each certificate is printed: written into revoked.txt of the centre's folder,
+    it revokes that certificate. Only their owner can read the keys.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
@@ -234,9 +241,9 @@ class DemoChoices(Settings):
     port: int = option("Port of the page; 0 for any free port.", 0, metavar="PORT", ge=0, le=65535)
     hold: float = option("Keep the page after the end for this time.", 0.0, metavar="S", ge=0, le=3600)
     coverage: Path | None = option(
-        "Picture of the links: response rates along the line, round trips over time and place.", None, metavar="PNG"
+        "Picture of the links: response rates along the line, round trips over time and position.", None, metavar="PNG"
     )
-    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
 
 
 @app.command("demo", cls=Command)
@@ -289,14 +296,15 @@ class CentreChoices(Settings):
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
-        "Password for orders in its first line, NAME PASSWORD of a person in others; one is printed without it.",
+        "File with the password for orders in its first line, and NAME PASSWORD of a person in each "
+        "further line; without it a password is made and printed.",
         None,
         metavar="FILE",
     )
     orders: str | None = option(
         "Accept orders at a separate address, and none at the address of the page.", None, metavar="HOST:PORT"
     )
-    for_s: float | None = option("End after this time; else at a signal.", None, name="--for", metavar="S", ge=0)
+    for_s: float | None = option("End after this time; by default at a signal.", None, name="--for", metavar="S", ge=0)
 
 
 @app.command("centre", cls=Command)
@@ -306,11 +314,12 @@ def centre(
     *,
     path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="Line, trains, keys and addresses.")],
 ) -> None:
-    r"""Supervise the trains of a line: reports in, authorities out, points and routes, with a page.
+    r"""Supervise the trains of a line with a page: receive reports, send authorities, set points and routes.
 
     Trains connect over two QUIC links with certificates of `railfix ground keys`. Every report that is acknowledged
     and every authority is in the database before it is sent, so the centre may be killed and started again at any
-    time. Reading the page is open; the release of a stop and routes by hand need a log-in. Points are simulated.
+    time. The page can be read without a log-in; the release of a stop and routes by hand need one. Points are
+    simulated.
 
         keys = "keys"
         listen = { A = "127.0.1.1:4433", B = "127.0.2.1:4433" }
@@ -358,9 +367,11 @@ class TrainChoices(Settings):
     """Options of a train's end of the links."""
 
     keys: Path = option("authority.pem and the train's own two files.", metavar="DIR")
-    centre: tuple[str, ...] = option("Centre's address: of bearer A, then of B.", metavar="HOST:PORT")
+    centre: tuple[str, ...] = option(
+        "Address of the centre on bearer A, then its address on bearer B.", metavar="HOST:PORT"
+    )
     local: tuple[str, ...] = option(
-        "Own address on a bearer: of A, then of B; else the system chooses.", (), metavar="HOST"
+        "Local address on bearer A, then on bearer B; by default the system chooses.", (), metavar="HOST"
     )
     integrity: Path | None = option(
         'The train\'s integrity device writes "complete" here at least every 2 s.', None, metavar="FILE"
@@ -384,7 +395,8 @@ def train(
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes are listed in `railfix --help`; also 0 where no authority came, which is reported on standard error.
+    Exit codes are listed in `railfix --help`; also 0 where no authority was received, which is reported on standard
+    error.
     """
     import asyncio
 
@@ -394,7 +406,7 @@ def train(
 
     hosts = choices.local or ("0.0.0.0", "0.0.0.0")
     if len(choices.centre) != 2 or len(hosts) != 2:
-        raise SettingsError("--centre and --local are given twice: for bearer A, then for B")
+        raise SettingsError("--centre and --local are given twice: for bearer A, then for bearer B")
     try:
         addresses = dict(zip(BEARERS, map(parse_address, choices.centre), strict=True))
     except ValueError as error:
@@ -413,8 +425,8 @@ def train(
         typer.echo("railfix ground train: nothing was reported: the input ended before the first report", err=True)
     elif not authorities:
         typer.echo(
-            f"railfix ground train: no authority came, to {plural(reports, 'report')}; the page of the centre says why "
-            "a report is rejected",
+            f"railfix ground train: no authority was received in answer to {plural(reports, 'report')}; the "
+            "page of the centre shows why a report is rejected",
             err=True,
         )
 

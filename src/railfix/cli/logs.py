@@ -45,7 +45,8 @@ def locate(
     """Compute conventional 3-D positions with standard deviations from a log alone, without a track map.
 
     Ranges that disagree with the others are left out. The file has quality 5 (single); `railfix map match`
-    puts it on the tracks of a network. `railfix map survey` makes a map of logs, better than of such positions.
+    puts it on the tracks of a network. `railfix map survey` makes a map from logs, which is better than a map from such
+    positions.
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 
@@ -85,8 +86,8 @@ def which_track(
     """Decide on which track a train at rest is, or report that it is undecided.
 
     Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
-    codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
-    a base station carrier phases count, too. The decision is taken when the probability of all other hypotheses
+    codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with a
+    base station carrier phases are used, too. The decision is taken when the probability of all other hypotheses
     together is below `--risk`; otherwise all probabilities are printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
@@ -123,16 +124,23 @@ def which_track(
 def convert(
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG...", help="Logs of one receiver: UBX, SBF, RTCM 3, or RINEX; plain or packed."),
+        typer.Argument(metavar="LOG...", help="Logs of one receiver: UBX, SBF, RTCM 3, or RINEX; plain or compressed."),
     ],
     reading: LogReading,
     *,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="OBS", help="RINEX observation file to write; .gz, .crx and .crx.gz pack it."),
+        typer.Option(
+            "--out",
+            metavar="OBS",
+            help="RINEX observation file to write; it is compressed if the name ends in .gz, .crx or .crx.gz.",
+        ),
     ] = None,
     nav_out: Annotated[
-        Path | None, typer.Option("--nav-out", metavar="NAV", help="RINEX navigation file to write; .gz packs it.")
+        Path | None,
+        typer.Option(
+            "--nav-out", metavar="NAV", help="RINEX navigation file to write; it is compressed if the name ends in .gz."
+        ),
     ] = None,
     rinex: Annotated[
         Literal["3", "4"], typer.Option("--rinex", help="Version of RINEX to write: 3 (3.04) or 4 (4.02).")
@@ -172,8 +180,8 @@ def export(
         bool | None,
         typer.Option(
             "--filter/--single",
-            help="Positions of the filter along the track, or of single epochs; the filter's unless given, where the "
-            "run has them.",
+            help="Positions of the filter along the track, or of single epochs; by default the filter's positions "
+            "if the run has them.",
         ),
     ] = None,
     overwrite: OverwriteOption = False,
@@ -231,7 +239,8 @@ def doctor(
 
     Example: `railfix doctor front.obs brdc.nav line.csv car.toml`
 
-    Exit codes: 0 everything fits; 3 a file is missing; 5 something does not fit, is missing or of no known kind.
+    Exit codes: 0 all files fit together; 3 a given file does not exist; 5 files do not match, a needed file is missing,
+    or the kind of a file is unknown.
     """
     from railfix.run.doctor import examine_files
 

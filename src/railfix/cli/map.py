@@ -32,7 +32,7 @@ from railfix.track import (
 from railfix.track.quality import error_note, needed_spacing_m
 
 app = command_group(
-    "map", help="Check a track map, make one from positions or of a network, and put positions on a network."
+    "map", help="Check a track map, make one from positions or from a network, and put positions on a network."
 )
 
 TracksArgument = Annotated[
@@ -52,7 +52,8 @@ def check(
     tracks: TracksArgument,
     *,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the picture map_check.png; it is created if it does not exist."),
     ] = None,
     reading: MapReading,
     max_gap: Annotated[
@@ -65,7 +66,7 @@ def check(
 ) -> None:
     """Check a track map and print its faults.
 
-    Checked: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
+    It checks spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
     where given, otherwise from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
@@ -113,11 +114,11 @@ def features(
         typer.Option(
             metavar="DIR",
             help="Folder of `railfix run` with --tachometer and --inertial: lists the features that the train "
-            "measured with those of the map; may be repeated.",
+            "measured next to the features of the map; may be repeated.",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="File for the features; printed alone without it.")
+        Path | None, typer.Option(metavar="CSV", help="File for the features; without it they are only printed.")
     ] = None,
     reading: PointsReading,
     overwrite: OverwriteOption = False,
@@ -125,8 +126,9 @@ def features(
     """List the features of a line: the positions where its gradient or curvature changes.
 
     A train that measures the same change can determine its position (`railfix.motion.features`). Changes are computed
-    over 15 m, about the distance of two bogies. With `--run` the features are the changes that several runs measured
-    consistently: their positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
+    over 15 m, about the distance between two bogies. With `--run` the features are the changes that several runs
+    measured consistently: their positions by run, the spread (as in P2's table 1), and the distance from the map's
+    feature.
 
     Example:
 
@@ -204,7 +206,7 @@ def from_positions_command(
         ),
     ] = None,
     max_sigma: Annotated[
-        float | None, typer.Option(metavar="M", help="Largest standard deviation of a position, any axis.")
+        float | None, typer.Option(metavar="M", help="Largest standard deviation of a position on any axis.")
     ] = None,
     columns: ColumnNames,
     name: Annotated[

@@ -38,11 +38,14 @@ MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "
 class RouteChoice(Settings):
     """Selection of a route through a network."""
 
-    tracks: str | None = option("Tracks to pass, in order; others between are found.", None, metavar="NAME,NAME...")
+    tracks: str | None = option(
+        "Tracks to pass, in order; tracks between them are found.", None, metavar="NAME,NAME..."
+    )
     via: tuple[str, ...] = option("A point to pass; repeat it in the order of travel.", (), metavar="LAT,LON")
     positions: Path | None = option("Positions of a run on the route.", None, metavar="LOG", panel=INPUTS)
     heights: Path | None = option(
-        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, or "
+        "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m "
+        "or kilometrage_m, or "
         "positions of a run.",
         None,
         metavar="FILE",
@@ -63,7 +66,7 @@ class Connecting(Settings):
         "Ends nearer than this are one point, where the file has no connections.", TOLERANCE_M, metavar="M", gt=0.0
     )
     same_frame: Literal["no", "yes"] = option(
-        "The positions are in the frame of the map (RTK from its base stations), not in that of the satellites.",
+        "The positions are in the frame of the map (RTK from its base stations), not in the frame of the satellites.",
         "no",
         name="--same-frame",
     )
@@ -73,21 +76,22 @@ class MatchOptions(Settings):
     """Expected distances of positions from a track, and outputs."""
 
     sigma: float | None = option(
-        "Standard deviation of the distance from the track, map included; by default that of LOG, or one estimated "
-        "from LOG, or 4 m.",
+        "Standard deviation of the distance from the track, including the map's error; by default as "
+        "stated in LOG, otherwise estimated from LOG, otherwise 4 m.",
         None,
         metavar="M",
         gt=0.0,
     )
     within: float | None = option(
-        "Farthest track considered; else 30 m, farther where LOG states larger sigmas, to 100 m.",
+        "Largest distance of a track that is considered; by default 30 m, up to 100 m where LOG states larger sigmas.",
         None,
         metavar="M",
         gt=0.0,
     )
     fill: Rows = option(
-        "Rows that are placed on the shortest route: gaps, those without a position between known positions; or "
-        "off-map, also those whose positions lie off the map, as in a tunnel, also at its start and end.",
+        "Rows to be placed on the shortest route: gaps for rows without a position between known "
+        "positions; off-map also for rows whose positions lie off the map, as in a tunnel, including "
+        "rows at the start and end of LOG.",
         "gaps",
     )
     picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
@@ -115,7 +119,7 @@ def network(
 ) -> None:
     """Check a network of tracks and print its faults.
 
-    Checked: gaps between ends, connections that do not meet, dead ends, kinks at switches, tracks nearer to each
+    It checks gaps between ends, connections that do not meet, dead ends, kinks at switches, tracks nearer to each
     other than vehicles need.
 
     Example: `railfix map network tracks.gpkg --out network.png`

@@ -39,7 +39,7 @@ _COLUMNS: Final[Sequence[Column]] = (
 def service(
     runs: Annotated[list[Path], typer.Argument(metavar="RESULTS...", help="Folders of `railfix run` on one map.")],
     *,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Table to write, a row by stretch.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Table to write, one row per stretch.")] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
     page: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Page to write, with charts that zoom.")
@@ -104,7 +104,7 @@ class SurveyFiles(Settings):
         "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS
     )
     picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
-    name: str | None = option("Name of the track; else that of the file.", None, metavar="NAME")
+    name: str | None = option("Name of the track; by default the name of the file.", None, metavar="NAME")
 
 
 @from_models
@@ -125,9 +125,9 @@ def survey(
     columns: ColumnNames,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make one smoothed 3-D track map of several runs of ordinary receivers, with its standard deviation by point.
+    """Make one smoothed 3-D track map from several runs of ordinary receivers, with its standard deviation per point.
 
-    Laps, both directions, standstill and runs over a part of the line are allowed; outliers lose their weight. Logs of
+    Laps, both directions, standstill and runs over a part of the line are allowed; outliers get no weight. Logs of
     observations make a better map than their positions: changes of the carrier phase and Dopplers give the shape.
     The map is the path of the antenna. Runs on different days average errors that all positions of one day share.
 
@@ -163,8 +163,8 @@ def survey(
     ]
     if weak.mean() >= 0.005:
         verdict.append(
-            f"{100 * weak.mean():.0f} % of it is worse than twice the median: more runs there, or a dual-frequency"
-            " receiver help"
+            f"{100 * weak.mean():.0f} % of its points have more than twice the median standard deviation: more runs "
+            "there, or a dual-frequency receiver, would reduce it"
         )
     show_verdict(console, verdict)
     rows = [

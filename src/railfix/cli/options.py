@@ -28,9 +28,11 @@ _DAY: Final = "%Y-%m-%d"
 
 Model = TypeVar("Model", bound=Settings)
 
-OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Folder for the results; it is created if it does not exist.")
+]
 OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", rich_help_panel="Choices", help="Replace results that are already there.")
+    bool, typer.Option("--overwrite", rich_help_panel="Choices", help="Replace existing results.")
 ]
 VerboseOption = Annotated[
     bool,
@@ -160,7 +162,8 @@ def _gps_time(text: str) -> datetime:
         time = datetime.fromisoformat(text.strip().replace("/", "-"))
     except ValueError:
         raise typer.BadParameter(
-            f"{text!r} is no GPS time such as 2026-05-12, 2026-05-12T03:00 or 2026-05-12T03:00:00.5 (a time with a "
+            f"{text!r} is not a GPS time such as 2026-05-12, 2026-05-12T03:00 or 2026-05-12T03:00:00.5 (a "
+            "time with a "
             "zone, 2026-05-12T03:00Z, is converted)"
         ) from None
     if time.tzinfo is None:
@@ -214,12 +217,15 @@ class Choices(Settings):
     """Settings of a run from the command line; later fields override earlier ones."""
 
     preset: str | None = option(
-        "Base preset; other settings override it: default; strict, fewer positions of higher integrity; p1, the "
-        "limits of the paper that the screens are from, for geodetic receivers at 10 Hz.",
+        "Base preset, which other settings override: default; strict, with fewer positions of higher "
+        "integrity; p1, the limits of the paper from which the screens are, for geodetic receivers at 10 "
+        "Hz.",
         None,
         metavar="NAME",
     )
-    config: Path | None = option("Settings file; defaults for settings that it lacks.", None, metavar="TOML")
+    config: Path | None = option(
+        "Settings file; settings that it does not contain have their defaults.", None, metavar="TOML"
+    )
     setting: tuple[str, ...] = option(
         "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
         (),
@@ -227,7 +233,7 @@ class Choices(Settings):
         metavar="KEY=VALUE",
     )
     screens: str | None = option(
-        "Screens that are on, of elevation, cn0, doppler, antenna_pair, raim, antenna_spacing; or none.",
+        "Screens to use: elevation, cn0, doppler, antenna_pair, raim, antenna_spacing; or none.",
         None,
         metavar="NAME,NAME",
     )
@@ -244,8 +250,9 @@ class Choices(Settings):
         metavar="TOML",
     )
     sbas: tuple[Path, ...] = option(
-        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word stream for those in the receivers' "
-        "own logs and streams; their corrections replace the models, and satellites without a valid one are rejected.",
+        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word stream for the "
+        "messages in the receivers' own logs and streams. Their corrections replace the models, and "
+        "satellites without a valid correction are rejected.",
         (),
         metavar="FILE",
         panel=INPUTS,

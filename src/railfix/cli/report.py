@@ -1,4 +1,4 @@
-"""Commands on finished runs: report, one epoch explained, pictures of screens."""
+"""Commands on finished runs: report, explanation of one epoch, pictures of screens."""
 
 from __future__ import annotations
 
@@ -42,16 +42,17 @@ def report(
         list[Path] | None,
         typer.Option(
             metavar="REF",
-            help="Reference trajectory: a reference file, a simulator's ground truth, or a log of positions. One for "
-            "all runs, or repeated, one for each run in order.",
+            help="Reference trajectory: a reference file, a simulator's ground truth, or a log of positions. Give "
+            "one for all runs, or repeat the option with one for each run in order.",
         ),
     ] = None,
     conventional: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="RUN",
-            help="Another run on the same log, whose conventional positions are shown: one with `--screens elevation` "
-            "gives unscreened ones, as in P1. Repeated, one for each run in order.",
+            help="Another run on the same log, whose conventional positions are shown: a run with `--screens "
+            "elevation` gives unscreened positions, as in P1. Repeat the option with one for each run in "
+            "order.",
         ),
     ] = None,
     background: Annotated[
@@ -65,9 +66,9 @@ def report(
     """Write one HTML page on one or several runs, to open in a browser.
 
     It begins with one sentence, five key figures, the plan of the line coloured by error, and the error over chainage
-    compared with the conventional one. Below, folded: figures of merit, counts, protection levels, settings and inputs,
-    each table with a CSV download. Then the charts of each antenna: errors, protection levels, intervals and, with
-    `railfix run --observations`, sky, C/N0 and screens. The page lists omitted parts with the reasons. Errors need
+    compared with the conventional error. Below, folded: figures of merit, counts, protection levels, settings and
+    inputs, each table with a CSV download. Then the charts of each antenna: errors, protection levels, intervals and,
+    with `railfix run --observations`, sky, C/N0 and screens. The page lists omitted parts with the reasons. Errors need
     `--reference`.
 
     The page contains everything it shows: it opens without a network and can be sent and printed.
@@ -113,14 +114,16 @@ def explain(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `railfix run --observations` wrote.")],
     *,
     at: Annotated[str, typer.Option(metavar="TIME", help="GPS time: hh:mm:ss, or 'yyyy-mm-dd hh:mm:ss'.")],
-    antenna: Annotated[str | None, typer.Option(metavar="NAME", help="The run's first antenna unless given.")] = None,
+    antenna: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Antenna; by default the run's first antenna.")
+    ] = None,
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page with the sky as well.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Explain one epoch: its position, every satellite with its outcome, and the causes of sigma, level and status.
 
-    For each used satellite it prints the shift of the single-epoch position along the line without it. The epoch
-    nearest to the time is taken, a minute away at most.
+    For each used satellite it prints how far the single-epoch position would move along the line without this
+    satellite. The epoch nearest to the time is explained; it may be at most one minute away.
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
@@ -131,7 +134,7 @@ def explain(
     check_outputs((html, "page"), overwrite=overwrite, inputs=[path for path in inputs if path.suffix != ".html"])
     found = explain_epoch(run, at, antenna=antenna)
     console = TableConsole()
-    console.print(f"{found.antenna} antenna, {time_text(found.time)} GPS time (asked: {at})")
+    console.print(f"{found.antenna} antenna, {time_text(found.time)} GPS time (requested: {at})")
     for sentence in found.sentences:
         console.print(sentence)
     show_table(console, replace(listing("satellites", found.satellites, _SATELLITES, "Satellites"), boxed=True))
@@ -142,7 +145,9 @@ def explain(
 def plot_screens(
     run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `railfix run --observations` wrote.")],
     *,
-    out: Annotated[Path, typer.Option("--out", metavar="PICS", help="Folder for the pictures; made where absent.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PICS", help="Folder for the pictures; it is created if it does not exist.")
+    ],
     overwrite: OverwriteOption = False,
 ) -> None:
     """Plot each screen's metric against its limit, over time and over chainage.

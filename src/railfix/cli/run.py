@@ -41,7 +41,7 @@ def run(
 ) -> None:
     r"""Positions along the line from receiver logs, navigation files and a track map.
 
-    Reads RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), reads the log in pieces, and writes into DIR:
+    It reads RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), the log in pieces, and writes into DIR:
 
     - `positions.csv` and `positions.parquet`: one row per epoch and antenna, also without a
       position: chainage, its standard deviation, coordinates, and the conventional position for
@@ -95,12 +95,12 @@ def live(
         ),
     ] = None,
 ) -> None:
-    r"""Position a train from its receivers' streams, one message a period.
+    r"""Position a train from its receivers' streams, with one message per period.
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
     the moment they are complete, SBAS messages with `--sbas stream`. The positions equal those of `railfix run` on the
-    same epochs, with sensors on board too. A period without input has a message, too. Connections that break are opened
-    again. The program ends when its files end, or on SIGINT or SIGTERM; SIGHUP has no effect but a message.
+    same epochs, with sensors on board too. A message is sent for a period without input, too. Connections that break
+    are opened again. The program ends when its files end, or on SIGINT or SIGTERM; SIGHUP has no effect but a message.
 
     Example:
 

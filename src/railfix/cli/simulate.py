@@ -21,7 +21,7 @@ class SimulateOptions(Settings):
     """Folder of the runs, and settings that override the scenario."""
 
     out: Path | None = option(
-        "Folder for the files; each run of a recipe in its own below it.", None, metavar="DIR", panel="Options"
+        "Folder for the files; each run of a recipe has its own folder in it.", None, metavar="DIR", panel="Options"
     )
     seconds: float | None = option("Duration, overriding the scenario's.", None, metavar="S", gt=0.0)
     seed: int | None = option("Seed, overriding the scenario's.", None)
@@ -34,8 +34,8 @@ class SimulateOptions(Settings):
     only: tuple[str, ...] = option(
         "Only this run of a recipe, by its number from 1 or its name; may be repeated.", (), metavar="RUN"
     )
-    packing: Literal["packed", "plain"] = option("Write unpacked files: .rnx, .csv.", "packed", name="--plain")
-    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    packing: Literal["packed", "plain"] = option("Write uncompressed files: .rnx, .csv.", "packed", name="--plain")
+    overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -62,13 +62,13 @@ def simulate(
     *,
     scenario: Annotated[
         str | None,
-        typer.Argument(metavar="SCENARIO", help="Scenario file (TOML), or the name of a shipped one, see --list."),
+        typer.Argument(metavar="SCENARIO", help="Scenario file (TOML), or the name of a shipped scenario, see --list."),
     ] = None,
-    list_shipped: Annotated[bool, typer.Option("--list", help="Name the shipped scenarios and end.")] = False,
+    list_shipped: Annotated[bool, typer.Option("--list", help="List the shipped scenarios and exit.")] = False,
 ) -> None:
     """Simulate runs of a train: logs of two antennas, navigation, track map, vehicle, sensors, and ground truth.
 
-    SCENARIO defines the line (elements, a generated one, or a track file), the motion of the train, the
+    SCENARIO defines the line (elements, a generated line, or a track file), the motion of the train, the
     satellites (a simulated constellation, or a navigation file), receivers, errors, obstacles along the line and
     sensors on board. A recipe lists many runs, each written to its own folder. The same scenario gives the same
     files.

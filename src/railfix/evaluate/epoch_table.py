@@ -100,7 +100,10 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Return the epochs of a log and those missing in gaps over 1.5 intervals, which are logged, the interval [s]."""
+    """Return the epochs of a log with those missing in its gaps, a mask of the logged epochs, and the interval [s].
+
+    Gaps are longer than 1.5 intervals.
+    """
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
     gap = seconds(np.diff(time))

@@ -287,7 +287,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
     parts = [_epochs(folder, run, number) for number, (folder, run) in enumerate(zip(folders, runs, strict=True))]
     epochs = pl.concat(parts, how="vertical").filter(pl.col("chainage_m").is_not_null())
     if not len(epochs):
-        raise MismatchError(f"{folders[0]}: no epoch of the runs has a place on the line")
+        raise MismatchError(f"{folders[0]}: no epoch of the runs has a position on the line")
     sound = pl.col("filter_status").is_in(_SOUND)
     stretch = (pl.col("chainage_m") / stretch_m).floor()
     return (

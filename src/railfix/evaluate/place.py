@@ -203,7 +203,9 @@ def compute_errors(
                 ),
                 distance_m=np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1),
                 reference_chainage_m=answers.reference_chainage_m,
-                notes=(f"{antenna}: the line is closed, errors are the short way round",) if np.isfinite(turn) else (),
+                notes=(f"{antenna}: the line is closed; errors are in the shorter direction",)
+                if np.isfinite(turn)
+                else (),
             )
         if method == "chainage":
             raise MismatchError(f"{run.path}: {against}; take the trajectory instead (--method trajectory)")
@@ -248,7 +250,8 @@ def _note_of_passes(
     if not others:
         return ()
     return (
-        f"{antenna}: the line comes by the same place several times; {others} of {int(known.sum())} errors are to the "
+        f"{antenna}: the line passes the same point several times; {others} of {int(known.sum())} errors "
+        "are to the "
         "pass nearest to the position, which may not be the one that the train was on",
     )
 

@@ -166,14 +166,14 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
         )
         tables.append(listing("limits", _in_order(limited), [*_where(limited), *_LIMITS], caption))
     if len(intervals := evaluation.intervals):
-        caption = "Metres run and seconds passed between two positions"
+        caption = "Distance travelled [m] and time [s] between consecutive positions"
         intervals = _pool_runs(intervals).filter(new)
         columns = [*_where(intervals), *_INTERVALS]
         tables.append(listing("intervals", intervals.with_columns(_POSITION, _OF), columns, caption))
     if evaluation.outages is not None and len(evaluation.outages):
         tables.append(outages(evaluation.outages))
     if (rows := evaluation.branches) is not None and len(rows):
-        caption = f"Stated probability of the place against the share of places within {WRONG_PLACE_M:g} m"
+        caption = f"Stated probability of the position against the fraction of positions within {WRONG_PLACE_M:g} m"
         tables.append(listing("branches", rows.with_columns(_OF), [*_where(rows), *_BRANCHES], caption))
     return tables
 
@@ -377,7 +377,8 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
             {**asdict(run), "path": str(run.path), "inputs": [entry["path"] for entry in run.inputs]}
             for run in evaluation.runs
         ],
-        "units": "metres, seconds, metres a second as the names end (_m, _s, _mps); shares are parts of 1",
+        "units": "by the ending of the names: metres (_m), seconds (_s), metres per second (_mps); fractions are "
+        "from 0 to 1",
         "columns": {name: tables[name][1] for name in ("figures", "intervals")}
         | {"epochs": EPOCH_COLUMNS}
         | {name: columns for name, (_, columns) in tables.items()},

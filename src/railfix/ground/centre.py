@@ -37,9 +37,9 @@ class ReferenceCurve:
         freeze_arrays(self)
         ahead = self.direction * np.diff(self.chainage_m)
         if self.direction not in (-1, 1) or len(ahead) < 1 or not (ahead > 0).all():
-            raise ValueError("chainage_m rises strictly in the direction of the run, which is -1 or 1")
+            raise ValueError("chainage_m must rise strictly in the direction of the run, and direction must be -1 or 1")
         if not (np.diff(self.running_s) > 0).all():
-            raise ValueError("running_s rises strictly")
+            raise ValueError("running_s must rise strictly")
 
     @classmethod
     def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
@@ -68,7 +68,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position after a running time, at most at the next station: by position, not by timetable."""
+        """Return the position after a running time, at most at the next station, regardless of any timetable."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -124,7 +124,7 @@ class CentreLimits(Settings):
     @model_validator(mode="after")
     def _lost_before_error(self) -> Self:
         if self.error_s <= self.lost_s:
-            raise ValueError("error_s is longer than lost_s")
+            raise ValueError("error_s must be longer than lost_s")
         return self
 
 
@@ -155,9 +155,9 @@ class Rejection(Enum):
     REPEATED = "repeated or older than the newest"
     EARLIER_START = "of an earlier start on board"
     FAR_AHEAD = "number further ahead than a train can have counted; start its unit again"
-    NO_PLACE = "without a place"
+    NO_PLACE = "without a position"
     NO_FACING = "the direction in which the front end looks is unknown"
-    NO_FRONT_END = "where the front end is is unknown"
+    NO_FRONT_END = "the position of the front end is unknown"
     TOO_OLD = "position too old when it was sent, or later than the train's clock; set that clock"
 
 

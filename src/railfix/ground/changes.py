@@ -26,7 +26,7 @@ def _placed(
     """Return a train between two chainages, without an authority, or the reason why it cannot be there."""
     low, high = sorted((rear_m, front_m))
     if direction not in (-1, 1) or track not in (1, 2):
-        return "direction is -1 or 1, and track 1 or 2"
+        return "direction must be -1 or 1, and track 1 or 2"
     if direction * (front_m - rear_m) < train.length_m:
         return f"from rear_m to front_m in running direction there is no room for a train of {train.length_m:g} m"
     if low < layout.stations[0].begin_m or high > layout.stations[-1].end_m:
@@ -79,7 +79,10 @@ def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
     """Return a refusal if a train may still run by an authority in transit, None if it cannot."""
     if known.runs_by is None or lapsed:
         return None
-    return f"train {known.train} has not reported that it obeys the order to brake, and may run on: wait for that"
+    return (
+        f"train {known.train} has not reported that it obeys the order to brake, and may still run: wait "
+        "for that report"
+    )
 
 
 def enter_train(
@@ -93,9 +96,9 @@ def enter_train(
     front_m: float,
     track: int,
 ) -> Changed:
-    """Return the state with a train added anywhere on the line, even one without reports; and a refusal's reason."""
+    """Return the state with a train added anywhere on the line, even without reports, and the reason of a refusal."""
     if train in state.trains:
-        return state, f"there is a train {train} already"
+        return state, f"train {train} exists already"
     if not 0 < train < 1 << 32 or not length_m > 0.0:
         return state, "a number from 1 to 4294967295 and a length above 0 m were expected"
     new = TrainInterval(
@@ -113,12 +116,12 @@ def _refused_overlap(
     pieces = pieces_of(train, layout)
     for other in state.trains.values():
         if other.train != train.train and overlap(pieces, pieces_of(other, layout)):
-            return state, f"the interval of train {other.train} is there"
+            return state, f"the interval overlaps the interval of train {other.train}"
     return with_train(replace(state, points=points), train), None
 
 
 def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[PointName, PointState]:
-    """Return points that a train no longer locks."""
+    """Return the points without the locks of a train."""
     return {
         name: replace(point, locked={n: since for n, since in point.locked.items() if n != train})
         if train in point.locked
@@ -130,8 +133,8 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
     """Return the state without a train; its sections are then occupied by vehicles that report nothing.
 
-    Their detection frees the sections, or an order of a person who has seen them free. No authority in transit may
-    therefore let the train run, as in `correct_interval`.
+    The sections are freed by their detection, or by the order of a person who has seen that they are free. Therefore,
+    as in `correct_interval`, no authority in transit may let the train run.
     """
     known = state.trains.get(train)
     if known is None:
@@ -156,7 +159,7 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
     if first is None or second is None or lead == other:
         return state, "two trains of the line were expected"
     if not all(train.stop is not None and train.standstill for train in (first, second)):
-        return state, "one of the trains is not stopped, or does not stand still"
+        return state, "one of the trains is not stopped, or not at rest"
     d = first.direction
     if second.direction != d or d * (first.front_m - second.front_m) < 0.0:
         return state, f"train {other} is not behind train {lead}, in its direction"
@@ -188,7 +191,7 @@ def divide_train(state: Interlocking, train: int, other: int, *, length_m: float
     if known is None:
         return state, f"no such train: {train}"
     if other in state.trains or not 0 < other < 1 << 32:
-        return state, f"{other} is no number for the other part"
+        return state, f"{other} is not a valid number for the other part"
     if known.stop is None or not known.standstill:
         return state, f"train {train} is not stopped, or does not stand still"
     if not 0.0 < length_m < known.length_m:

@@ -33,7 +33,7 @@ _CAUSE = "cause of the stop"
 
 
 def _severity(verdict: TriangleVerdict) -> int:
-    """Return the rank of a verdict; the highest rank between two steps counts."""
+    """Return the rank of a verdict; of the verdicts between two steps, one of the highest rank is used."""
     if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
         return 2  # an absent fix stops trains only once it is late
     return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
@@ -154,7 +154,7 @@ class ControlCentre:
         if after.session != before.session and before.sequence >= 0:
             self.log(f"train {number}: started again on board", train=number)
         if after.rejected != before.rejected:
-            word = "reports count again" if after.rejected is None else f"report does not count: {after.rejected}"
+            word = "reports are accepted again" if after.rejected is None else f"report rejected: {after.rejected}"
             self.log(f"train {number}: {word}", train=number)
         if after.sequence != before.sequence or after.session != before.session:
             self._hear_interference(message)
@@ -174,7 +174,7 @@ class ControlCentre:
         """Count and log contradictions of a report, and its answers."""
         number = known.train
         if known.contradiction is not None:
-            self.rejected["contradicts what is known of the train"] += 1
+            self.rejected["contradicts the record of the train"] += 1
             if known.contradiction != was.contradiction:
                 word = "stopped" if was.stop is None else "stopped before; now"
                 self.log(f"train {number}: {word}, {known.contradiction}", train=number)
@@ -183,7 +183,7 @@ class ControlCentre:
         elif known.direction != message.facing:
             self.rejected["change of ends outside its station, or of an incomplete train"] += 1
         if was.asked_m is not None and known.asked_m is None:
-            what = "has given its route back" if known.held else "keeps its route"
+            what = "has returned its route" if known.held else "keeps its route"
             self.log(f"train {number}: {what}", train=number)
 
     def _hear_interference(self, message: TrainMessage) -> None:
@@ -209,9 +209,9 @@ class ControlCentre:
         ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Process a verdict on satellite positioning from fixes of a given age; the worst between two steps counts.
+        """Process a verdict on satellite positioning from fixes of a given age; the worst between two steps is used.
 
-        Fixes older than `MonitorLimits.late_s`, or from the future by as much, give no verdict.
+        Fixes older than `MonitorLimits.late_s`, or further in the future than this, give no verdict.
         """
         if abs(age_s) > self.times.late_s:
             self.rejected["fixes of the triangle with a wrong age"] += 1
@@ -220,7 +220,7 @@ class ControlCentre:
             self._verdict = verdict, receiver
 
     def step(self) -> None:
-        """Judge and send: order braking, release points, set routes, extend authorities, commit, then send.
+        """Order braking, release points, set routes, extend authorities, and commit; then send the committed messages.
 
         It is to be called several times per second. Orders to brake need no store. Authorities, and commands to points,
         are sent once their state is committed.
@@ -257,7 +257,7 @@ class ControlCentre:
         if alarm is not None and self._alarm is None:
             self.log(f"ALARM: {alarm}")
         elif alarm is None and self._alarm is not None:
-            self.log("the database is written again")
+            self.log("the database can be written again")
         self._alarm = alarm
 
     def _order(self, order: BrakeOrder, now: float) -> None:
@@ -304,7 +304,7 @@ class ControlCentre:
             if not self.supervision.state.stopped:
                 return "there is no stop to release"
             self.supervision.state = replace(self.supervision.state, stopped=False)
-            self.log("stop released by hand; nothing judges satellite positioning")
+            self.log("stop released by hand; satellite positioning is not monitored")
             return None
         self.monitor, orders, reason = release(self.monitor, self.clock(), limits=self.times)
         if orders:

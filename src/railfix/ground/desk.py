@@ -28,7 +28,7 @@ Values = dict[str, Any]
 
 
 def number_of(values: Values, name: str) -> int | str:
-    """Return an integer of an order, or the sentence on its fault."""
+    """Return an integer of an order, or a sentence on what is wrong with it."""
     value = values.get(name)
     return value if type(value) is int else f"{name}: a number was expected"
 
@@ -75,7 +75,8 @@ class OrderDesk:
         self._asked = {k: v for k, v in self._asked.items() if now - v[0] <= most_s}
         self._asked[key] = now, by
         return (
-            f"{what}: order it again in {AGAIN_S[0]:g} to {most_s:g} s, or let another person order it, if that is so"
+            f"{what}: if this is true, repeat the order in {AGAIN_S[0]:g} to {most_s:g} s, or let another "
+            "person give it"
         )
 
     def asked_s(self, name: str, values: Values) -> float:
@@ -84,7 +85,7 @@ class OrderDesk:
         return self._asked.get(key, (self.clock(), ""))[0]
 
     def release_train(self, values: Values, by: str) -> str | None:
-        """Release the stop of a train; for a silent train, whose position is unconfirmed, it is ordered twice."""
+        """Release the stop of a train; for a train that does not report (unconfirmed position) it is ordered twice."""
         train = number_of(values, "train")
         if isinstance(train, str):
             return train
@@ -92,7 +93,9 @@ class OrderDesk:
         record = self.supervision.records.get(train)
         silent = record is None or record.state is not TrainState.TRACKED
         if reason is None and silent:
-            reason = self.confirmed("release-train", values, by, f"train {train} is silent, and stands, whole")
+            reason = self.confirmed(
+                "release-train", values, by, f"train {train} does not report, but is at rest and complete"
+            )
         if reason is None:
             self.supervision.state = state
         return reason
@@ -103,7 +106,9 @@ class OrderDesk:
         """Change trains at the second order, which must contain a reason in words."""
         reason = values.get("reason")
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
-            return f"reason: one to {LONGEST_REASON} characters were expected: who has seen what"
+            return (
+                f"reason: one to {LONGEST_REASON} characters that state the observer and the observation were expected"
+            )
         since_s = self.asked_s(name, values)
         before = self.supervision.state
         state, refused = change(values)
@@ -124,7 +129,7 @@ class OrderDesk:
                 record.heard_s >= since_s - self.supervision.centre.lost_s
                 and replace(train, reported_m=known.reported_m).outside_m() > 0.0
             ):
-                return "train {} reports {:.0f} to {:.0f} m, outside of that interval".format(number, *known.reported_m)
+                return "train {} reports {:.0f} to {:.0f} m, outside that interval".format(number, *known.reported_m)
         return None
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
@@ -163,7 +168,7 @@ class OrderDesk:
         """Continue after a start without the trains that have not reported since, if the database is no older copy."""
         if not self.supervision.awaited:
             return "every train has reported since the start"
-        what = f"the database is no older copy, and these trains are silent: {self.supervision.awaited_text}"
+        what = f"the database is not an older copy, and these trains do not report: {self.supervision.awaited_text}"
         if (reason := self.confirmed("confirm-start", values, by, what)) is None:
             self.supervision.awaited.clear()
         return reason
@@ -207,7 +212,7 @@ class OrderDesk:
         if values.get("lift") is True:
             if name not in state.restrictions:
                 return f"there is no restriction {name!r}"
-            reason = self.confirmed("restrict", values, by, f"nothing needs the restriction {name}")
+            reason = self.confirmed("restrict", values, by, f"restriction {name} is no longer needed")
             if reason is None:
                 kept = {key: value for key, value in state.restrictions.items() if key != name}
                 supervision.state = replace(state, restrictions=kept)
@@ -217,11 +222,11 @@ class OrderDesk:
             return found
         new = Restriction(*found)
         if not new.low_m < new.high_m or not 0.0 < new.speed_mps <= 100.0:
-            return "low_m below high_m, and a speed up to 100 m/s were expected"
+            return "low_m below high_m, and a speed above 0 and up to 100 m/s were expected"
         if name in state.restrictions:
-            return f"there is a restriction {name!r} already: lift it, or take another name"
+            return f"restriction {name!r} exists already: lift it, or use another name"
         if len(state.restrictions) >= MOST_PARTS:
-            return f"there are {MOST_PARTS} restrictions already, the most that an authority names"
+            return f"there are {MOST_PARTS} restrictions already, the largest number that an authority can contain"
         supervision.state = replace(state, restrictions={**state.restrictions, name: new})
         return None
 
@@ -252,11 +257,11 @@ class OrderDesk:
             "stop": of_train(self.stop),
             "stop-all": lambda _values, _by: self.stop(None),
             "release-train": self.release_train,
-            "correct-train": changing("correct", "the train is inside that interval, and stands"),
-            "enter-train": changing("enter", "the train is inside that interval, and stands"),
+            "correct-train": changing("correct", "the train is inside that interval, and at rest"),
+            "enter-train": changing("enter", "the train is inside that interval, and at rest"),
             "remove-train": changing("remove", "the train is no longer to be supervised"),
-            "join-trains": changing("join", "the trains are coupled, and stand"),
-            "divide-train": changing("divide", "the train is divided there, and both parts stand"),
+            "join-trains": changing("join", "the trains are coupled, and at rest"),
+            "divide-train": changing("divide", "the train is divided there, and both parts are at rest"),
         }
         return {name: partial(self.given, name, order) for name, order in orders.items()} | {
             "detect-section": self.detect  # repeated every few seconds

@@ -34,7 +34,8 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor_setup import parse_position
 
-#: Drop of the mean C/N0 over satellites, below its median over preceding epochs, that counts as fallen [dB-Hz].
+#: Smallest drop of the mean C/N0 over satellites, below its median over preceding epochs, that is taken as a fall
+#: [dB-Hz].
 FALLEN_DBHZ = 6.0
 #: Number of epochs of this median.
 USUAL_EPOCHS: Final = 600
@@ -48,7 +49,7 @@ class StationFixes(FrozenArrays):
 
     time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
     points_m: Floats  #: Known points, east and north of the first; shape (N, 2).
-    fixes_m: Floats  #: NaN where the common satellites are too few; shape (T, N, 2).
+    fixes_m: Floats  #: NaN where there are too few common satellites; shape (T, N, 2).
     n_satellites: Integers  #: Shape (T,).
     cn0_fallen: Masks  #: Shape (T, N).
 
@@ -132,16 +133,18 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
     """Read the positions of three receivers (`computed`), or compute them from their observations.
 
-    `points` are the known points as texts, one per log; without any, the headers' positions are used. SettingsError:
-    navigation or points are missing, or not applicable. MismatchError: a header has no position, or the logs have no
-    satellite or no epoch in common.
+    `points` are the known points as texts, one per log; without them the positions in the headers are used.
+    SettingsError: navigation or points are missing, or not applicable. MismatchError: a header has no position, or the
+    logs have no satellite or no epoch in common.
     """
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:
         if nav:
             raise SettingsError("--nav has no use with --fixes: positions are not computed again")
         if not len(known):
-            raise SettingsError("--point is missing: logs of positions name no known points; give it for each receiver")
+            raise SettingsError(
+                "--point is missing: logs of positions contain no known points; give it for each receiver"
+            )
         return fixes_of_positions([read_positions(path) for path in logs], known)
     if not nav:
         raise SettingsError("--nav is missing: logs need navigation files")
@@ -189,7 +192,7 @@ def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:
 
 
 def round_tags(time: Datetimes) -> Datetimes:
-    """Return tags rounded to `SAME_EPOCH`, shape (T,)."""
+    """Return time tags rounded to `SAME_EPOCH`, shape (T,)."""
     step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
     rounded = (time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step
     return np.asarray(rounded.astype("datetime64[ns]"))

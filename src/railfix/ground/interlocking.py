@@ -93,7 +93,7 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
         if k := bisect_right(by_high, (low, math.inf)):
             low = by_high[bisect_left(by_high, (by_high[k - 1][0],))][1]
         beside = [span for span in free if span[0] <= high and span[1] >= low]
-        found.update((span[2], f"train {number} is stopped beside it") for span in beside)
+        found.update((span[2], f"train {number} is stopped next to it") for span in beside)
         free = [span for span in free if span not in beside] if beside else free
     return found
 
@@ -116,7 +116,7 @@ def points_reported(state: Interlocking, point: PointName, detected: int | None,
     if answered:
         low, high = layout.zone_m(point)
         under = [number for number in before.locked if state.trains[number].overlaps(low, high)]
-        return stop_trains(state, under, "points of its route lie otherwise")
+        return stop_trains(state, under, "points of its route are detected in another position")
     return state
 
 
@@ -168,7 +168,7 @@ def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: 
         return f"the train is stopped: {stopped[here.train]}"
     if not 0 <= target < len(layout.stations):
         return "there is no station ahead"
-    if reached(here, target, layout):  # it has a track there, on which it may stop
+    if reached(here, target, layout):  # the train has a track there, on which it may stop
         return f"the train is in {layout.stations[target].name}"
     for name in ((here.station, here.direction), (target, -here.direction)):
         if not state.points[name].commanded and state.points[name].detected is None:
@@ -195,9 +195,9 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
             continue
         stays = other.station == target or other.direction != direction
         if other.tracks.get(target) == track and stays and not other.has_passed(ahead.begin_m, ahead.end_m):
-            return f"track {track} of {ahead.name} is taken by train {other.train}"
+            return f"track {track} of {ahead.name} is occupied or reserved by train {other.train}"
         if comes_the_other_way(other, direction, section, layout):
-            return f"train {other.train} comes the other way"
+            return f"train {other.train} comes from the opposite direction"
     return None
 
 

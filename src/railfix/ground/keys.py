@@ -94,7 +94,7 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):
-        # the newest certificate of a renewed authority counts
+        # of a renewed authority the newest certificate is checked
         newest = max(x509.load_pem_x509_certificates((folder / file).read_bytes()), key=lambda c: c.not_valid_after_utc)
         if newest.not_valid_after_utc <= limit:
             found.append(ending_sentence(file, newest.not_valid_after_utc))
@@ -113,7 +113,7 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
         signing, issuer = _read_authority(folder)
         names = [name for name in names if not (folder / f"{name}.pem").exists()]
         if not names:
-            raise OutputError(f"{folder}: every certificate is there already; --renew makes new ones")
+            raise OutputError(f"{folder}: every certificate exists already; --renew makes new ones")
         parts: dict[str, bytes] = {}
     else:
         signing = ec.generate_private_key(ec.SECP256R1())
@@ -153,7 +153,7 @@ def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
         certificates = x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes())
     except (OSError, ValueError, TypeError) as error:
         raise InputFileError(
-            path, f"cannot be read with authority.pem ({error}); name the folder of the keys"
+            path, f"cannot be read with authority.pem ({error}); give the folder of the keys"
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificates[0].public_key():
         raise InputFileError(path, "is not the key of authority.pem")
@@ -213,7 +213,7 @@ def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path
         for name in parts if replace else ():
             (folder / f"{name}.new").replace(folder / name)
     except FileExistsError as error:
-        raise OutputError(f"{error.filename}: is there already; remove it, or name another folder") from None
+        raise OutputError(f"{error.filename}: is there already; remove it, or give another folder") from None
     except OSError as error:
         raise OutputError(f"{folder}: keys cannot be written ({error.strerror})") from None
     return written

@@ -51,7 +51,7 @@ class LoopStation(Settings):
 
 
 class Gradient(Settings):
-    """Gradient from a chainage on to the next; before the first the line is level."""
+    """Gradient from a chainage to the next gradient's chainage; before the first the line is level."""
 
     from_m: float
     permille: float = Field(ge=-1000, le=1000)  #: Uphill with rising chainage positive.
@@ -72,9 +72,9 @@ class Layout(Settings):
             if other.begin_m <= one.end_m:
                 raise ValueError(f"{other.name} begins at {other.begin_m} m, before the end of {one.name}")
         if any(other.from_m <= one.from_m for one, other in pairwise(self.gradients)):
-            raise ValueError("gradients are in order of chainage")
+            raise ValueError("gradients must be in order of chainage")
         if len(self.sections) < 4 * len(names) - 1:
-            raise ValueError("a station has the name of a section")
+            raise ValueError("a station must not have the name of a section")
         return self
 
     @cached_property
@@ -97,7 +97,7 @@ class Layout(Settings):
 
     @cached_property
     def sections(self) -> dict[str, tuple[Piece, ...]]:
-        """Pieces of track by name: of each station with its points, of each of its tracks, and between stations."""
+        """Pieces of track by name: each station with its points, each of its tracks, and the line between stations."""
         found: dict[str, tuple[Piece, ...]] = {}
         for k, station in enumerate(self.stations):
             first, last = station.inner_m
@@ -228,7 +228,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
         names = tuple(network.names[track] for track in ahead)
         if len(ahead) > 2 or len(fars) != 1:
             raise MismatchError(
-                f"tracks {', '.join(names)} leave one point and do not meet at the next: no passing loop"
+                f"tracks {', '.join(names)} begin at one point but do not meet at the next: this is not a passing loop"
             )
         far = fars.pop()
         lines = [_points_m(network, track, backward=ends[track][0] != node) for track in ahead]
@@ -250,8 +250,8 @@ def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats]
     """Return the station of two tracks, track 1 first, from a chainage on."""
     if abs(lengths_m[0] - lengths_m[1]) > LENGTHS_M:
         raise MismatchError(
-            f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; at most "
-            f"{LENGTHS_M:g} m of difference were expected"
+            f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; a "
+            f"difference of at most {LENGTHS_M:g} m was expected"
         )
     points = max(_clear_after_m(*lines), _clear_after_m(*(line[::-1] for line in lines)))
     return LoopStation(name=names[0], begin_m=begin_m, end_m=begin_m + lengths_m[0], points_m=round(points + 0.5, 1))

@@ -79,7 +79,7 @@ class OnBoard:
     stops_at_m: float | None = None
     #: Time of sending of the newest report that an authority has answered; None before the first.
     answered_s: float | None = None
-    #: Newest report from before the last change of ends, or from before this start: answers to it or to an older report
+    #: Newest report from before the last change of ends, or from before this start: answers to this or an older report
     #: are rejected.
     before_turn: int = -1
 
@@ -90,7 +90,7 @@ class OnBoard:
     _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
 
     def note_report(self, sequence: int, now_s: float) -> None:
-        """Note a report that is sent."""
+        """Record a report that is sent."""
         self._sent[sequence] = now_s
         self._newest = sequence
         if len(self._sent) > REMEMBERED:
@@ -105,7 +105,10 @@ class OnBoard:
         safe_rear_m: float | None = None,
         now_s: float | None = None,
     ) -> None:
-        """Store the train's safe ends and speed; a single wrong position cannot accept a shorter end.
+        """Store the train's safe ends and speed.
+
+        Whether the train can stop before a shorter end is decided by the farther of its last two stopping positions, so
+        that a single wrong position cannot cause the acceptance of that end.
 
         A train that has rolled back brakes: earlier grants of the centre do not include it. Without a position or a
         speed it continues from the previous position (`OnBoardLimits.placeless_s`).
@@ -130,7 +133,7 @@ class OnBoard:
         self.stops_at_m = self._further(before, self._place_m)
 
     def _further(self, before_m: float | None, now_m: float) -> float | None:
-        """Return the farther of two positions in running direction, None without the first [m]."""
+        """Return the farther of two positions in running direction; None without a first position [m]."""
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:
@@ -169,7 +172,7 @@ class OnBoard:
         return True
 
     def _ends_order(self, authority: Authority) -> bool:
-        """Return whether an authority ends the order to brake; otherwise only its age is used."""
+        """Return whether an authority ends the order to brake; otherwise only the authority's age is used."""
         assert self.order is not None
         if authority.number > self.order.number and not authority.stopped:
             return True
@@ -191,7 +194,7 @@ class OnBoard:
         return not self._granted
 
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
-        """Return whether a shorter end may be accepted: an authority from before the start is unknown.
+        """Return whether a shorter end may be accepted: the train does not know authorities from before its start.
 
         The train brakes until it can accept the end.
         """
@@ -257,7 +260,7 @@ class OnBoard:
         return self.stale_reason(now_s) or self.curve_reason(now_s)
 
     def stale_reason(self, now_s: float) -> str | None:
-        """Return the input that is too old, the authority or the position; None if neither is."""
+        """Return the input that is too old, the authority or the position; None if neither is too old."""
         if self.age_s(now_s) > self.limits.fresh_s:
             return "no fresh authority"
         at_s = None if self._motion is None else self._motion.at_s
@@ -273,7 +276,7 @@ class OnBoard:
         over = stopping_m(place, motion.speed_mps, self._steps(), self.limits) - d * self.end_m
         overruns = f", {over:.0f} m beyond it" if over > 0.0 else ""
         target = f"{found.target.speed_mps:.1f} m/s at {d * found.target.at_m:.0f} m"
-        return f"{motion.speed_mps:.1f} m/s where {found.intervention_mps:.1f} m/s lead to {target}{overruns}"
+        return f"{motion.speed_mps:.1f} m/s, above the {found.intervention_mps:.1f} m/s that lead to {target}{overruns}"
 
     def turn(self, direction: int, front_m: float) -> None:
         """Change to a running direction, without an authority."""

@@ -192,7 +192,7 @@ def address_errors(host: str, port: int) -> Iterator[None]:
         yield
     except OSError as error:
         todo = {
-            errno.EADDRINUSE: "end the program that does, or choose another port",
+            errno.EADDRINUSE: "end the program that listens there, or choose another port",
             errno.EACCES: "choose a port above 1023",
         }.get(error.errno or 0, "choose an address of this computer")
         raise OSError(error.errno, f"cannot listen at {host}:{port} ({error.strerror}); {todo}") from None

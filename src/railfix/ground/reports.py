@@ -135,7 +135,7 @@ def off_line(report: PlacedReport) -> str | None:
 def moving_standstill(report: PlacedReport) -> str | None:
     """Return the reason if a standstill is reported with a speed."""
     moving = report.message.standstill and not stands(report.message)
-    return f"the train stands, and runs at {report.speed_mps:.1f} m/s" if moving else None
+    return f"the report states standstill and a speed of {report.speed_mps:.1f} m/s" if moving else None
 
 
 def unknown_authority(report: PlacedReport) -> str | None:
@@ -143,7 +143,8 @@ def unknown_authority(report: PlacedReport) -> str | None:
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None
-    return f"the train holds authority {held}, the centre's database ends at {last if held < first else report.granted}"
+    newest = last if held < first else report.granted
+    return f"the train has authority {held}, the newest in the centre's database is {newest}"
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
@@ -169,7 +170,7 @@ def holds_more(report: PlacedReport) -> str | None:
     if report.turns:
         known_m, allowed_m = report.ahead_m, report.over_m + report.under_m
     beyond = facing * (held - known_m) > allowed_m
-    return f"the train holds an authority beyond its interval, to {held:.0f} m" if beyond else None
+    return f"the train has an authority that ends beyond its interval, at {held:.0f} m" if beyond else None
 
 
 def too_fast(report: PlacedReport) -> str | None:
@@ -198,10 +199,11 @@ def impossible_way(report: PlacedReport) -> str | None:
     known, elapsed = report.known, report.elapsed_s
     if report.turns:
         return None
-    if elapsed is None:  # at its first report it stands; after a start on board it may be anywhere in its interval
+    # At its first report the train is at rest; after a start on board it may be anywhere in its interval.
+    if elapsed is None:
         end = known.front_m if known.reported_m is None else known.interval_m[1]
         way = known.direction * (report.front_m - end) - report.over_m
-        return f"the train is {way:.0f} m or more ahead of where it is known to be" if way > 0.0 else None
+        return f"the train is {way:.0f} m or more ahead of its recorded position or interval" if way > 0.0 else None
     way = known.direction * (report.front_m - known.front_m) - report.over_m
     if way > longest_way_m(known.speed_mps, report.speed_mps, max(elapsed, 0.0), report.limits):
         return f"the train has moved {way:.0f} m or more in {elapsed:.1f} s"
@@ -241,7 +243,7 @@ def compute_contradiction(report: PlacedReport) -> str | None:
 
 
 def covered_m(report: PlacedReport) -> tuple[float, float]:
-    """Return rear and front end of an interval that is extended to the reported position.
+    """Return the rear and the front end of an interval that is extended to the reported position.
 
     The extension is limited by the distance that the train can have run, and by the line.
     """

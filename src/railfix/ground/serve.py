@@ -43,7 +43,8 @@ from railfix.track.network_read import read_network
 STEP_S = 0.1
 #: Longest wait for a commit in progress at the end [s].
 ENDING_S = 3.0
-#: Thresholds of the garbage collection: with a thousand connections a full collection takes 0.3 s, and is made rarely.
+#: Thresholds of the garbage collection: with a thousand connections a full collection takes 0.3 s, and is therefore
+#: rare.
 COLLECTION = 10_000, 20, 50
 #: Document with the stations and trains that the database belongs to.
 _BELONGS_TO = "stations and trains"
@@ -122,9 +123,9 @@ class CentreFile(Settings):
     @model_validator(mode="after")
     def _both_bearers_and_known_places(self) -> Self:
         if set(self.listen) != set(BEARERS):
-            raise ValueError("listen has an address for each of A and B")
+            raise ValueError("listen must have an address for each of A and B")
         if bool(self.stations) == bool(self.network):
-            raise ValueError("the line is given by stations, or by network, and not by both")
+            raise ValueError("give the line either by stations or by network")
         if self.network:
             return self  # checked again with its stations
         layout, numbers = self.layout, [train.number for train in self.trains]
@@ -140,19 +141,19 @@ class CentreFile(Settings):
                 tracks = {station.name: "{:.0f} to {:.0f} m".format(*station.inner_m) for station in layout.stations}
                 where = tracks.get(train.station, f"none, the stations are {', '.join(tracks)}")
                 raise ValueError(
-                    f"train {train.number} does not stand between the points of {train.station} ({where}): with its "
+                    f"train {train.number} is not between the points of {train.station} ({where}): with its "
                     f"bounds it is at {low - train.bound_m:.0f} to {high + train.bound_m:.0f} m"
                 )
         places = [(train.station, train.track) for train in self.trains]
         if len(set(places)) < len(places):
-            raise ValueError("two trains stand on the same track")
+            raise ValueError("two trains are on the same track")
         return self
 
     def with_stations(self, folder: Path) -> Self:
         """Return the settings with the stations of the network, whose files are relative to a folder.
 
         InputFileError, MismatchError: a map file cannot be read, or the network is not a single line with passing
-        loops. SettingsError: a train stands outside all stations.
+        loops. SettingsError: a train is outside all stations.
         """
         if not self.network:
             return self
@@ -353,7 +354,7 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
 
 
 async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> None:
-    """Judge satellite positioning by the streams of the triangle; if they end, late fixes stop the trains."""
+    """Monitor satellite positioning with the streams of the triangle; if they end, late fixes stop the trains."""
     if (triangle := settings.triangle) is None:
         return
     try:
@@ -376,13 +377,13 @@ def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
     text = store.document(_BELONGS_TO)
     if text is None and store.document(HEAD) is not None:
-        raise InputFileError(path, "the database is of an older version of railfix; name another database")
+        raise InputFileError(path, "the database is of an older version of railfix; give another database")
     before: dict[str, str] = under if text is None else json.loads(text)
     for name in sorted(before.keys() | under.keys()):
         if before.get(name) != under.get(name):
             was, is_now = before.get(name, "absent"), under.get(name, "absent")
             raise InputFileError(
-                path, f"{name} is {is_now}, in the database {was}; restore the file, or name another database"
+                path, f"{name} is {is_now}, in the database {was}; restore the file, or give another database"
             )
     if text is None:
         store.save(documents={_BELONGS_TO: json.dumps(under)})
@@ -398,7 +399,7 @@ def _is_loopback(host: str) -> bool:
 def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
     """Return the password in the first line of a file, and personal passwords in the other lines, ``NAME PASSWORD``.
 
-    InputFileError: when the file cannot be read, is empty, has another form, or is readable by others than its owner.
+    InputFileError: when the file cannot be read, is empty, has another form, or can be read by others than its owner.
     """
     try:
         shared = path.stat().st_mode & 0o077

@@ -1,6 +1,7 @@
 """State of the interlocking: intervals of trains, points, bars and speed restrictions; and its texts for the store.
 
-The texts are the head, one per train, and one per set of points. Values are immutable: each step returns new ones.
+The state is stored as texts: one head text, one text per train, and one text per set of points. Values are immutable:
+each step returns new values.
 """
 
 from __future__ import annotations
@@ -211,7 +212,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
     names = {field.name for field in fields(TrainInterval)}
     of_trains = [json.loads(text or "").keys() for name, text in texts.items() if name.startswith(_TRAIN)]
     if "bars" not in head or any(found != names for found in of_trains):
-        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
+        raise InputFileError("the centre's database", "is of an older version of railfix; give another database")
     trains, points = {}, {}
     for name, text in texts.items():
         if name.startswith(_TRAIN):

@@ -16,8 +16,8 @@ from railfix.ground.layout import Layout, Piece, PointName, overlap
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
 
-#: Reasons why a section is barred: closed by hand; occupied by vehicles that report nothing, by hand or by its
-#: detection; its detection has not answered. `BARS` are the reasons that stop the trains inside.
+#: Reasons why a section is barred: it was closed by hand; it is occupied by vehicles that report nothing, as entered by
+#: hand or as detected; or its detection has not answered. `BARS` are the reasons that stop the trains inside.
 CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
@@ -55,8 +55,8 @@ def overlaps_stopped(
         if (first.stop and second.stop) or first.parted == other_number or second.parted == number:
             continue
         if overlap(pieces_of(first, layout), pieces_of(second, layout)):
-            state = stop_trains(state, [number], f"its interval meets that of train {other_number}")
-            state = stop_trains(state, [other_number], f"its interval meets that of train {number}")
+            state = stop_trains(state, [number], f"its interval overlaps the interval of train {other_number}")
+            state = stop_trains(state, [other_number], f"its interval overlaps the interval of train {number}")
     return state
 
 
@@ -85,17 +85,21 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     if known is None or known.stop is None:
         return state, f"train {train} is not stopped"
     if not known.standstill:
-        return state, f"train {train} does not stand still"
+        return state, f"train {train} is not at rest"
     if known.outside_m() > 0.0 and known.reported_m is not None:
         return state, (
-            "train {} was last reported at {:.0f} to {:.0f} m, outside its interval {:.0f} to {:.0f} m: see where it "
-            "stands and correct its interval by order (correct-train) first"
+            "train {} was last reported at {:.0f} to {:.0f} m, outside its interval {:.0f} to {:.0f} m: "
+            "first observe where it is, and correct its interval by order (correct-train)"
         ).format(train, *known.reported_m, *known.span_m)
     held = known.held_end_m
     if held is not None and known.direction * (held - known.interval_m[1]) > ROUNDING_M:
-        return state, f"train {train} still holds an authority to {held:.0f} m: it gives it up where it stands by order"
+        return (
+            state,
+            f"train {train} still has an authority to {held:.0f} m: it gives the authority up when it is at rest under "
+            "an order to brake",
+        )
     if (bar := bar_over(state, known, layout)) is not None:
-        return state, f"the section where train {train} is or may run is {bar[1]}: {bar[0]}"
+        return state, f"section {bar[0]}, where train {train} is or may run, is {bar[1]}"
     under = [name for name in layout.points_between(*known.span_m) if known.overlaps(*layout.zone_m(name))]
     if (reason := points_refused(state, known, under, layout)) is not None:
         return state, reason
@@ -110,7 +114,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     moved = replace(known, stop=None, end_m=end, line=None, station=station)
     released_state = with_train(replace(state, points=points), moved)
     if overlaps_stopped(released_state, layout) != released_state:
-        return state, f"the interval of train {train} meets another one"
+        return state, f"the interval of train {train} overlaps the interval of another train"
     return released_state, None
 
 
@@ -177,7 +181,7 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer: the route is released where the train agrees, else kept.
+    """Return the state after a report that may answer the request; the route is released where the train agrees.
 
     For a stopped train, whose report may be wrong, no answer is used until it is released.
     """

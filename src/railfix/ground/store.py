@@ -89,7 +89,7 @@ class Store:
             except OSError:
                 self._lock.close()
                 self._lock = None
-                raise InputFileError(database, "is in use by another centre; end that one first") from None
+                raise InputFileError(database, "is in use by another centre; end that centre first") from None
         token = uuid.uuid4().hex
         with self._connection.begin():
             charge = DOCUMENTS.update().where(DOCUMENTS.c.name == _IN_CHARGE).values(text=token)
@@ -143,7 +143,9 @@ class Store:
                 # written before it is read, so that the row stays locked until the commit
                 mine = (DOCUMENTS.c.name == _IN_CHARGE) & (DOCUMENTS.c.text == self._token)
                 if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
-                    raise InputFileError(self._url, "another centre has taken charge of this database; this one ends")
+                    raise InputFileError(
+                        self._url, "another centre has taken charge of this database; this centre ends"
+                    )
             self._put(TRAINS.c.train, trains)
             self._put(
                 DOCUMENTS.c.name, [{"name": n, "text": text} for n, text in documents.items() if text is not None]
@@ -203,7 +205,7 @@ class Store:
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
     def _put(self, key: sql.Column[Any], rows: list[dict[str, Any]]) -> None:
-        """Replace rows by their key; of rows with the same key the last counts."""
+        """Replace rows by their key; of rows with the same key the last is used."""
         if rows := list({row[key.name]: row for row in rows}.values()):
             self._connection.execute(
                 key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]

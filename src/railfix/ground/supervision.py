@@ -224,7 +224,7 @@ class Supervision:
             self.awaited.discard(number)
 
     def advance(self, now_s: float) -> list[Authority]:
-        """Watch, work and command points at once, without a store; return the authorities."""
+        """Find trains to be stopped, extend authorities and command points, without a store; return the authorities."""
         self.watch(now_s)
         authorities = self.work(now_s)
         self.command_points(self.state)
@@ -347,12 +347,12 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names an order to brake, or a later order."""
+    """Return whether a report names this order to brake, or a later order."""
     return (message.brake_order or -1) >= number
 
 
 def counts(reason: Rejection | None) -> bool:
-    """Return whether a report counts, by the reason of its rejection."""
+    """Return whether a report is accepted, by the reason of its rejection."""
     return reason is None
 
 

@@ -68,7 +68,9 @@ class TriangleLimits(Settings):
     @model_validator(mode="after")
     def _side_within_twice_the_radius(self) -> Self:
         if self.side_m > 2.0 * self.radius_m:
-            raise ValueError("side_m is at most twice radius_m: two fixes inside their circles differ by no more")
+            raise ValueError(
+                "side_m must be at most twice radius_m: two fixes inside their circles cannot differ by more"
+            )
         return self
 
 
@@ -100,7 +102,7 @@ def limits_for_false_stops(
         raise ValueError("0 < own_sigma_m <= sigma_m, stops_per_year > 0 and independent_s > 0 were expected")
     probability = stops_per_year * independent_s / YEAR_S / 6.0
     if probability >= 0.1:
-        raise ValueError(f"{stops_per_year} stops a year are more than the limits can be chosen for")
+        raise ValueError(f"{stops_per_year} stops per year are more than the limits can be chosen for")
     factor = float(np.sqrt(-2.0 * np.log(probability)))
     return TriangleLimits(
         radius_m=factor * sigma_m, side_m=min(factor * np.sqrt(2.0) * own_sigma_m, 2.0 * factor * sigma_m)

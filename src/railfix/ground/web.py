@@ -1,6 +1,6 @@
 """Page of the control centre: the line with trains, intervals and authorities, links, alarms and log.
 
-Reading is open; orders need a log-in. The page loads nothing from other servers.
+The page can be read without a log-in; orders need one. The page loads nothing from other servers.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
 #: A connection without a whole request for this time ends, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
-#: Largest number of connections, further ones are refused; and of a peer's connections without a complete request.
+#: Largest number of connections, beyond which further connections are refused; and largest number of a peer's
+#: connections without a complete request.
 MOST_CONNECTIONS: Final = 500
 MOST_IDLE: Final = 20
 #: Name for a log-in by the password alone.
@@ -71,7 +72,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None if the password is wrong, or too many from the address were."""
+        """Open a session and return its token; None for a wrong password, or after too many from that address."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
@@ -162,7 +163,7 @@ def _session_routes(sessions: Sessions) -> list[Route]:
             else sessions.log_in(str(values.get("password", "")), address, str(values.get("name", "")))
         )
         if token is None:
-            return _answer({"refused": "wrong password, or too many wrong ones within a minute"}, 403)
+            return _answer({"refused": "wrong password, or too many wrong passwords within a minute"}, 403)
         answer = _answer({"refused": None})
         secure = request.url.scheme == "https"
         answer.set_cookie(_COOKIE, token, httponly=True, samesite="strict", secure=secure, max_age=int(SESSION_S))
@@ -245,7 +246,7 @@ class _TimedProtocol(H11Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """Whether no request of the connection is being answered."""
+        """Whether no request on this connection is being answered."""
         return self.cycle is None or self.cycle.response_complete
 
     def _look(self, *, waited: bool) -> None:

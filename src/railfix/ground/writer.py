@@ -51,7 +51,7 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
     """Run a function; set its outcome in the future and return it."""
     try:
         work()
-    except Exception as error:  # noqa: BLE001 (the caller of `result` gets it)
+    except Exception as error:  # noqa: BLE001 (the caller of `result` gets the error)
         outcome.set_exception(error)
     else:
         outcome.set_result(None)

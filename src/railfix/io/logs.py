@@ -97,7 +97,7 @@ def _by_georinex(
         parts.append(_of_systems(part, systems)[start:end])
     parts = sorted((part for part in parts if len(part)), key=lambda part: part.time[0])
     if not parts:
-        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the requested time span")
     joined = [parts[0]]
     for part in parts[1:]:
         rest = part[int(np.searchsorted(part.time, joined[-1].time[-1], side="right")) :]
@@ -164,7 +164,7 @@ def _mate_pieces(
     tables = sorted((read_mate_observations(path) for path in paths), key=lambda part: part.time[0])
     pieces = list(in_pieces((_of_systems(part[slice(*limits)], systems) for part in tables), epochs))
     if not any(len(piece) for piece in pieces):
-        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the requested time span")
     return iter(pieces)
 
 
@@ -205,7 +205,7 @@ def _receiver_runs(
         found += len(part)
         yield part
     if not found:
-        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the requested time span")
 
 
 def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:

@@ -191,7 +191,7 @@ def _as_arrays(
         values[name][row, column] = table[source].cast(pl.Float64).fill_null(np.nan).to_numpy()
     time = times.astype("datetime64[ns]")
     lock = values.pop("lock_s")
-    # the lock time rises with the time, whole seconds, while the phase is continuous
+    # the lock time is in whole seconds, and increases with time while the phase is continuous
     lost = np.zeros(lock.shape, dtype=np.uint8)
     lost[1:] = lock[1:] < np.fmin(lock[:-1], lock[:-1] + seconds(np.diff(time))[:, None] - 1.0 + 1e-6)
     return Observations(

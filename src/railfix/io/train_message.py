@@ -219,7 +219,7 @@ def from_json(line: str) -> TrainMessage:
         if values.get("interference") is not None:
             values["interference"] = SuspectedInterference[str(values["interference"]).upper()]
     except (KeyError, TypeError):
-        raise MessageError("has an unknown status, source, interference or what is unknown") from None
+        raise MessageError("has a status, source, interference or item of `unknown` that is not defined") from None
     return validate_message(TrainMessage, values)
 
 
@@ -233,7 +233,7 @@ def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> 
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")
     if Unknown.FRONT_END in message.unknown:
-        raise ValueError("a message without the place of the front end has no packet 0")
+        raise ValueError("a message without the position of the front end has no packet 0")
     distance = message.chainage_cm - reference_cm
     metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
     # Whole metres (Q_SCALE 1), tens of metres where these do not reach (Q_SCALE 2); confidence bounds are rounded up,

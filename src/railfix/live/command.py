@@ -102,7 +102,7 @@ def _check_outputs(inputs: LiveInputs) -> None:
     for k, path in enumerate(written):
         check_not_input(path, _files_read(inputs))
         if path.resolve() in [other.resolve() for other in written[:k]]:
-            raise OutputError(f"{path}: is named for two outputs; name another file for one of them")
+            raise OutputError(f"{path}: is given for two outputs; give another file for one of them")
     if inputs.log is not None:
         check_log_file(inputs.log)
 

@@ -105,7 +105,7 @@ def check_log_file(path: Path) -> None:
     except OSError as error:
         raise OutputError(f"{path}: cannot be opened as a log file ({error.strerror or error})") from None
     if begin and not _LINE.match(begin):
-        raise OutputError(f"{path}: is no log of railfix live, and is not appended to; name another file")
+        raise OutputError(f"{path}: is not a log of railfix live, and nothing is appended to it; give another file")
 
 
 class SessionLog:

@@ -87,7 +87,8 @@ async def run_session(
     Raises
     ------
     InputFileError
-        A source cannot be opened, or breaks and is not opened again; a sensor's stream begins with another table.
+        A source cannot be opened, or breaks and is not opened again; or the first line of a sensor's stream is not the
+        header of that sensor's table.
     OutputError
         A sink of a replay cannot be written; raised at the end, when the other sinks are complete, or if none is left.
     ChannelsDisagreeError

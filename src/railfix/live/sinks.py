@@ -327,7 +327,7 @@ async def open_sink(
     else:
         path = Path(target)
         if path.exists() and overwrite == "refuse":
-            raise OutputError(f"{target}: the file exists already; name another one, or give --overwrite")
+            raise OutputError(f"{target}: the file exists already; give another file, or add --overwrite")
         try:
             opened = ByteTarget(form, path.open("wb", buffering=0), path)
         except OSError as error:

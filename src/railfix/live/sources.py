@@ -265,7 +265,7 @@ class _Answer:
             request = self._h11.Request(method="GET", target=parts.path, headers=head)
             return bytes(self._client.send(request) + self._client.send(self._h11.EndOfMessage()))
         except self._h11.LocalProtocolError as error:
-            raise SettingsError(f"source {hidden(self._source)!r}: cannot be asked for ({error})") from None
+            raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
 
     def take(self, data: bytes) -> bytes:
         """Return the content of further bytes; InputFileError if the mount point has no stream."""
@@ -320,12 +320,12 @@ class _Answer:
         if kind.startswith(b"text/html"):
             raise self._no_stream("a page of HTML")
         if coding != b"identity":
-            raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not asked for")
+            raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not requested")
 
     def _check_content(self, content: bytes) -> None:
         """Raise InputFileError if the first bytes are not a receiver's."""
         if content.startswith(b"\x1f\x8b"):
-            raise self._no_stream("compressed content (gzip), which was not asked for")
+            raise self._no_stream("compressed content (gzip), which was not requested")
         if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
             raise self._no_stream("a page of HTML")
         if content.startswith((b"STR;", b"CAS;", b"NET;", b"SOURCETABLE")):

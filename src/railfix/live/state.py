@@ -94,7 +94,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
         head = None
     form = str(head.get("form")) if isinstance(head, dict) else ""
     if data and not form.startswith("railfix live state "):
-        raise OutputError(f"{path}: is no state file of railfix live, which would overwrite it; name another file")
+        raise OutputError(f"{path}: is not a state file of railfix live, which would overwrite it; give another file")
     if form != _FORM:
         return _refuse(path, "is no state file of this version")
     for name, value in under.items():

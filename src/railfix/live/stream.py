@@ -311,10 +311,12 @@ class Lag:
         if self.skipped == 0:
             if lag_s <= self.behind_s:
                 return False
-            self.reports.append(f"{lag_s:.1f} s behind the receivers: epochs are skipped up to the present")
+            self.reports.append(
+                f"processing is {lag_s:.1f} s behind the receivers: epochs are skipped until it is up to date"
+            )
             self._steady = 0
         elif lag_s <= 0.25 * self.behind_s:
-            self.reports.append(f"at the present again, {self.skipped} epochs were skipped")
+            self.reports.append(f"processing is up to date again; {self.skipped} epochs were skipped")
             self.skipped = 0
             return False
         if self._steady == 0 or abs(lag_s - self._steady_s) > STEADY_S:

@@ -74,8 +74,8 @@ def along_track(
 ) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
     """Return filtered positions of one antenna, the filter's input, and its state.
 
-    Of the codes that screens and exclusions of single epochs have rejected, the filter itself weighs those with some
-    reasons, and leaves out the others (`gnss_epochs`).
+    Codes that screens or single-epoch exclusions have rejected for certain reasons are used, weighted by the filter
+    itself; codes rejected for other reasons are left out (`gnss_epochs`).
 
     The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
     `samples` are the on-board sensor samples since the previous chunk; `references` has the line's features, ground

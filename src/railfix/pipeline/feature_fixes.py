@@ -54,7 +54,7 @@ class LineFeatures:
         )  # fmt: skip
 
     def body_at(self, antenna_m: Floats) -> Floats:
-        """Position of the body's middle where an antenna is at an arc length of its trajectory [m]."""
+        """Return the arc length of the body's middle when the antenna is at an arc length of its trajectory [m]."""
         return np.interp(antenna_m, self.antenna_m, self.body_m)
 
 
@@ -67,7 +67,7 @@ def ahead_m(trajectory: Trajectory) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RateSeries:
-    """Rates of the body at K ticks."""
+    """Changes of the body's heading and pitch, wheel distances and speeds at K ticks."""
 
     #: Times of validity, and times at which the rates became known; shape (K,).
     time: Datetimes

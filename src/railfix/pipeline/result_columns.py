@@ -210,7 +210,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "integer_risk_ppm",
-            "probability that one of these integers, or of the best candidates, is wrong [1e-6]",
+            "probability that any of the fixed integers, or where none is fixed any of the best candidates, "
+            "is wrong [1e-6]",
             lambda r: None if r.phase is None else 1e6 * r.phase.integer_risk,
         ),
         Column(

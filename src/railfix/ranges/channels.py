@@ -61,7 +61,7 @@ def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
-        raise ValueError(f"channels of one clock must stand side by side, got {clocks}")
+        raise ValueError(f"channels of one clock must be adjacent, got {clocks}")
     return tuple(slice(a, b) for a, b in pairwise([*starts, len(clocks)]))
 
 

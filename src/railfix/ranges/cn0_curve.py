@@ -71,7 +71,7 @@ class Cn0Mean:
         for name in ("elevation_deg", "mean_dbhz", "spread_db", "count"):
             values = getattr(self, name)
             if values.shape != self.elevation_deg.shape or values.ndim != 1 or not np.isfinite(values).all():
-                raise ValueError(f"{name} must be finite, one number a bin")
+                raise ValueError(f"{name} must be finite, one number per bin")
             object.__setattr__(self, name, read_only(values))
         if len(self.elevation_deg) < 2 or not (np.diff(self.elevation_deg) > 0.0).all():
             raise ValueError("elevation_deg must rise, over at least two bins")

@@ -78,7 +78,7 @@ def read_cn0_curve(path: FilePath) -> Cn0Curve:
     try:
         return Cn0Curve(means=means, source=file.source)
     except ValueError as error:
-        raise InputFileError(path, f"{error}; each kind and signal stands once") from None
+        raise InputFileError(path, f"{error}; each kind and signal must occur once") from None
 
 
 def _mean(path: FilePath, curve: _Curve, where: str) -> Cn0Mean:

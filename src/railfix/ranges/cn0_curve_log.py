@@ -93,8 +93,8 @@ def cn0_curve_from_log(
         )
     if below > _BELOW_SHARE * seen:
         raise MismatchError(
-            f"{observations[0]}: {100.0 * below / seen:.0f} % of the satellites tracked stand below the horizon of the "
-            "position; give the position of the antenna, or the navigation files of this day"
+            f"{observations[0]}: {100.0 * below / seen:.0f} % of the tracked satellites are below the horizon "
+            "of the position; give the position of the antenna, or the navigation files of this day"
         )
     if not samples.keys():
         raise InputFileError(observations[0], "has no C/N0 (S1C, S2I, ...); log it in the receiver's RINEX output")

@@ -285,7 +285,8 @@ def _statistics(path: FilePath, name: str, columns: _Columns, bins: ErrorBins) -
         values = np.array(getattr(columns, column), dtype=np.int64 if column in _COUNTS else np.float64)
         if len(values) != np.prod(bins.shape):
             raise InputFileError(
-                path, f"entry {name}.{column}: {np.prod(bins.shape)} values were expected, one a bin, got {len(values)}"
+                path,
+                f"entry {name}.{column}: {np.prod(bins.shape)} values were expected, one per bin, got {len(values)}",
             )
         if column not in ("bias_m", *_COUNTS) and (values < 0.0).any():
             raise InputFileError(path, f"entry {name}.{column}: must not be negative, got {np.nanmin(values)}")

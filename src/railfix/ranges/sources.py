@@ -86,11 +86,12 @@ def choose_ionosphere(
         return None, 0.0, ()
     known = navigation.klobuchar
     if "G" in known or "J" in known:
-        notes = () if "G" in known else ("ionosphere: klobuchar asked for, coefficients broadcast by QZSS used",)
+        notes = () if "G" in known else ("ionosphere: klobuchar requested, coefficients broadcast by QZSS used",)
         return known.get("G", known.get("J")), 0.0, notes
     sigma = nominal.typical_ionosphere_sigma_m
     note = (
-        "ionosphere: klobuchar asked for, no coefficients of GPS or QZSS received: typical ones used (GPS, "
+        "ionosphere: klobuchar requested, no coefficients of GPS or QZSS received: typical coefficients "
+        "used (GPS, "
         f"2004-01-01), {sigma:g} m added to the sigma of the vertical delay"
     )
     return TYPICAL_KLOBUCHAR, sigma, (note,)

@@ -51,14 +51,16 @@ class ReferenceInputs(InputFiles):
     rtk: Path | None = input_option(
         "Positions of the front (or only) antenna: RTKLIB .pos, NMEA (.nmea) or CSV with named columns.", None
     )
-    rtk_rear: Path | None = input_option("The same of the rear antenna.", None)
+    rtk_rear: Path | None = input_option("Positions of the rear antenna, in the same formats.", None)
 
     track: tuple[Path, ...] = input_option(TRACK, metavar="TRACK")
     vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
     )
-    rear: tuple[Path, ...] = input_option("The same of the rear antenna.", (), metavar="OBS")
+    rear: tuple[Path, ...] = input_option(
+        "RINEX observation file of the rear antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
+    )
     nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; repeat it for several.", ())
 
     pulses: Path | None = input_option(

@@ -173,9 +173,10 @@ def _first_sigmas(states: _States, settings: ReferenceSettings) -> Floats:
 def _motion(states: _States, evidence: Evidence, dt: Floats, settings: ReferenceSettings) -> tuple[Floats, Floats]:
     """Return the transition to each instant from the previous one and its noise covariance, shapes (N, n, n).
 
-    Position, speed and a time-correlated acceleration (Singer's model); the Doppler speed's error is a first-order
-    Gauss-Markov process; the wheel's difference changes with the distance by the scale error, and by slip; its scale
-    error and the accelerometer's offset are random walks.
+    The states are position, speed and a time-correlated acceleration (Singer's model). The Doppler speed's error is a
+    first-order Gauss-Markov process. The difference of wheel distance and position changes with the distance by the
+    wheel's scale-factor error, and randomly by slip. The wheel's scale-factor error and the accelerometer's offset are
+    random walks.
     """
     count = len(evidence.time)
     transition, noise = np.zeros((2, count, states.count, states.count))

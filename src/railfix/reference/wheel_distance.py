@@ -103,8 +103,8 @@ def estimate_wheel(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m
     if speed.max() > _FASTEST_MPS:
         row = int(np.argmax(speed))
         raise MismatchError(
-            f"{pulses.path}: {speed[row]:.0f} m/s between rows {row + 1} and {row + 2} with {pulse_m:.6g} m a pulse; "
-            "does the counter wrap, or is the distance of a pulse wrong?"
+            f"{pulses.path}: {speed[row]:.0f} m/s between rows {row + 1} and {row + 2} with {pulse_m:.6g} m "
+            "per pulse; does the counter wrap, or is the distance per pulse wrong?"
         )
     return Wheel(pulses=pulses, pulse_m=pulse_m, source=source)
 
@@ -120,7 +120,7 @@ def _estimate(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
     usable = (distance > _LEAST_DISTANCE_M) & np.isfinite(turned) & (turned > 0)
     if usable.sum() < _LEAST_WINDOWS:
         raise MismatchError(
-            f"{pulses.path}: too few fixes while the train runs to tell the distance of a pulse; give it (wheel "
-            "circumference and pulses a turn)"
+            f"{pulses.path}: too few fixes in motion to estimate the distance per pulse; give it (wheel "
+            "circumference over pulses per turn)"
         )
     return float(np.median(distance[usable] / turned[usable]))

@@ -156,7 +156,8 @@ def _describe_marked(errors: pl.DataFrame | None) -> list[str]:
     statuses = ", ".join(status.replace("_", " ") for status in marked["status"].unique(maintain_order=True))
     largest = number(float(np.abs(floats(marked, "error_m")).max()), 1, " m")
     return [
-        f"{len(marked):,} further positions failed a check and carry its status ({statuses}); their largest "
+        f"{len(marked):,} further positions failed a check and have its status ({statuses}); their "
+        "largest "
         f"error is {largest}. They are drawn, but not counted above."
     ]
 

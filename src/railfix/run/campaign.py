@@ -58,7 +58,7 @@ class Campaign(Settings):
     options: RunOptions = RunOptions()  #: Options of every run.
 
 
-#: Patterns of several files per run, and of one.
+#: Patterns of several files per run, and patterns of one file per run.
 _MANY: Final = ("front", "rear", "nav", "sp3")
 _ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 
@@ -76,7 +76,7 @@ class CampaignRun:
 
     @property
     def done(self) -> bool:
-        """Whether the results are there, of the same inputs and settings."""
+        """Whether results for the same inputs and settings exist."""
         try:
             record = read_record(self.out)
             record.check_inputs()
@@ -98,8 +98,8 @@ class CampaignProgress(Protocol):
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     """Read a campaign file and find the files of each run.
 
-    InputFileError: no log matches its pattern. SettingsError: a setting is misspelt, or a pattern has no field or one
-    that the logs of the front antenna lack.
+    InputFileError: no log matches its pattern. SettingsError: a setting is misspelt, or a pattern has no field, or a
+    field that the pattern of the front antenna's logs lacks.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
     folder, out = path.absolute().parent, out.absolute()
@@ -160,7 +160,7 @@ def run_campaign(
 
     `reading` replaces the campaign's reading options where it differs from the default. The executor is of
     `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the same files;
-    by the errors `lost` it reports that a worker process is gone.
+    by the errors `lost` it reports that a worker process has ended.
     """
     runs = read_campaign(path, out)
     if reading not in (None, LogReading()):
@@ -178,7 +178,7 @@ def position_runs(
 ) -> pl.DataFrame:
     """Position runs below the folder ``out / "runs"``; parameters, result and errors as `run_campaign`."""
     if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
-        raise OutputError(f"{out}: the folder is not empty, nor that of a campaign; name another one")
+        raise OutputError(f"{out}: the folder is not empty and not the folder of a campaign; give another folder")
     began, results, kept = clock.perf_counter(), {}, 0
     (out / "runs").mkdir(parents=True, exist_ok=True)
     first = sorted(range(len(runs)), key=lambda number: not (runs[number].out / "run.json").exists())
@@ -188,7 +188,7 @@ def position_runs(
         try:
             results[number], is_kept = future.result()
         except lost as error:
-            gone = f"its worker process is gone ({type(error).__name__}), perhaps for lack of memory"
+            gone = f"its worker process has ended ({type(error).__name__}), perhaps for lack of memory"
             results[number] = _row(runs[number], status="failed", error=f"{gone}; run the command again")
         results[number]["folder"] = str(runs[number].out.relative_to(out.absolute()))
         kept += is_kept

@@ -66,7 +66,7 @@ def _spans(tally: Tally) -> dict[str, Span]:
 
 
 def spans_apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) -> bool:
-    """Return whether two spans have no time in common, each reaching further at both ends; False for NaT."""
+    """Return whether two spans have no time in common, the first extended by `reach` at both ends; False for NaT."""
     return bool(one[0] - reach > other[1] or one[1] + reach < other[0])
 
 
@@ -83,7 +83,7 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
             raise MismatchError(f"{files}: no record of any satellite of the {name} log; give its navigation file")
         if spans_apart(of_log, span, reach=reach):
             raise MismatchError(
-                f"{', '.join(navigation.sources)}: navigation records of {_period(*span)} do not reach the {name} "
+                f"{', '.join(navigation.sources)}: navigation records of {_period(*span)} do not cover the {name} "
                 f"log of {_period(*of_log)} (GPS time); give the navigation file of that day"
             )
 
@@ -154,7 +154,7 @@ def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajector
     if spans and not any(start - last <= timedelta(np.array(LONGEST_AGE_S)) and first <= end for start, end in spans):
         raise MismatchError(
             f"the log of the base station of {_period(first, last)} and the logs of {_period(*spans[0])} (GPS time) "
-            "have no time in common; give one that overlaps"
+            "have no time in common; give a log that overlaps"
         )
 
 
@@ -166,7 +166,7 @@ def check_whole_run(
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> None:
-    """Raise MismatchError where the inputs of a whole run do not match, NoPositionError where it has no position.
+    """Raise MismatchError where the inputs of a whole run do not match, NoPositionError where the run has no position.
 
     `causes`: likely causes by antenna, which the error names.
     """
@@ -180,14 +180,14 @@ def check_whole_run(
 
 
 def check_positions(tally: Tally, likely: Mapping[str, str]) -> None:
-    """Raise NoPositionError, with the commonest status and reason, where a run has not one position."""
+    """Raise NoPositionError, with the most frequent status and reason, where a run has no position."""
     if tally.positioned:
         return
     if not tally.epochs:
         raise NoPositionError("no epoch between --start and --end; the logs have none there")
     causes = "; ".join(_why_nothing(name, antenna) for name, antenna in tally.antennas.items() if antenna.epochs)
     causes += "".join(f"; {name}: {cause}" for name, cause in likely.items() if cause)
-    raise NoPositionError(f"not one position: {causes}")
+    raise NoPositionError(f"there is no position: {causes}")
 
 
 def _why_nothing(name: str, antenna: AntennaTally) -> str:

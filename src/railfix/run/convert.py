@@ -1,4 +1,4 @@
-"""Receiver logs as RINEX files, positions of a run as messages of ROS 2, tables of EGNSS MATE in and out.
+"""Receiver logs as RINEX files, positions of a run as ROS 2 messages, EGNSS MATE tables read and written.
 
 Message definitions in an MCAP file are from sensor_msgs, and from https://github.com/EGNSS-MATE/emate_ros (MIT), commit
 9067868 of 16 April 2024, written for ROS 1; the third contains the row of the table.
@@ -50,7 +50,7 @@ def convert_logs(
     an input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
-        raise OutputError(f"{out}: is named by --out and by --nav-out; name another file for one of them")
+        raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")
     for target in (out, nav_out):
         if target is not None:
             check_output_file(target, overwrite=overwrite, inputs=logs)
@@ -115,12 +115,12 @@ _APPROXIMATED: Final = 1
 
 
 def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows of a table of positions that have coordinates, three topics an antenna; return their number.
+    """Write the rows of a table of positions that have coordinates, three topics per antenna; return their number.
 
-    ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, of the filter
-    alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The file
-    contains the `description`: the kind of positions, and the frame of the coordinates. NoPositionError: no row has
-    coordinates. SettingsError: mcap-ros2-support is not installed.
+    ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, written for
+    the filter only, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The
+    file contains the `description`: the kind of positions, and the frame of the coordinates. NoPositionError: no row
+    has coordinates. SettingsError: mcap-ros2-support is not installed.
     """
     with needs_extra():
         from mcap_ros2.writer import Writer

@@ -83,11 +83,11 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
     """Read each file as every kind until one fits, and compare them; InputFileError where one is missing."""
     for path in paths:
         if path.is_dir():
-            raise InputFileError(path, "is a folder; name the files in it")
+            raise InputFileError(path, "is a folder; give the files in it")
         if not path.is_file():
             raise InputFileError(path, "there is no such file; check the name")
         if sum(path.samefile(other) for other in paths if other.exists()) > 1:
-            raise InputFileError(path, "is given twice; name each file once")
+            raise InputFileError(path, "is given twice; give each file once")
     findings = tuple(_examine(path, date) for path in paths)
     problems = tuple(_problems(findings))
     return Diagnosis(findings=findings, problems=problems, command=_command(findings, date))
@@ -124,7 +124,7 @@ def _unknown(path: Path) -> FileFinding:
 
 
 def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Read a log piece by piece: the facts of the whole, in the memory of a piece."""
+    """Return the facts of a whole log, read piece by piece, with the memory of one piece."""
     header: ObservationHeader | None = None
     times, channels = [np.empty(0, dtype="datetime64[ns]")], set[tuple[str, str]]()
     broken, notes = Counter[str](), list[str]()
@@ -135,7 +135,7 @@ def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
         times.append(piece.time)
         channels |= {*zip(piece.satellite.tolist(), piece.signal.tolist(), strict=True)}
     if header is None:
-        raise InputFileError(path, "has no epoch of observations")
+        raise InputFileError(path, "has no epoch with observations")
     time = np.concatenate(times)
     between = np.diff(time) / _SECOND if len(time) > 1 else np.array([np.nan])
     systems = Counter(satellite[0] for satellite in {satellite for satellite, _ in channels})
@@ -179,7 +179,7 @@ def _own_ephemerides(path: Path, date: np.datetime64 | None) -> tuple[int, Span]
         return None
     try:
         navigation = read_navigation([path], date=date)
-    except InputFileError:  # without navigation records: observations alone are no fault of a log
+    except InputFileError:  # without navigation records: a log of observations alone is not faulty
         return None
     span = navigation_span(navigation)
     return None if span is None else (len(navigation.kepler) + len(navigation.glonass), span)
@@ -355,14 +355,14 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
         spans = [finding.ephemerides for finding in navigation if finding.ephemerides is not None]
         if spans and all(spans_apart(log.span, span, reach=RECORD_REACH) for span in spans):
             problems.append(
-                f"{log.path}: no ephemeris reaches its time; give the navigation file of {str(log.span[0])[:10]}"
+                f"{log.path}: no ephemeris covers its time; give the navigation file of {str(log.span[0])[:10]}"
             )
         for other in tracks:
             if log.place_ecef_m is not None and other.place_ecef_m is not None:
                 apart = float(np.linalg.norm(log.place_ecef_m - other.place_ecef_m))
                 if apart > ANOTHER_PLACE_M:
                     problems.append(
-                        f"{other.path}: lies {apart / 1000:,.0f} km from the place in the header of {log.path}"
+                        f"{other.path}: lies {apart / 1000:,.0f} km from the position in the header of {log.path}"
                     )
     if len(readable) == 2:
         one, two = (log.span for log in readable)

@@ -84,7 +84,7 @@ def run_files(
 ) -> RunSummary:
     """Position the logs of one run along its line and write the results into the folder `out`.
 
-    `config` are all settings, `asked` the explicitly given ones, for ``run.json``. RailfixError: see
+    `config` has all settings, `asked` the explicitly given settings, for ``run.json``. RailfixError: see
     `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
@@ -152,7 +152,7 @@ def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
     verdict = judge_run(record)
     if not any(antenna.is_usable for antenna in verdict.antennas):
         of_map = [note for note in notes if ": the map " in note]
-        raise NoPositionError(f"not one position is promised: {'; '.join([*verdict.lines(), *of_map])}")
+        raise NoPositionError(f"no position can be used: {'; '.join([*verdict.lines(), *of_map])}")
     return verdict
 
 
@@ -194,7 +194,7 @@ def open_inputs(
 
 
 def find_record_time(navigation: Navigation) -> np.datetime64 | None:
-    """Return a time within days of the records, for the epoch of reference frames."""
+    """Return a time within days of the records, as the epoch of reference frames."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
         clocks = navigation.precise.time
@@ -297,9 +297,9 @@ def _notes_of_sensors(
     return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
-#: Question of a note where positions are off the map and no cause was found.
+#: Question at the end of a note on positions off the map whose cause was not found.
 _TRACK: Final = "is this the right track?"
-#: Largest number of left-out satellites that notes name.
+#: Largest number of left-out satellites that are named in notes.
 _NAMED: Final = 3
 
 
@@ -312,9 +312,9 @@ def collect_notes(
     *,
     note_statistic: float,
 ) -> tuple[str, ...]:
-    """Return the notes of a run, each once; on the map if its test statistic exceeds `MapOffsetLimits.note_threshold`.
+    """Return the notes of a run, each once; a note on the map only above the test statistic `note_statistic`.
 
-    `causes`: why no position of an antenna is on the line, where that is so.
+    `causes`: for each antenna without a position on the line, the reason.
     """
     notes = [
         *line.notes,
@@ -339,7 +339,7 @@ def collect_notes(
         for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
             notes += [
                 f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
-                "inconsistent with the others for over a minute"
+                "inconsistent with the other satellites for over a minute"
                 for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
             ]
         offset = antenna.map_offset
@@ -402,8 +402,9 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
     for name, of_antenna in tally.antennas.items():
         if of_antenna.without_budget:
             yield (
-                f"{name}: {of_antenna.without_budget} epochs without a protection level, where more faults at a time "
-                "than can be left out, or more satellites excluded, are likelier than the risk allows (settings risk)"
+                f"{name}: {of_antenna.without_budget} epochs have no protection level: more simultaneous faults "
+                "than can be left out are more probable than the risk allows, or too many satellites are "
+                "excluded (settings risk)"
             )
     risk = get_risk_budget(config)
     yield (

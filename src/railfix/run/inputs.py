@@ -49,9 +49,8 @@ VEHICLE: Final = (
     "own path."
 )
 BALISE_LIST: Final = (
-    "Positions of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts "
-    "from "
-    "the beginning of that track) and sigma_m."
+    "Positions of the balises: CSV with balise, chainage_m and, if known, track (chainage_m is then "
+    "from the beginning of that track) and sigma_m."
 )
 VIRTUAL_BALISES: Final = (
     "Points whose passing is reported with its interval: a list in the format of --balise-list. Needs levels."
@@ -61,7 +60,7 @@ VIRTUAL_BALISES: Final = (
 class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
 
-    #: Fields of receiver logs whose own ephemerides serve where no navigation file is given.
+    #: Fields of receiver logs whose own ephemerides are used where no navigation file is given.
     own_navigation: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="before")
@@ -73,7 +72,7 @@ class InputFiles(Settings):
         logs = [Path(path) for name in cls.own_navigation if values.get(name) for path in path_names(values[name])]
         own = tuple(path for path in logs if path.is_file() and find_kind(path) == "receiver")
         if logs and not own:
-            raise ValueError("nav (--nav) is missing; name the navigation file, which RINEX observations need")
+            raise ValueError("nav (--nav) is missing; give the navigation file, which RINEX observations need")
         return {**values, "nav": own}
 
     def files_by_name(self) -> Iterator[tuple[str, Path]]:
@@ -95,7 +94,7 @@ class InputFiles(Settings):
             _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Hash every file in parallel to other work."""
+        """Compute the hash of every file in parallel to other work."""
         return [
             pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
         ]
@@ -138,11 +137,11 @@ class RunInputs(InputFiles):
     )
     vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     tachometer: Path | None = input_option(
-        "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; its wheel "
-        "stands in the settings sensors.tachometer.",
+        "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; "
+        "its wheel is described by the settings sensors.tachometer.",
         None,
     )
-    inertial: Path | None = input_option("Specific forces and rates of an inertial unit: CSV or Parquet.", None)
+    inertial: Path | None = input_option("Specific forces and angular rates of an inertial unit: CSV or Parquet.", None)
     radar: Path | None = input_option("Speeds of a Doppler radar: CSV or Parquet with time_gpst, speed_mps.", None)
     ranging: Path | None = input_option(
         "Two-way ranges to ground units: CSV or Parquet with time_gpst, unit, range_m and, where it is known, sigma_m.",
@@ -160,8 +159,8 @@ class RunInputs(InputFiles):
     integrity_support: Path | None = None
     sbas: tuple[Path, ...] = ()
     truth: Path | None = input_option(
-        "Reference positions: CSV with named columns (`antenna` where there are two) or RTKLIB .pos; only those of "
-        "quality 1 where the file has qualities.",
+        "Reference positions: CSV with named columns (`antenna` where there are two) or RTKLIB .pos; "
+        "only positions of quality 1 are used where the file has qualities.",
         None,
         metavar="POSITIONS",
     )
@@ -169,7 +168,7 @@ class RunInputs(InputFiles):
     @model_validator(mode="before")
     @classmethod
     def _with_mate(cls, values: Any) -> Any:
-        """Return the inputs of a folder of tables, with explicitly given ones added."""
+        """Return the inputs of a folder of tables, with explicitly given inputs added."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
@@ -179,7 +178,7 @@ class RunInputs(InputFiles):
     def _complete(self) -> Self:
         missing = [name for name in ("front", "track") if not getattr(self, name)]
         if missing:
-            raise ValueError(f"{missing[0]} (--{missing[0]}) is missing; name its file, or a folder with mate (--mate)")
+            raise ValueError(f"{missing[0]} (--{missing[0]}) is missing; give its file, or a folder with mate (--mate)")
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
@@ -196,7 +195,7 @@ class RunInputs(InputFiles):
         return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 
     def _with_own_sbas(self, config: Config) -> Config:
-        """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.
+        """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, which have the messages.
 
         SettingsError: none of the logs is a receiver's.
         """
@@ -204,7 +203,9 @@ class RunInputs(InputFiles):
             return config
         logs = tuple(path for paths in self.logs.values() for path in paths if find_kind(path) == "receiver")
         if not logs:
-            raise SettingsError("sbas = stream: RINEX logs carry no SBAS messages; name a log of them (--sbas FILE)")
+            raise SettingsError(
+                "sbas = stream: RINEX logs contain no SBAS messages; give a log of SBAS messages (--sbas FILE)"
+            )
         return config.replaced(sbas=logs)
 
     @property
@@ -221,7 +222,7 @@ class RunInputs(InputFiles):
 
 
 def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Antenna, tuple[Path, ...]]:
-    """Return the observation files of those antennas that have any."""
+    """Return the observation files of the antennas that have such files."""
     both: dict[Antenna, tuple[Path, ...]] = {"front": front, "rear": rear}
     return {name: paths for name, paths in both.items() if paths}
 
@@ -245,7 +246,7 @@ def record_path(path: Path, folder: Path) -> str:
 
 
 def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
-    """Return where a recorded input is now: relative paths count from the results folder."""
+    """Return the present path of a recorded input: relative paths are relative to the results folder."""
     path = folder / str(entry["path"])
     plain = Path(os.path.normpath(path))
     return plain if plain.exists() or not path.exists() else path
@@ -254,14 +255,14 @@ def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
 def _check_file(name: str, path: Path) -> None:
     try:
         if path.is_dir():
-            raise InputFileError(path, f"is a folder, {name} expects a file; name the file in it")
+            raise InputFileError(path, f"is a folder, {name} expects a file; give the file in it")
         if not path.is_file():
             problem = "is not a regular file" if path.exists() else "there is no such file"
-            raise InputFileError(path, f"{problem}; check what {name} names")
+            raise InputFileError(path, f"{problem}; check the path given by {name}")
         with path.open("rb") as file:
             file.read(1)
     except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror}); check what {name} names") from error
+        raise InputFileError(path, f"cannot be read ({error.strerror}); check the path given by {name}") from error
 
 
 #: Last full year of 64-bit times in nanoseconds.
@@ -271,7 +272,7 @@ LAST_YEAR: Final = 2261
 class TrackReading(Settings):
     """Options for reading the track, and the point of the vehicle to which the chainage refers."""
 
-    crs: str | None = option("CRS of the track where its file does not name one.", None, metavar="EPSG")
+    crs: str | None = option("CRS of the track, if its file does not state a CRS.", None, metavar="EPSG")
     height_datum: str | None = option("Heights of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
     geoid: str | None = option(
         "Geoid of orthometric heights: egm96 (the world), japan (JPGEO2024), gsigeo2011, or a grid or CRS of PROJ.",
@@ -279,21 +280,22 @@ class TrackReading(Settings):
         metavar="MODEL",
     )
     plan_sigma: float | None = option(
-        "Standard deviation of the track in plan, instead of its own (OpenStreetMap: 2 m where the file states none).",
+        "Standard deviation of the track in plan, instead of the value in its file (OpenStreetMap: 2 m "
+        "where the file states none).",
         None,
         metavar="M",
         gt=0,
         le=1000.0,
     )
     height_sigma: float | None = option(
-        "Standard deviation of the track's heights, instead of its own; required for a raster.",
+        "Standard deviation of the track's heights, instead of the value in its file; required for a raster.",
         None,
         metavar="M",
         gt=0,
         le=1000.0,
     )
     map_epoch: float | None = option(
-        "Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).",
+        "Epoch of the track's coordinates, where its frame is an ITRF or is fixed at an epoch (JGD2011).",
         None,
         metavar="YEAR",
         gt=1980.0,
@@ -318,28 +320,30 @@ class TrackReading(Settings):
         return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
 
     cache: Literal["use", "skip"] = option(
-        "Prepare the line again: neither read nor write the cache folder.", "use", name="--no-cache"
+        "Prepare the line again; neither read nor write the cache folder.", "use", name="--no-cache"
     )
 
 
 class LogReading(Settings):
-    """How to read logs and navigation files: one policy of every command."""
+    """How to read logs and navigation files: the same policy in every command."""
 
     date: datetime | None = option(
-        "Some time within half a week of RTCM 3 logs without ephemerides, GPS time: their observations carry no week.",
+        "A time within half a week of RTCM 3 logs without ephemerides, GPS time: their observations do "
+        "not contain the week.",
         None,
         metavar="TIME",
     )
     broken_lines: BrokenLines = option(
-        "Skip and count broken parts of the input files, instead of stopping. What loses nothing is read without it: "
-        "comments, further headers, doubled and exchanged epochs, a cut last record.",
+        "Skip and count broken parts of the input files, instead of stopping. Irregularities that lose "
+        "no data are accepted without this option: comments, further headers, duplicate and exchanged "
+        "epochs, an incomplete last record.",
         "stop",
         name="--lenient",
     )
 
     reader: Reader = option(
-        "Reader of RINEX observation files: railfix, or georinex, an independent reader to compare with, which is "
-        "slower, reads whole files at once, and knows neither events nor broken lines.",
+        "Reader of RINEX observation files: railfix, or georinex, an independent reader for comparison, "
+        "which is slower, reads whole files at once, and supports neither events nor broken lines.",
         "railfix",
     )
 
@@ -398,12 +402,13 @@ class RunOptions(Settings):
         "skip",
         name="--observations",
     )
-    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
         "Epochs in memory at a time; the results do not depend on it.", 4000, name="--chunk", metavar="EPOCHS", ge=1
     )
     smooth: Literal["off", "on"] = option(
-        "Also smooth the filter along the track: positions by all measurements before and after, in columns of train.*",
+        "Also smooth the filter along the track: positions from all measurements before and after each "
+        "epoch, in columns of train.*",
         "off",
         name="--smooth",
     )
@@ -412,7 +417,7 @@ class RunOptions(Settings):
 
     @property
     def of_filter(self) -> list[str]:
-        """Given options that need the filter along the track."""
+        """Options, among those given, that need the filter along the track."""
         return ["smooth"] if self.smooth == "on" else []
 
     @field_validator("start", "end")

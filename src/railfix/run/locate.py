@@ -69,7 +69,7 @@ def locate_files(
     reasons = reasons_text(located)
     if not np.isfinite(located.ecef_m).any():
         if (located.no_position == int(NoPosition.NO_RECORD)).any():
-            reasons += "; are the navigation files of the day of the log?"
+            reasons += "; are the navigation files from the day of the log?"
         message = f"{inputs.log[0]}: no epoch has a position: {reasons}"
         raise NoPositionError("; ".join([message, *navigation.notes]))
     write_whole(out, solution_text(located))
@@ -154,7 +154,7 @@ def likely_cause(observations: Observations, received: Received, config: Config,
             )
     if as_tagged is None:
         return ""
-    return f"its positions lie {as_tagged[0]:,.0f} m beside the line: is this the right track?"
+    return f"its positions lie {as_tagged[0]:,.0f} m from the line: is this the right track?"
 
 
 def _shifts_s() -> Iterator[int]:
@@ -221,10 +221,10 @@ def survey_files(
     """
     for path in (*paths, *nav):
         if not path.is_file():
-            raise InputFileError(path, "no such file; name files of positions and logs of observations")
+            raise InputFileError(path, "no such file; give files of positions and logs of observations")
     twice = {path for path in paths if sum(path.samefile(other) for other in paths) > 1}
     if twice:
-        raise InputFileError(min(twice), "is given twice; name each run once")
+        raise InputFileError(min(twice), "is given twice; give each run once")
     reading = reading or LogReading()
     runs: list[SurveyRun] = []
     notes: list[str] = []
@@ -265,7 +265,7 @@ def survey_files(
 
 
 def _check_together(runs: Sequence[SurveyRun]) -> None:
-    """Raise MismatchError where a run is at another location than the first."""
+    """Raise MismatchError where a run is at another location than the first run."""
     places: list[Floats] = [np.nanmedian(run.ecef_m, axis=0) for run in runs]
     for run, place in zip(runs, places, strict=True):
         distance = float(np.linalg.norm(place - places[0]))

@@ -97,8 +97,8 @@ def _release(lock: Path) -> None:
         if not _try_lock(file):
             process = file.read().strip() or "unknown"
             raise OutputError(
-                f"{lock.parent}: another railfix (process {process}) is writing there; wait for it, or name another "
-                "folder"
+                f"{lock.parent}: another railfix (process {process}) is writing there; wait for it, or give "
+                "another folder"
             )
         staging = lock.with_name(lock.name.removesuffix(_LOCK))
         if (staging / READY).is_dir():
@@ -149,8 +149,8 @@ _LOOK_S: Final = 0.1
 class ParquetFile:
     """A Parquet file to which tables of one schema are appended; memory does not grow with their number.
 
-    polars writes a file from one query. Here the source of the query waits for the next rows, in a thread, and one
-    table at most waits for it.
+    polars writes a file from one query. Here the source of the query waits for the next rows, in a thread, and at most
+    one table waits to be written.
     """
 
     def __init__(self, path: Path, schema: pl.Schema) -> None:
@@ -162,7 +162,7 @@ class ParquetFile:
         self._thread.start()
 
     def append(self, table: pl.DataFrame) -> None:
-        """Append rows; raises errors of writing earlier ones."""
+        """Append rows; raises errors of writing earlier rows."""
         from polars.exceptions import SchemaError
 
         if table.schema != self._schema:
@@ -196,7 +196,7 @@ class ParquetFile:
             rows = register_io_source(tables, schema=self._schema)
             # The metadata is requested last, with the footer.
             rows.sink_parquet(self._path, row_group_size=_GROUP, metadata=lambda _: self._metadata)
-        except BaseException as error:  # noqa: BLE001  raised again where rows are given
+        except BaseException as error:  # noqa: BLE001  raised again when rows are appended
             self._error = error
 
 
@@ -295,7 +295,7 @@ class OutputFolder:
     def stage(self, name: str) -> Path:
         """Return the temporary path at which to write one file; `commit` moves it to its path.
 
-        OutputError: the file would overwrite an input, or a folder of that name is there.
+        OutputError: the file would overwrite an input, or a folder of that name exists.
         """
         target = self.path / name
         check_not_input(target, self._inputs)
@@ -329,7 +329,7 @@ class OutputFolder:
             del self._parquet[name]
 
     def change(self, name: str, transform: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
-        """Write a table again, Parquet and CSV, some rows at a time, changed."""
+        """Change a table, Parquet and CSV, and write it again, some rows at a time."""
         import polars as pl
 
         from railfix.pipeline.result_tables import round_floats
@@ -377,22 +377,23 @@ class OutputFolder:
 def check_folder(path: Path, *, overwrite: Overwrite) -> None:
     """Clean up a results folder after killed processes, and raise OutputError where it must not be written.
 
-    It is a file, is being written by another process, or has files in it that must not be replaced.
+    It must not be written if it is a file, is being written by another process, or contains files that must not be
+    replaced.
     """
     with _writing(path):
         if path.exists() and not path.is_dir():
-            raise OutputError(f"{path}: is a file, expected a folder for the results; name another folder")
+            raise OutputError(f"{path}: is a file, expected a folder for the results; give another folder")
         if path.is_dir():
             clean_up(path)
         if overwrite == "refuse" and path.is_dir() and any(path.iterdir()):
-            raise OutputError(f"{path}: the folder is not empty; name another one, or give --overwrite")
+            raise OutputError(f"{path}: the folder is not empty; give another folder, or add --overwrite")
 
 
 def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
     """Raise OutputError where a file to be written is an input, under whichever name."""
     for path in inputs:
         if target.resolve() == path.resolve() or (target.exists() and path.exists() and target.samefile(path)):
-            raise OutputError(f"{target}: is an input, which is never overwritten; name another output")
+            raise OutputError(f"{target}: is an input, which is never overwritten; give another output")
 
 
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
@@ -404,16 +405,18 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
     with _writing(target):
         check_not_input(target, inputs)
         if not target.parent.is_dir():
-            raise OutputError(f"{target}: the folder {target.parent} does not exist; make it, or name another")
+            raise OutputError(f"{target}: the folder {target.parent} does not exist; create it, or give another")
         if target.is_dir():
             raise OutputError(f"{target}: is a folder, expected the name of a file to write")
         what, endings, other = _ENDINGS.get(kind, ("", (), ""))
         if endings and target.suffix.lower() not in endings:
-            raise OutputError(f"{target}: {what} is written; name a file that ends in {' or '.join(endings)}{other}")
+            raise OutputError(
+                f"{target}: {what} is written; give a file name that ends in {' or '.join(endings)}{other}"
+            )
         if target.exists() and overwrite == "refuse":
-            raise OutputError(f"{target}: the file exists already; name another one, or give --overwrite")
+            raise OutputError(f"{target}: the file exists already; give another file, or add --overwrite")
         if not os.access(target.parent, os.W_OK):
-            raise OutputError(f"{target}: the folder {target.parent} cannot be written; name another")
+            raise OutputError(f"{target}: the folder {target.parent} cannot be written; give another")
 
 
 @contextmanager

@@ -35,7 +35,7 @@ from railfix.track.trajectory import Trajectory
 VARIABLE: Final = "RAILFIX_CACHE_DIR"
 #: Smallest number of points of a cached line. 5000 points with two antennas take 0.11 s to prepare, 0.01 s to load.
 LEAST_POINTS: Final = 2_000
-#: Number of cache entries; the last written ones are kept.
+#: Number of cache entries; the entries written last are kept.
 MOST_ENTRIES: Final = 48
 #: Fields computed from the points of a trajectory and cached with them.
 _DERIVED: Final = ("up", "across")
@@ -139,7 +139,7 @@ def compute_key(kind: str, *parts: object) -> str:
 
 @cache
 def _code() -> list[tuple[str, int, int]]:
-    """Return the files of code that prepare lines, with size and time: changed ones prepare them again."""
+    """Return the files of code that prepare lines, with size and time: a change prepares the lines again."""
     files = sorted(Path(railfix.track.__file__).parent.glob("*.py"))
     return [(file.name, (state := file.stat()).st_size, state.st_mtime_ns) for file in files]
 

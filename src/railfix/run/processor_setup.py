@@ -30,7 +30,7 @@ from railfix.track.trajectory import Trajectory
 def with_measured_priors(config: Config) -> Config:
     """Return settings with the fault priors, and the stretches without a level, of their error model.
 
-    Explicitly given settings stay unchanged, and all settings do if the model does not bound its priors.
+    Explicitly given settings stay unchanged; all settings stay unchanged if the model does not bound its priors.
     """
     given = config.risk.model_fields_set & {"local_prior", "side_prior", "priors"}
     if config.error_model is None or given:
@@ -57,7 +57,7 @@ def make_processor(
     `track` is the line itself, for positions by its features; `units` are the surveyed stations of two-way ranges,
     `balises` the positions of the balises. `base_ecef_m`: position of a base station; "stream": the position in the
     headers of its observations. InputFileError: a file named by the settings is not as expected. SettingsError: SBAS
-    and precise ephemerides together, or no SBAS message of the requested GEO.
+    and precise ephemerides together, or no SBAS message of the requested GEO satellite.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
@@ -81,7 +81,7 @@ def make_processor(
     )
 
 
-#: Largest delay of the base station's time tags after the train's that counts as the same instant.
+#: Largest difference by which the base station's time tags may be later than the train's at the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
@@ -97,7 +97,7 @@ def parse_position(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station at LAT,LON,HEIGHT, or the position of the log's header; InputFileError without."""
+    """Log of a base station at LAT,LON,HEIGHT, or at the position of its header; InputFileError if that is missing."""
 
     def __init__(self, log: Log, place: str | None) -> None:
         self._parts = log.parts()

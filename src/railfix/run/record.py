@@ -34,7 +34,7 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Limits at which the filter's levels are counted [m].
+#: Limits within which the filter's levels are counted [m].
 WITHIN_M: Final = (20, 50)
 #: Figures of an antenna without rows.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
@@ -262,7 +262,7 @@ def read_record(folder: Path) -> RunRecord:
     """Read the record of a run from its folder; InputFileError: the file does not exist, or is not a record."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
-        raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; name that")
+        raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; give that folder")
     path = folder / "run.json"
     if not path.is_file():
         raise InputFileError(path, "there is no such file; railfix run writes it with the positions")

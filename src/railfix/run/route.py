@@ -39,10 +39,10 @@ _INTERVAL_S: Final = 1.0
 #: and along the line.
 _REACH_M: Final = 50.0
 _LENGTHS_DIFFER: Final = 1e-3
-#: Minimum probability of another track for it to be written and named.
+#: Minimum probability of another track from which on it is written and reported.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
-#: Number of alternatives named in the notes; all are in ``run.json``.
+#: Number of alternatives reported in the notes; all are in ``run.json``.
 _NAMED: Final = 8
 #: Largest gap within one alternative [s].
 _TOGETHER_S: Final = 60.0
@@ -55,8 +55,9 @@ NONE: Final = "none"
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track": "track of the network on which the position lies, part of the route found from the log",
     "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
-    "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the alternatives",
-    "unmapped_probability": "probability of a track that the map lacks, given the whole log",
+    "track_probability": "probability of the route at this position, given the whole log; `tracks.csv` has the "
+    "alternatives",
+    "unmapped_probability": "probability of a track that is not in the map, given the whole log",
     "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, to the right "
     "of that track",
     "unconstrained_up_m": "height of that position above the track, less the antenna height if the vehicle is known",
@@ -111,7 +112,8 @@ class RouteOfLog:
 
     network: Network
     tracks: tuple[int, ...]  #: Tracks of the route, in order.
-    #: Tracks of the most probable sequence that no route joins to those: the train turned back over them.
+    #: Tracks of the most probable sequence that no route connects with the tracks of the route: the train turned back
+    #: over them.
     left_out: tuple[int, ...]
     log: PlanLog  #: Matched positions in the frame of the network.
     matched: Matched
@@ -126,10 +128,10 @@ class RouteOfLog:
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
         """Return whether a track outside the route has a probability above a risk.
 
-        An unmapped track counts above `_UNMAPPED_LIMIT`; below it the levels include it (`with_unmapped`). It is
-        computed from the tracks of the route within `_REACH_M` of each chainage, because parallel parts of the route
+        An unmapped track is considered only above `_UNMAPPED_LIMIT`; below, the levels include it (`with_unmapped`). It
+        is computed from the tracks of the route within `_REACH_M` of each chainage, because parallel parts of the route
         have their own probabilities, and at the matched positions before and after each time, because the track may
-        differ between two known ones.
+        differ between two positions with known tracks.
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
@@ -324,7 +326,7 @@ class LogPositions:
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions of quality 5 (single), or 4 with a base station; NoPositionError if the log has none."""
+        """Positions of quality 5 (single), or 4 with a base station; NoPositionError if the log has no position."""
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         base, state, located = self.open_base(), BaseState(), []
         station = None if base is None else BaseStation(self.config, base.ecef_m)

@@ -114,7 +114,10 @@ def sign_notes(
         yaw = _means(inertial.time, inertial.rate_radps[:, 2], time)
         slope = _slope(motion.heading_rate_radps, yaw, _LEAST_RATE_RADPS)
         if slope < _REVERSED:
-            yield "inertial: its yaw rate is opposite to that of the line; it must be positive to the right, about down"
+            yield (
+                "inertial: its yaw rate is opposite to the turning rate of the line; it must be positive to the "
+                "right, about the down axis"
+            )
         if abs(slope) > _IN_DEGREES:
             yield "inertial: its rates are in degrees per second, not in radians; convert them"
 
@@ -204,9 +207,9 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
 
 #: Interval of the compared wheel speeds [ns].
 _STEP_NS: Final = 500_000_000
-#: Largest time from an instant to a satellite speed [s].
+#: Largest time difference between an instant and a satellite speed [s].
 _NEAR_S: Final = 1.5
-#: Smallest reported scale error and lag.
+#: Smallest scale error, and smallest lag, that are reported.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
 #: Largest scale error of a worn wheel.
@@ -322,7 +325,8 @@ def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
 def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
     """Return a sentence on each sensor whose speeds have a wrong unit, a delay, or a scale error.
 
-    `speeds` are the satellite speeds of one antenna (`doppler_speeds`), `tachometer` the wheel as entered.
+    `speeds` are the satellite speeds of one antenna (`doppler_speeds`), `tachometer` the wheel as entered in the
+    settings.
     """
     right_time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
     right = speeds["speed_mps"].to_numpy()

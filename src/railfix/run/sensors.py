@@ -90,10 +90,10 @@ def read_units(path: Path) -> GroundUnits:
 
 
 def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
-    """Read balises, or virtual ones, along a line: ``balise,chainage_m`` and, where there are such, ``track,sigma_m``.
+    """Read balises, or virtual balises, along a line: ``balise,chainage_m`` and, if known, ``track,sigma_m``.
 
-    With the name of a track, a chainage counts from the beginning of that track; balises of tracks that are not part of
-    the line, or beyond its ends, are left out.
+    With the name of a track, a chainage is measured from the beginning of that track; balises of tracks that are not
+    part of the line, or beyond its ends, are left out.
 
     InputFileError: no such table, a name twice, or none on the line.
     """
@@ -138,8 +138,8 @@ def load_balises(
     """Read the positions of the balises, whose readings are a table or a stream, and of virtual balises; None without
     any.
 
-    InputFileError: see `read_listed_balises`. SettingsError: readings without a list, or a list without; virtual
-    balises without levels of the filter.
+    InputFileError: see `read_listed_balises`. SettingsError: readings without a list, or a list without readings;
+    virtual balises without levels of the filter.
     """
     if virtual is not None and (config.filter == "off" or config.tracking.level == "off"):
         raise SettingsError(

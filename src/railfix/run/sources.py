@@ -121,7 +121,7 @@ def open_line(
 
     With a time `at` the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
     without it the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a
-    network: `log` gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
+    network: `log` gives the route through it, and the heights of a map without heights where `heights` is `OF_LOG`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -200,7 +200,7 @@ def _paths(
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
-                f"the chainage of {reading.reference} was requested, which needs a vehicle file; name one"
+                f"the chainage of {reading.reference} was requested, which needs a vehicle file; give one"
             )
         return None, dict.fromkeys(antennas, Trajectory.from_antenna_path(track))
     body = read_vehicle(vehicle)
@@ -223,7 +223,7 @@ class Log:
     paths: tuple[Path, ...]
     chunk_epochs: int
     reading: LogReading = field(default_factory=LogReading)
-    #: Time from which epochs are read, and time before which the last one lies; None without a limit.
+    #: Time from which epochs are read, and time before which the last epoch lies; None without a limit.
     start: datetime | None = None
     end: datetime | None = None
     share: float = 0.0  #: Fraction of the files that has been read, 0 to 1.
@@ -312,7 +312,7 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
 
 
 def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
-    """Return results whose statuses and levels account for another track more probable than `Config.track_risk`."""
+    """Return results whose statuses and levels account for other tracks more probable than `Config.track_risk`."""
     antennas, fusion = dict(result.antennas), dict(result.fusion)
     for name, single in antennas.items():
         beside = route.is_uncertain(single.time, single.chainage_m, risk=config.track_risk)

@@ -1,4 +1,4 @@
-"""Codes and carrier phases of an antenna at rest, less a base station's if given."""
+"""Codes and carrier phases of an antenna at rest, less the codes and phases of a base station if one is given."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def standstill_codes(
     places = locate(obs, received, config, book).ecef_m
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
-        raise NoPositionError("the log has no position; are the navigation files of its day?")
+        raise NoPositionError("the log has no position; are the navigation files from the day of the log?")
     # thirds of the log, as a train that returns is at its first position in the end
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
@@ -132,7 +132,7 @@ def standstill_codes(
 
 
 def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
-    """Return observed minus computed codes at a position with the Earth's rotation during transit; NaN: unused."""
+    """Return observed minus computed codes at a position with the Earth's rotation during transit; NaN if not used."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)

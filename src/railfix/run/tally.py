@@ -107,9 +107,10 @@ class AntennaTally:
     conventional_nearest_m: float = float("nan")
     #: Epochs by status of the protection level; empty where levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
-    #: Epochs without a level because more faults than can be left out are likelier than the risk allows.
+    #: Epochs without a level because faults of more satellites than can be left out are more probable than the risk
+    #: allows, or because too many satellites are excluded.
     without_budget: int = 0
-    #: Largest contradiction of 3-D positions and map; None before there were enough.
+    #: Largest contradiction of 3-D positions and map; None before there were enough positions.
     map_offset: MapOffsetFound | None = None
     #: Number of epochs at which the filter, and single epochs, left out a satellite's codes as persistently wrong, and
     #: the first of these epochs.

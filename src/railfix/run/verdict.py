@@ -18,7 +18,7 @@ from railfix.run.record import level_basis
 POSITIONS: Final = "epochs with a position"
 PASSED: Final = "epochs that passed every check"
 SIGMA: Final = "sigma along the line, median"
-#: Filter statuses of positions that count as passed.
+#: Filter statuses of positions that have passed every check.
 _PROMISED: Final = ("tracking", "coasting")
 
 
@@ -146,7 +146,7 @@ def _describe(antenna: AntennaVerdict) -> str:
 
 
 def _describe_checks(figures: Sequence[PositionFigures]) -> str:
-    """Return how many single epochs passed every check, and the most frequent status of the others."""
+    """Return how many single epochs passed every check, and the most frequent status of the other epochs."""
     passed, epochs = sum(of.passed for of in figures), sum(of.epochs for of in figures)
     failed = _count_statuses(figures)
     del failed[Status.OK.text]

@@ -101,7 +101,7 @@ def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     """Parse the interlocking's track weights ``NAME=WEIGHT,...``.
 
-    SettingsError: it is not such a text, or names a track that the map lacks.
+    SettingsError: it is not such a text, or names a track that is not in the map.
     """
     weights = {}
     for pair in text.split(","):
@@ -226,7 +226,9 @@ class WhichTrackInputs(InputFiles):
     base: tuple[Path, ...] = input_option("Observations of a base station within 10 km.", (), metavar="OBS")
     nav: tuple[Path, ...] = input_option(NAVIGATION, (), metavar="NAV")
     map: tuple[Path, ...] = input_option("Map files with the tracks of the yard or station.", metavar="MAP")
-    last: Path | None = input_option("Probabilities of tracks when the train was last there (--save-last).", None)
+    last: Path | None = input_option(
+        "Probabilities of the tracks at the end of the last standstill (file of --save-last).", None
+    )
 
 
 class WhichTrackOptions(Settings):
@@ -234,7 +236,7 @@ class WhichTrackOptions(Settings):
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
     base_place: str | None = option("Position of the base station: latitude, longitude, height.", None, metavar="L,L,H")
-    risk: float = option("Bound of the probability of a wrong track.", 1e-3, metavar="P", gt=0, lt=0.5)
+    risk: float = option("Upper bound of the probability of a wrong track.", 1e-3, metavar="P", gt=0, lt=0.5)
     least_s: float = option("Time at rest before the first decision.", 60.0, name="--least", metavar="S", ge=0)
     prior: str | None = option(
         "Weights of the tracks that the interlocking considers possible: T1=0.9,T2=0.1.", None, metavar="NAME=P,..."
@@ -248,7 +250,7 @@ class WhichTrackOptions(Settings):
     start: datetime | None = option("First epoch of the standstill, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
     same_frame: Literal["no", "yes"] = option(
-        "The position of the base station is in the frame of the map, not in that of the satellites.",
+        "The position of the base station is in the frame of the map, not in the frame of the satellites.",
         "no",
         name="--same-frame",
     )
@@ -263,11 +265,11 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if (not inputs.base) != (options.base_place is None):
         raise SettingsError("a base station needs both --base and --base-place")
     if any(base.samefile(log) for base in inputs.base for log in (*inputs.front, *inputs.rear)):
-        raise SettingsError(f"--base {inputs.base[0]}: is the log of the train; give that of the base station")
+        raise SettingsError(f"--base {inputs.base[0]}: is the log of the train; give the log of the base station")
     if options.spacing > 0.0 and not inputs.rear:
         raise SettingsError("--spacing is given without --rear; give the log of the rear antenna, too")
     if inputs.rear and not options.spacing > 0.0:
-        raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
+        raise SettingsError("two antennas need --spacing, the distance from the rear to the front antenna")
     if (inputs.last is None) != (options.moved is None):
         raise SettingsError("the last position needs --last and --moved, the distance moved since (0: none)")
     navigation = read_navigation(inputs.nav, **options.logs.arguments)

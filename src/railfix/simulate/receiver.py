@@ -142,7 +142,7 @@ class TrackingNoise:
 
 
 def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
-    """Return the whole cycles in +-2e6 for each channel and number of losses, 0 for none (mixed by splitmix64)."""
+    """Return phase offsets by losses of lock, pseudo-random whole cycles within 2e6 (splitmix64); 0 without a loss."""
     mixed = salt + losses * np.uint64(0x9E3779B97F4A7C15)
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

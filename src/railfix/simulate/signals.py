@@ -318,7 +318,7 @@ def _disturb(
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
-    """Range errors of faults of satellites and of a station's receiver [m], and their rates [m/s], shapes (T, M)."""
+    """Return range errors by satellite and station receiver faults [m], and their rates [m/s], shapes (T, M)."""
     names = receiver.names.tolist()
     fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:

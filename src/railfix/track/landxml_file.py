@@ -92,7 +92,8 @@ def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Seg
             ) from None
         except (TypeError, ValueError, AttributeError):
             raise InputFileError(
-                path, f"alignment {name!r}: an element lacks a number that LandXML 1.2 has, or it is none"
+                path,
+                f"alignment {name!r}: a number that LandXML 1.2 requires is missing in an element, or is not a number",
             ) from None
         segments.append(
             segment_of_design(
@@ -246,7 +247,9 @@ def _read_ordinates(
     )
     share = abs((element.last if into else element.first) / (curvature[1] if into else curvature[0]))
     if not _ORDINATE_SHARE[0] < share < _ORDINATE_SHARE[1]:
-        raise InputFileError(path, f"the end of a {shape} transition is not that of its radius ({share:.2f} times)")
+        raise InputFileError(
+            path, f"the curvature at the end of a {shape} transition does not match its radius ({share:.2f} times)"
+        )
     if not into:  # the direction at the curve is the tangent's direction less the turn
         element = replace(element, direction_rad=element.direction_rad + element.turn_rad)
     return element

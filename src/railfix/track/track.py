@@ -91,7 +91,9 @@ class Track(NotebookTable):
         if not np.isfinite(place).all():
             raise ValueError("latitude_deg, longitude_deg and height_m must be finite")
         if (np.abs(place[:2]) > [[90.0], [360.0]]).any() or (place[2] < -1e5).any():
-            raise ValueError("a point is no place on Earth; latitude, longitude [deg] and height [m] were expected")
+            raise ValueError(
+                "a point is not a position on the Earth; latitude, longitude [deg] and height [m] were expected"
+            )
         if not (self.sigma_plan_m > 0 and self.sigma_height_m > 0):
             raise ValueError("sigma_plan_m and sigma_height_m must be positive")
 

@@ -78,7 +78,8 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
             ]
         except (TypeError, ValueError):
             raise InputFileError(
-                path, f"netElement {name!r}: a coordinate lacks a number that railML 3 has, or it is none"
+                path,
+                f"netElement {name!r}: a number that railML 3 requires is missing in a coordinate, or is not a number",
             ) from None
         points = np.array(sorted(rows))[:, 1:]
         if any(place.get("z") is None for _, place in found):
@@ -179,7 +180,7 @@ def _graph(path: FilePath) -> Graph:
 
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
-    """Return the triples of a file, kept for its relations."""
+    """Return the triples of a file, cached because its relations are read by a second call."""
     with needs_extra(f"{path}: RDF"):
         from rdflib import Graph
     data = read_bytes(path)

@@ -107,7 +107,7 @@ def decimate_epochs(
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
-    """Return the values and variances of the summed sensors, shape (T, 3); NaN without a sensor."""
+    """Return values and variances of the sensors that are summed between epochs, shape (T, 3); NaN without a sensor."""
     value, variance = np.full((epochs, 3), np.nan), np.full((epochs, 3), np.nan)
     for column, (name, sigma) in enumerate(_SUMMED):
         if getattr(sensors, name) is not None:

@@ -72,8 +72,8 @@ class RiskBudget(Settings):
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that are not hypotheses. If these are likelier, further faults become hypotheses,
-    #: up to four satellites at a time and three shared faults (constellation, side, map).
+    #: Fraction of the risk for faults that are not hypotheses. If their probability exceeds this fraction, further
+    #: faults become hypotheses, up to four satellites at a time and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
     #: Fraction of the risk for epochs with one excluded satellite, and the same fraction for two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)

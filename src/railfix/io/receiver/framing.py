@@ -250,7 +250,7 @@ _LONGEST: Final = 62
 def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
     """Return the unsigned integers from a bit field, shape (N,)."""
     if length > _LONGEST:
-        raise ValueError(f"a field has at most {_LONGEST} bits, {length} were asked for")
+        raise ValueError(f"a field has at most {_LONGEST} bits, {length} were requested")
     value = np.zeros(len(bits), dtype=np.int64)
     for column in bits[:, first : first + length].T:
         value = value << 1 | column

@@ -202,7 +202,7 @@ def scan_observations(
     that has been read, 0 to 1.
     """
     if epochs < 1:
-        raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
+        raise ValueError(f"a piece has at least one epoch, epochs={epochs} was requested")
     if broken_lines not in get_args(BrokenLines):
         raise ValueError(f"broken_lines is '{broken_lines}', 'stop' or 'count' was expected")
     letters = None if systems is None else frozenset(systems)

@@ -185,7 +185,7 @@ def _fraction(text: Bytes) -> tuple[Integers, Masks]:
 
 
 def _value(digits: Bytes, counted: Masks) -> Integers:
-    """Return the value of digits, those not counted 0."""
+    """Return the numbers that the digits form, shape (n,); a digit that is not `counted` is taken as 0."""
     value = np.zeros(digits.shape[1], dtype=np.int64)
     for row, here in zip(digits, counted, strict=True):
         value = 10 * value + np.where(here, row, 0)

@@ -119,7 +119,7 @@ def linearise(
     phase = np.where(v > 0, phases.phase_m - distance - clock[:, None], 0.0)
     prior = np.array([trajectory.sigma_plan_m**-2.0, trajectory.sigma_height_m**-2.0])
     known = np.zeros((len(code), unknowns, unknowns))
-    # Unobservable unknowns of an epoch: the matrix stays regular, their sigma is large.
+    # Loose prior: the matrix stays regular where an epoch does not determine an unknown, whose sigma is then large.
     for free in (0, *range(PLACE, unknowns)):
         known[:, free, free] = _FREE_M**-2.0
     known[:, 1, 1], known[:, 2, 2] = prior

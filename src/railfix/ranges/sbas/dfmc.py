@@ -161,7 +161,8 @@ class DfmcService:
         self.span: tuple[np.datetime64, np.datetime64] = (own.time[0], own.time[-1]) if len(own) else (never, never)
         self.notes = (
             *notes,
-            f"SBAS on L5 asked for: corrections of {system_name(prn)} PRN {prn} used, for ionosphere-free codes of GPS "
+            f"SBAS on L5 requested: corrections of {system_name(prn)} PRN {prn} used, for ionosphere-free "
+            "codes of GPS "
             "(L1 C/A, L5), Galileo (E1, E5a) and BeiDou (B1C, B2a); other satellites and signals are rejected",
         )
         self._time = {kind: own.time[own.type == kind] for kind in (0, *LAYOUTS)}

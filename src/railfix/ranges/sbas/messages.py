@@ -103,7 +103,7 @@ class SbasMessages(RowArrays, NotebookTable):
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
-        return f"SBAS PRN {prn} was asked for; the log has {known}"
+        return f"SBAS PRN {prn} was requested; the log has {known}"
 
     def of(self, prn: int) -> SbasMessages:
         """Return the messages of one PRN; the counts of rejected messages are for all PRNs."""

@@ -104,8 +104,8 @@ class SbasLimits(Settings):
     mode: Literal["precision", "en_route"] = "precision"
     type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops its sender for 60 s, or has fast corrections.
     range_rate: Literal["mops", "off"] = "mops"  #: Fast corrections change with their rate (DO-229D, A.4.4.3).
-    #: Without degradation data a satellite is rejected, or its sigma is increased by 8 m (DO-229D, J.2.2) with the
-    #: shortest time-out.
+    #: Use of a satellite without degradation data: rejected, or used with the shortest time-out and its sigma increased
+    #: by 8 m (DO-229D, J.2.2).
     incomplete: Literal["reject", "inflate"] = "reject"
     #: Largest UDREI used; None is 11 for precision approach and 13 en route.
     max_udrei: int | None = Field(default=None, ge=0, le=13)

@@ -84,12 +84,13 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
     whole = 1e3 * spent.sum() / max(epochs.sum(), 1.0)
     return Chart(
         name="processing-time",
-        title="Time an epoch",
+        title="Time per epoch",
         caption=f"Mean of each of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of all antennas, at "
-        f"the time of the first; reading and writing not included. Over the run {whole:.3f} ms an epoch and antenna. A "
-        "chunk is positioned as a whole: live, epoch by epoch, each takes longer.",
+        f"the time of the first; reading and writing not included. Mean over the run: {whole:.3f} ms per "
+        "epoch and antenna. A chunk is positioned as a whole; in live operation, epoch by epoch, each "
+        "epoch takes longer.",
         x_label="GPS time",
-        y_label="ms an epoch",
+        y_label="ms per epoch",
         layers=(
             Curve(label="", colour=GREY, x=x, y=mean_ms, width=1.0),
             Points(label="mean of a chunk", colour=BLUE, x=x, y=mean_ms, size=6.0),

@@ -112,12 +112,12 @@ def plan(
 def _filter_points(
     placed: pl.DataFrame, filtered: pl.DataFrame, frame: LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
-    """Yield the filtered positions of the epochs that have none of their own."""
+    """Yield the filter's positions of epochs without a single-epoch position."""
     alone = filtered.join(placed, on="time_gpst", how="anti").filter(pl.col("x_m").is_not_null())
     if len(alone):
         place = frame.plane(points(alone, *ECEF))
         kept = one_per_cell(place[:, 0], place[:, 1], cell=cell)
-        label = f"filtered, no position of its own ({len(alone):,})"
+        label = f"filter position of epochs without a single-epoch position ({len(alone):,})"
         epoch = since(alone, start)[kept]
         yield Points(label=label, colour=FILTERED, x=place[kept, 0], y=place[kept, 1], size=4.0, epoch_s=epoch)
 

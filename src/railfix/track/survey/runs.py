@@ -67,7 +67,7 @@ class RunSignals(FrozenArrays):
     code_m: Floats
     sigma_m: Floats
     clock: Indices  #: Number of the receiver clock, shape (M,).
-    step: Indices  #: Row before the change; it ends at the next row; shape (C,).
+    step: Indices  #: Row at which each change begins; it ends at the next row; shape (C,).
     #: The satellite at transmission, at both rows; shape (C, 3).
     before_ecef_m: Floats
     after_ecef_m: Floats
