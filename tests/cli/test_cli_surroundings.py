@@ -148,7 +148,7 @@ def test_tables_are_whole_in_a_log_of_80_columns(
 
 @pytest.mark.parametrize(
     ("number", "hint"),
-    [(errno.ENOSPC, "free some space on the disk"), (errno.EACCES, "name a folder that can be written to")],
+    [(errno.ENOSPC, "free some space on the disk"), (errno.EACCES, "give a folder that can be written to")],
 )
 def test_a_full_disk_asks_for_space(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, hint: str

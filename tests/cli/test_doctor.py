@@ -60,7 +60,7 @@ def test_a_log_without_a_date_is_a_log_that_needs_one(recordings: Path, tmp_path
     path.write_bytes(b"".join(content[a:b] for (a, b), n in zip(spans, numbers, strict=True) if 1070 < n < 1140))
     (finding,) = examine_files([path]).findings
     assert finding.kind == "observations"
-    assert "its observations (RTCM 3) carry no date; give one (date, --date)" in finding.problems[0]
+    assert "its observations (RTCM 3) have no date; give a date (date, --date)" in finding.problems[0]
     result = RUNNER.invoke(app, ["doctor", str(path), "--date", "2024-08-18T12:00", "--json"])
     (found,) = json.loads(result.stdout)["files"]
     assert found["first"].startswith("2024-08-18T21:14:25")

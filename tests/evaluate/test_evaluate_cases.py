@@ -406,7 +406,7 @@ def test_chainage_is_not_taken_where_it_is_not_the_same(tmp_path: Path):
         assert any(told in note for note in found.runs[0].notes)
         assert found.figure("mean_m") == pytest.approx(3.0, abs=2e-3)
         assert found.epochs["chainage_m"].to_numpy() == pytest.approx(place, abs=2e-3)
-        with pytest.raises(MismatchError, match="take the trajectory instead"):
+        with pytest.raises(MismatchError, match="use the trajectory instead"):
             evaluate_run(folder, known, options=EvaluationOptions(method="chainage"))
 
 
@@ -547,7 +547,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
         arguments += ["--reference", str(file)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    assert "By configuration, its runs together" in result.output
+    assert "By configuration, with its runs together" in result.output
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert {entry["input"] for entry in written["inputs"]} == {"positions", "record", "reference"}
     for entry in written["inputs"]:
@@ -645,7 +645,7 @@ def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
     write_reference(log.parent / "reference.csv", reference(time, 10.0 * time))
     found = evaluate_run(run)
     assert found.figure("max_m") < 1e-3
-    assert any("found beside the log" in note for note in found.runs[0].notes)
+    assert any("found next to the log" in note for note in found.runs[0].notes)
     write_reference(log.parent / "truth.csv", reference(time, 10.0 * time))
     with pytest.raises(InputFileError, match=r"truth\.csv and reference\.csv"):
         evaluate_run(run)

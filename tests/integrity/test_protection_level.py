@@ -293,7 +293,7 @@ def test_refusals():
         protection_level(model, list("GGGGX"))
     with pytest.raises(ValueError, match="scale must be positive"):
         protection_level(model, list("GGGGG"), scale=0.0)
-    with pytest.raises(ValueError, match="got a negative one"):
+    with pytest.raises(ValueError, match="must not be negative"):
         protection_level(model, list("GGGGG"), n_excluded=-1)
     space = point_model(raim_cases.made(ARC, "GGGGG", seed=5), raim_cases.LINE.at_arc(ARC))
     with pytest.raises(ValueError, match="a model on the line"):

@@ -243,9 +243,9 @@ def test_overlapping_logs_of_one_receiver_give_each_epoch_once(tmp_path: Path) -
 
 def test_messages_of_what_cannot_be_read(recordings: Path, tmp_path: Path) -> None:
     live = recordings / "live"
-    with pytest.raises(InputFileError, match="holds no observations"):
+    with pytest.raises(InputFileError, match="contains no observations"):
         railfix.read_observations(live / RTCM)
-    with pytest.raises(InputFileError, match="holds no whole ephemeris"):
+    with pytest.raises(InputFileError, match="contains no complete ephemeris"):
         railfix.read_navigation(live / TWO_BANDS)
     noise = tmp_path / "noise.ubx"
     noise.write_bytes(np.random.default_rng(1).integers(0, 256, 5000).astype(np.uint8).tobytes())

@@ -358,7 +358,7 @@ def test_a_date_for_rtcm_in_run_and_convert(tmp_path: Path) -> None:
     for words in ([*run, "--out", str(tmp_path / "run")], convert):
         undated = RUNNER.invoke(app, words)
         assert undated.exit_code == 3
-        assert "give one (date, --date)" in " ".join(undated.output.split())
+        assert "give a date (date, --date)" in " ".join(undated.output.split())
     assert RUNNER.invoke(app, [*convert, "--date", "2024-03-05"]).exit_code == 0
     dated = railfix.read_observations(tmp_path / "log.rnx")
     assert dated.time[0] == np.datetime64("2024-03-05T07:33:20")

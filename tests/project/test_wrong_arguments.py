@@ -147,8 +147,9 @@ def test_what_the_command_line_notes_is_a_warning_in_python_once(made: dict[str,
     (ionosphere,) = warned(lambda: run(navigation=no_ionosphere))
     assert ionosphere.startswith("ionosphere: klobuchar requested")
     late = replace(made["log"], time=made["log"].time + np.timedelta64(3, "D"))
-    assert "front: no epoch has a position: no navigation record is valid then; is it of another day?" in warned(
-        lambda: run(log=late)
+    assert (
+        "front: no epoch has a position: no navigation record is valid at the time of the log; is it of another day?"
+        in warned(lambda: run(log=late))
     )
     moved = made["track"].latitude_deg + 0.002
     elsewhere = railfix.Track.from_geodetic(moved, made["track"].longitude_deg, made["track"].height_m)

@@ -142,7 +142,7 @@ def test_rasters_that_cannot_be_used_are_one_sentence(tmp_path: Path) -> None:
     read = partial(read_track, path, height_datum="ellipsoidal", sigma_height_m=0.4)
     with pytest.raises(InputFileError, match=r"points of the map have no height, the first at chainage 418 m"):
         read(heights=_raster(tmp_path / "hole.tif", driver="GTiff", crs="EPSG:25832", hole=True))
-    with pytest.raises(InputFileError, match=r"names no CRS; put a \.prj file"):
+    with pytest.raises(InputFileError, match=r"states no CRS; put a \.prj file"):
         read(heights=_raster(tmp_path / "bare.asc", driver="AAIGrid", crs=None))
     with pytest.raises(InputFileError, match="points of the map have no height, the first at chainage 0 m"):
         read(heights=_raster(tmp_path / "elsewhere.tif", driver="GTiff", crs="EPSG:25833"))

@@ -275,7 +275,7 @@ def read_text_lines(path: FilePath) -> list[str]:
 def _open_plain(path: FilePath) -> IO[bytes]:
     file = Path(path)
     if file.is_dir():
-        raise InputFileError(path, "is a folder; name the file inside it")
+        raise InputFileError(path, "is a folder; give the file inside it")
     try:
         if file.exists() and not file.is_file():
             raise InputFileError(path, "is not a regular file; write its content to a file first")

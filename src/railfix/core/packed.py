@@ -50,7 +50,7 @@ def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
     if {"[Content_Types].xml", "mimetype"} & {*names}:
         raise InputFileError(path, "is a spreadsheet or another document; save it as CSV, and give that")
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-    raise InputFileError(path, f"is a zip archive of {len(names)} files ({shown}); unpack it, and name the files")
+    raise InputFileError(path, f"is a zip archive of {len(names)} files ({shown}); unpack it, and give the files")
 
 
 #: First bytes of a compress (.Z) file, and of a zip archive.

@@ -48,7 +48,7 @@ class Checked(BaseModel):
 
         def __setattr__(self, name: str, value: Any) -> None:
             raise SettingsError(
-                f"{type(self).__name__} cannot be changed; make another one: settings.replaced({name}={value!r})"
+                f"{type(self).__name__} cannot be changed; make another object: settings.replaced({name}={value!r})"
             )
 
         def __delattr__(self, name: str) -> None:

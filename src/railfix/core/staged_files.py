@@ -41,15 +41,15 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
 
 #: Errors of a full file system, and the remedy.
 _FULL: Final = {
-    errno.ENOSPC: "free some space on the disk, or name a folder on another",
-    errno.EDQUOT: "free some of your quota, or name a folder elsewhere",
-    errno.EFBIG: "name a folder on a file system for larger files",
+    errno.ENOSPC: "free some space on the disk, or give a folder on another disk",
+    errno.EDQUOT: "free some of your quota, or give a folder elsewhere",
+    errno.EFBIG: "give a folder on a file system for larger files",
 }
 
 
 def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
     """Return the error of a file that cannot be written: the system's reason, and the remedy."""
-    hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
+    hint = _FULL.get(error.errno or 0, "give a folder that can be written to")
     return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 
 

@@ -250,7 +250,9 @@ def _effect(choice: str, config: Config, antenna: str, parts: Sequence[Mapping[s
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     counts = columns["counted"] > 0
     if not counts.any():
-        raise MismatchError(f"the truth and the {antenna} log have no time in common; give that of the same run")
+        raise MismatchError(
+            f"the ground truth and the {antenna} log have no time in common; give the ground truth of the same run"
+        )
     has, ok = counts & (columns["has"] > 0), counts & (columns["ok"] > 0)
     figures: dict[str, Score] = {}
     normalised = float("nan")

@@ -176,7 +176,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "configuration": "settings of the run",
     "line": "name of the track",
     "antenna": "`front` or `rear`; `all` for both together",
-    "position": "`constrained` on the map, `constrained_ok` those that passed every check, `conventional`",
+    "position": "`constrained`: positions on the map; `constrained_ok`: those of them that passed every check; "
+    "`conventional`",
     "epochs_of": "`own`: every epoch of this kind; `common`: epochs with a constrained and a conventional position",
     "epochs": "of the run, with a reference; epochs missing in the log included",
     "observed": "those with observations",
@@ -192,7 +193,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "lowest_m": "error furthest toward the start of the line",
     "highest_m": "error furthest toward the end of the line",
     "max_at_time": "GPS time of the largest error",
-    "max_at_chainage_m": "chainage of the reference there",
+    "max_at_chainage_m": "chainage of the reference at that time",
     **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this size"),
     "wrong_places": "errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",

@@ -136,7 +136,7 @@ def evaluate_runs(
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
-        raise SettingsError("no run to evaluate; name the folders that railfix run wrote")
+        raise SettingsError("no run to evaluate; give the folders that railfix run wrote")
     for item in runs:
         check_type(item, RunAndReference, "run to evaluate")
     counts = Counter((item.run.resolve(), item.table) for item in runs)
@@ -193,7 +193,7 @@ def _evaluate(
         inputs.append(fingerprint("conventional", read_run(item.conventional, columns=NO_MORE).positions_path))
     references, path = _references(item, folder, read, options)
     if path is not None:
-        notes += [f"the reference was found beside the log: {path}"] if item.reference is None else []
+        notes += [f"the reference was found next to the log: {path}"] if item.reference is None else []
         inputs.append(fingerprint("reference", path))
     stretches = None
     if sections is not None:

@@ -174,7 +174,7 @@ def read_run(
         of_run, of_other = (_log_hashes(entries) for entries in (record, other.record))
         if of_run != of_other:
             raise MismatchError(
-                f"{conventional}: is not a run on the log of {path}; give one whose observations are the same"
+                f"{conventional}: is not a run on the log of {path}; give a run with the same observations"
             )
         unscreened = other.positions.select(*_KEYS, *CONVENTIONAL)
         rows = rows.drop(CONVENTIONAL).join(unscreened, on=_KEYS, how="left", maintain_order="left")
@@ -277,8 +277,8 @@ class EvaluationInputs(Settings):
         panel=INPUTS,
     )
     conventional: Path | None = option(
-        "Another run on the same log, whose conventional positions are compared with: one with `--screens elevation` "
-        "gives unscreened ones, as in P1.",
+        "Another run on the same log, whose conventional positions are compared with: a run with "
+        "`--screens elevation` gives unscreened positions, as in P1.",
         None,
         metavar="RUN",
         panel=INPUTS,
@@ -371,12 +371,12 @@ def read_sections(path: Path) -> Sections:
         if not name:
             raise table.error(row, "the environment is empty; expected a word such as open or tunnel")
         if not first[row] < last[row]:
-            raise table.error(row, f"from_m {first[row]:g} is not below to_m {last[row]:g}; mend the section")
+            raise table.error(row, f"from_m {first[row]:g} is not below to_m {last[row]:g}; correct the section")
     order = np.argsort(first, kind="stable")
     over = np.flatnonzero(first[order][1:] < last[order][:-1] - 1e-6)
     if len(over):
         row = int(order[over[0] + 1])
-        raise table.error(row, f"the section from {first[row]:g} m begins inside another one; make them disjoint")
+        raise table.error(row, f"the section from {first[row]:g} m begins inside another section; make them disjoint")
     return Sections(
         path=path, from_m=first[order], to_m=last[order], environment=tuple(table.cells["environment"].gather(order))
     )

@@ -28,13 +28,13 @@ from railfix.evaluate.evaluation_inputs import RunFolder, list_position_tables, 
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "position": "`constrained`, `constrained_ok` or `conventional`",
     "intervals": "pairs of consecutive positions between which the train moved",
-    "standing": "pairs between which it did not",
+    "standing": "pairs of consecutive positions between which the train did not move",
     **dict.fromkeys(
         (f"interval_{figure}_m" for figure in ("mean", "p50", "p95", "p99", "max")),
         "distance travelled between consecutive positions",
     ),
     "interval_max_from": "time of the position before the largest interval, GPS time",
-    "interval_max_chainage_m": "chainage there; empty in a gap of the reference",
+    "interval_max_chainage_m": "chainage of that position; empty in a gap of the reference",
     **dict.fromkeys(("gap_p50_s", "gap_p95_s", "gap_max_s"), "time between consecutive positions"),
     "gap_max_from": "time of the position before the longest gap, GPS time",
     "before_first_s": "from the first epoch with a reference to the first position",
@@ -105,10 +105,10 @@ LEAST_S: Final = 2.0
 #: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "begin_gpst": "first epoch without a satellite used, GPS time",
-    "duration_s": "from the last epoch with a satellite to the last without",
+    "duration_s": "from the last epoch with a satellite to the last epoch without",
     "travelled_m": "distance travelled meanwhile, by the reference",
     "environment": "of the reference or of the sections, at its middle",
-    "carried_by": "measurements that the filter used within it",
+    "carried_by": "measurements that the filter used within the outage",
     "epochs": "epochs without satellites",
     "positions": "those with a position",
     **dict.fromkeys(("outage_p50_m", "outage_p95_m", "outage_max_m"), "size of error"),

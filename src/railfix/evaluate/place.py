@@ -144,8 +144,8 @@ _ROUNDING_M: Final = 1e-3
 class TrackFiles(Settings):
     """Files that replace the files of ``run.json``, and options for reading the track (except `reading.reference`)."""
 
-    track: tuple[Path, ...] = option("Track that replaces the one in run.json.", (), metavar="TRACK", panel=INPUTS)
-    vehicle: Path | None = option("Vehicle that replaces the one in run.json.", None, metavar="TOML", panel=INPUTS)
+    track: tuple[Path, ...] = option("Track that replaces the track in run.json.", (), metavar="TRACK", panel=INPUTS)
+    vehicle: Path | None = option("Vehicle that replaces the vehicle in run.json.", None, metavar="TOML", panel=INPUTS)
     reading: TrackReading = Field(default_factory=TrackReading)
 
 
@@ -208,10 +208,10 @@ def compute_errors(
                 else (),
             )
         if method == "chainage":
-            raise MismatchError(f"{run.path}: {against}; take the trajectory instead (--method trajectory)")
+            raise MismatchError(f"{run.path}: {against}; use the trajectory instead (--method trajectory)")
         notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory: {against}",)
     else:
-        notes = (f"{antenna}: errors are along the trajectory, as asked",)
+        notes = (f"{antenna}: errors are along the trajectory, as requested",)
     trajectory, used, more = find_trajectory(run, antenna, answers.chainage_m, answers.ecef_m, files)
     arc, other = (_arc(trajectory, c) for c in (answers.chainage_m, answers.conventional_chainage_m))
     place = answers.reference_chainage_m
@@ -235,8 +235,8 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
     apart = apart[np.isfinite(apart)]
     if len(apart) and (median := float(np.median(apart))) > ANOTHER_PLACE_M:
         raise MismatchError(
-            f"{run.path}: the reference of the {antenna} antenna lies {median / 1000:,.0f} km from its positions; give "
-            "that of this run, and check the order of its coordinates"
+            f"{run.path}: the reference of the {antenna} antenna lies {median / 1000:,.0f} km from its "
+            "positions; give the reference of this run, and check the order of its coordinates"
         )
 
 

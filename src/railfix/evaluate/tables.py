@@ -27,8 +27,8 @@ _POSITION: Final = pl.col("position").replace(_NAMES)
 _OF: Final = pl.when(pl.col("run") != "all").then("run").otherwise("configuration").alias("of")
 #: Groupings in the order shown, with their captions.
 _GROUPINGS: Final = {
-    "configuration": "By configuration, its runs together",
-    "line": "By line, the runs of a configuration together",
+    "configuration": "By configuration, with its runs together",
+    "line": "By line, with the runs of a configuration together",
     "environment": "By environment",
     "speed": "By speed",
     "signals": "With and without satellites (tunnels and other outages)",
@@ -41,8 +41,8 @@ _LEVELS_OF: Final = (
     "all: every finite level"
 )
 _AVAILABLE: Final = (
-    "available: share of all epochs, tunnels included; 15 s, 60 s: share of windows beginning at an available epoch "
-    "that stay available"
+    "available: fraction of all epochs, tunnels included; 15 s, 60 s: fraction of windows beginning "
+    "at an available epoch that stay available"
 )
 
 

@@ -110,7 +110,7 @@ def only_device(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
     """Return the table; InputFileError where it has rows of several devices."""
     devices = table["DEVICE_ID"].drop_nulls().unique().sort().to_list()
     if len(devices) > 1:
-        raise InputFileError(path, f"has devices {', '.join(map(str, devices))}; keep the rows of one")
+        raise InputFileError(path, f"has devices {', '.join(map(str, devices))}; keep the rows of one device")
     return table
 
 

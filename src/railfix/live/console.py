@@ -157,7 +157,7 @@ class SessionLog:
             self._written.close()
             self._file.close()
             if missing := self._written.dropped + self._written.failed:
-                self._screen.send(f"railfix live: the log file lacks {missing} lines: {self._written.failure}")
+                self._screen.send(f"railfix live: {missing} lines are missing in the log file: {self._written.failure}")
         self._screen.close()
         self._terminal.close()
 

@@ -87,11 +87,12 @@ class LiveInputs(Settings):
         metavar="SOURCE",
     )
     base_place: str | None = option(
-        "Position of the base station; from its stream or header without it.", None, metavar="LAT,LON,HEIGHT"
+        "Position of the base station; by default from its stream or header.", None, metavar="LAT,LON,HEIGHT"
     )
     tachometer: str | None = input_option(
         "Pulses of a tachometer: the rows of the table of `railfix run` as lines of CSV, header first, from a "
-        "source as of --front; or the whole table, a file. A row with the time alone reports that no pulse came.",
+        "source as of --front; or the whole table, a file. A row with the time alone reports that there "
+        "was no pulse.",
         None,
         metavar="SOURCE",
     )
@@ -103,13 +104,14 @@ class LiveInputs(Settings):
     balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
     virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
     send: tuple[str, ...] = option(
-        "Where messages go: json, cbor, nmea, tpv, etcs, positions, train or passings at -, a file, udp://HOST:PORT, "
+        "Form and target of messages: json, cbor, nmea, tpv, etcs, positions, train or passings at -, a "
+        "file, udp://HOST:PORT, "
         "tcp-server://HOST:PORT or mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",
         ("json@-",),
         metavar="FORM@TARGET",
     )
     speed: float | None = option(
-        "Replay files this many times as fast as recorded; else without pause.", None, metavar="TIMES", ge=0.01
+        "Replay files this many times as fast as recorded; by default without pause.", None, metavar="TIMES", ge=0.01
     )
     channels: Literal["1", "2"] = option("2: a second process checks every message; a difference ends the output.", "1")
     metrics: str | None = option("Serve Prometheus text at /metrics.", None, metavar="HOST:PORT")
@@ -118,7 +120,7 @@ class LiveInputs(Settings):
     )
     log: Path | None = option("Also log into this file, which rotates.", None, metavar="FILE")
     out: Path | None = option("Also write the tables of results into this folder.", None, metavar="DIR")
-    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
     config: Config = Field(default_factory=Config)
     live: LiveSettings = Field(default_factory=LiveSettings)
     reading: TrackReading = Field(default_factory=TrackReading)

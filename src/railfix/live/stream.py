@@ -64,7 +64,7 @@ def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
 
     Each item ends with the message that completes an epoch, so that its navigation records precede its epoch.
     The state for the next chunk is `ReceivedData.after` of the last item; there is always an item. Epochs with
-    repeated or older time tags are kept: `LiveEngine.push` judges them.
+    repeated or older time tags are kept: `LiveEngine.push` decides on their use.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept

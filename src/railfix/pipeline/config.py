@@ -231,7 +231,7 @@ class Config(ScreenSettings):
     @classmethod
     def _some_system_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not value or len(set(value)) != len(value):
-            raise ValueError("name at least one constellation, each once")
+            raise ValueError("give at least one constellation, each once")
         return value
 
     @field_validator("screens")
@@ -248,7 +248,7 @@ class Config(ScreenSettings):
     @classmethod
     def _codes_and_each_once(cls, value: tuple[FilterSource, ...]) -> tuple[FilterSource, ...]:
         if "code" not in value or len(set(value)) != len(value):
-            raise ValueError("name each measurement once, code among them: the filter starts from codes")
+            raise ValueError("give each measurement once, code among them: the filter starts from codes")
         return tuple(name for name in FILTER_SOURCES if name in value)
 
     @model_validator(mode="after")

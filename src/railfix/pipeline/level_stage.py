@@ -58,7 +58,7 @@ def prior_basis_text(facts: Mapping[str, Any]) -> str:
     """Return a sentence on the priors of a run's levels (`level_facts`): measured or assumed, supported or not."""
     words = {
         "indicative": "indicative: priors of faults are assumed, not measured on this line; no hourly risk is claimed",
-        "measured": "priors of local faults measured on this line, risk.map_prior assumed",
+        "measured": "priors of local faults are measured on this line, risk.map_prior is assumed",
     }
     side = facts.get("side_prior")
     text = words.get(str(facts.get("basis")), "not recorded")

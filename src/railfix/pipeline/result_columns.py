@@ -226,7 +226,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "protection.level.fault_free_m",
         ),
         *of_one_meaning(
-            "level for faults of one satellite, of two; 0 where less likely than its part of the risk",
+            "level for faults of one satellite, and of two satellites; 0 where such faults are less probable "
+            "than their part of the risk",
             protection_one_fault_m="protection.level.one_fault_m",
             protection_two_faults_m="protection.level.two_fault_m",
         ),
@@ -305,7 +306,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "map_offset_statistic",
-            "squared normalised offset; status `map_offset` from 13.8 on",
+            "squared normalised offset; the status is `map_offset` from 13.8 on",
             "map_offset.statistic",
         ),
         Column(

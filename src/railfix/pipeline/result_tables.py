@@ -168,7 +168,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         *EPOCH,
         Column(
             "status",
-            "see `railfix.tracking.TrackStatus`; `tracking` and `coasting` alone have a finite level along the line",
+            "see `railfix.tracking.TrackStatus`; only `tracking` and `coasting` have a finite level along the line",
             "tracked.status",
             words=tuple(s.text for s in TrackStatus),
         ),
@@ -196,8 +196,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "number of possible positions", "tracked.hypotheses", dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "exceeded by the error along the line with the stated risk; infinite where another position is likelier "
-            "or measurements contradict the position",
+            "exceeded by the error along the line with the stated risk; infinite where another position is "
+            "more probable than the risk or measurements contradict the position",
             "tracked.level_m",
         ),
         Column(

@@ -225,7 +225,11 @@ class Result(NotebookTable):
             off = np.isin(result.status, (Status.OFF_MAP, Status.MAP_OFFSET))
             if observed.any() and not np.isfinite(result.point.ecef_m).any():
                 lost = (result.reason & (Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD)) != 0
-                cause = "no navigation record is valid then; is it of another day?" if lost.any() else "see its reasons"
+                cause = (
+                    "no navigation record is valid at the time of the log; is it of another day?"
+                    if lost.any()
+                    else "see its reasons"
+                )
                 yield f"{name}: no epoch has a position: {cause}"
             elif 2 * np.count_nonzero(off) > np.count_nonzero(observed):
                 yield f"{name}: most positions contradict the map; is this the track of the log?"

@@ -160,7 +160,9 @@ def select_channels(
         A letter names no constellation.
     """
     if unknown := [letter for letter in systems if letter not in CLOCK_GROUP]:
-        raise ValueError(f"systems names {unknown[0]!r}, which is no constellation; known are {', '.join(CLOCK_GROUP)}")
+        raise ValueError(
+            f"systems names {unknown[0]!r}, which is not a constellation; known are {', '.join(CLOCK_GROUP)}"
+        )
     glonass = glonass_channel or {}
     system = satellite.astype("<U1")
     columns = channel_order(satellite, signal, systems=systems, signals=signals)

@@ -53,7 +53,7 @@ class ErrorModelFit(Settings):
     #: Independent passes below which a bin uses the samples of a wider set of bins. 30: its largest error is then about
     #: the quantile of 2 standard scores, so that at least the shoulder of the tail is sampled.
     least_blocks: int = option(
-        "Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one.", 30, metavar="N", ge=1
+        "Passes of a satellite (30 s blocks) below which a bin has the values of a wider bin.", 30, metavar="N", ge=1
     )
     #: Length of the blocks in which a satellite's samples are counted. Errors are correlated over tens of seconds while
     #: a train is at rest.

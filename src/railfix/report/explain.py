@@ -32,7 +32,7 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
     "off_map": "beyond an end of the map, or too far from the position without the map",
-    "map_end": "at an end of the map: the ranges place it slightly beyond",
+    "map_end": "at an end of the map: by the ranges the position is slightly beyond it",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
@@ -40,7 +40,7 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
     "inconsistent": "the ranges are inconsistent, and no exclusion resolves it",
     "antennas_disagree": "the positions of the two antennas are not as far apart as the antennas are",
     "uncertain": "its standard deviation is over the limit",
-    "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or the train is on "
+    "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
     "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
     "spoofing_suspected": "the signals may be those of a spoofer (column interference_causes)",

@@ -308,7 +308,9 @@ def segment_of_design(
     unit = unit_of_grid(crs, path=path)
     if grid is not None:
         if unit != 1.0:
-            raise InputFileError(path, f"the grid {crs} is not in metres, which is not read; give one in metres")
+            raise InputFileError(
+                path, f"the grid {crs} is not in metres, which is not supported; give a grid in metres"
+            )
         east, north, up, cosine, sine, scale = grid
         xy = np.array([east, north]) + scale * xy @ np.array([[cosine, sine], [-sine, cosine]])
     xy /= unit
@@ -362,8 +364,8 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
     if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
         raise InputFileError(
             path,
-            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right crs (--crs), or mend the "
-            "elements that do not meet",
+            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right crs (--crs), or "
+            "correct the elements that do not meet",
         )
 
 

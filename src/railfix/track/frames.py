@@ -55,7 +55,7 @@ class FrameShift:
         size = float(np.hypot(self.east_m, self.north_m))
         moved = (
             f"map: {self.frame} moved by {size:.2f} m (east {self.east_m:+.2f}, north {self.north_m:+.2f}) to "
-            f"{self.used}, the frame of the positions (--same-frame: they are in that of the map)"
+            f"{self.used}, the frame of the positions (--same-frame: they are in the frame of the map)"
         )
         return (*self.notes, moved) if size > 0.0 else self.notes
 
@@ -167,7 +167,7 @@ def _from_dynamic(
         )
         return moved, f"{name} at the epoch of the log", (note,)
     if plate is None:
-        note = f"map: {name} at {epoch:g} is not moved to {year:.2f}, for no plate is named (1 to 8 cm a year)"
+        note = f"map: {name} at {epoch:g} is not moved to {year:.2f}, because no plate is given (1 to 8 cm per year)"
         return moved, f"{name} at {epoch:g}, not moved", (note,)
     return _by_plate(moved, plate, year - epoch), f"{name} at {epoch:g}, motion of the plate {plate}", ()
 

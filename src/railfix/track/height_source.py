@@ -111,7 +111,7 @@ def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
     try:
         with rasterio.open(path) as raster:
             if raster.crs is None:
-                raise InputFileError(path, "names no CRS; put a .prj file beside it, or write it as GeoTIFF")
+                raise InputFileError(path, "states no CRS; put a .prj file next to it, or write it as GeoTIFF")
             yield raster, CRS.from_wkt(raster.crs.to_wkt())
     except rasterio.errors.RasterioError as error:
         raise InputFileError(path, f"GDAL cannot read this raster ({str(error).splitlines()[0]})") from None
@@ -138,8 +138,8 @@ def _from_raster(
         )
     above = ellipsoidal_heights(heights, place, datum=str(datum), geoid=model, path=str(path))
     note = (
-        f"heights of the raster {path}, sigma {sigma_m or 0.0:.2f} m: those of the ground, which on bridges and in "
-        "tunnels are not the track's"
+        f"heights of the raster {path}, sigma {sigma_m or 0.0:.2f} m: heights of the ground, which on "
+        "bridges and in tunnels are not the heights of the track"
     )
     return _replace(track, above, float(sigma_m or 0.0), note)
 
@@ -163,7 +163,7 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
     datum = "ellipsoidal" if "height_m" in table else "orthometric"
     column = "height_m" if datum == "ellipsoidal" else "elevation_m"
     if column not in table:
-        raise table.header_error("there is no column height_m nor elevation_m")
+        raise table.header_error("there is no column height_m or elevation_m")
     known, heights = table.numbers(by), table.numbers(column)
     if len(known) < 2 or not (np.diff(known) > 0.0).all():
         raise InputFileError(table.path, f"{by} must rise from row to row, with at least two rows")

@@ -206,7 +206,7 @@ def _map_conversion(
         scale /= unit
     elif not abs(scale - 1.0) < LARGEST_SCALE:
         raise InputFileError(
-            step.path, f"the scale {scale:g} of IfcMapConversion is not that of its units ({unit:g} m)"
+            step.path, f"the scale {scale:g} of IfcMapConversion does not match its units ({unit:g} m)"
         )
     norm = float(np.hypot(a, b))
     return (east, north, up, a / norm, b / norm, float(scale)), str(system)

@@ -133,7 +133,7 @@ def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Sta
             place = before[0] + sign * (finite_number(equation.get("staBack")) * scale - before[1])
         back = before[1] + sign * (place - before[0])
         if place < before[0] + 2.0 * _JUMP_M:
-            raise InputFileError(path, "its station equations do not rise from the start along the line; mend them")
+            raise InputFileError(path, "its station equations do not rise from the start along the line; correct them")
         rows.append((place, back, ahead))
         sign = -1.0 if equation.get("staIncrement") == "decreasing" else 1.0
         before = (place, ahead)
@@ -165,7 +165,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             raise InputFileError(
                 path,
                 f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the other side "
-                f"than they say (rot), with {orders[1 - chosen]} the reverse; mend the order of the coordinates",
+                f"than they say (rot), with {orders[1 - chosen]} the reverse; correct the order of the coordinates",
             )
     else:
         chosen = int(broken[1] < broken[0])

@@ -222,12 +222,12 @@ def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[floa
     first, second = np.abs(near.offset_m[:, 0]), np.abs(near.offset_m[:, -1])
     alone = np.isfinite(first) & (second > first + _ALONE_M) if near.offset_m.shape[1] > 1 else np.isfinite(first)
     if alone.sum() < _ENOUGH:
-        return SIGMA_M, ", for too few lie where one track alone is near"
+        return SIGMA_M, ", because too few lie where only one track is near"
     own = near.offset_m[alone, 0]
     level, noise = (float(np.median(np.abs(v))) / _NORMAL_MEDIAN for v in (own, np.diff(own) / np.sqrt(2.0)))
     if level > max(_LARGEST_LEVEL_M, _BESIDE * noise):
-        return max(noise, SIGMA_M / 2.0), ", for they lie beside the tracks"
-    return max(level, _LEAST_SIGMA_M, network.sigma_plan_m), ", by their distances where one track alone is near"
+        return max(noise, SIGMA_M / 2.0), ", because they do not lie on the tracks"
+    return max(level, _LEAST_SIGMA_M, network.sigma_plan_m), ", from their distances where only one track is near"
 
 
 def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:

@@ -134,7 +134,9 @@ def check_heights(
             f"({GEOIDS}); a profile by chainage; or a log of 3-D positions",
         )
     if heights is not None and len(flat) < len(segments):
-        raise SettingsError(f"{segments[0].source} has heights itself; heights (--heights) are for maps without")
+        raise SettingsError(
+            f"{segments[0].source} has heights itself; heights (--heights) are for maps without heights"
+        )
     if isinstance(heights, str | PathLike) and ending(heights) in RASTERS:
         check_raster(heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 

@@ -331,7 +331,7 @@ def plan_segment(
         raise InputFileError(
             source,
             f"{int((~known).sum())} of {len(known)} points have no height, the first is point {np.argmin(known) + 1}; "
-            "mend them, or write the line without heights",
+            "correct them, or write the line without heights",
         )
     if known.any() and values[:, 2].any():
         heights = heights_of_file(values[:, 2] * unit_of_heights(crs), place, reading, path=source)

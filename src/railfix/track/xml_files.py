@@ -66,7 +66,9 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
             continue
         name, used = str(element.get("id")), {place.get("positioningSystemRef") for _, place in found}
         if len(used) > 1:
-            raise InputFileError(path, f"netElement {name!r} has coordinates of {len(used)} systems; give it in one")
+            raise InputFileError(
+                path, f"netElement {name!r} has coordinates in {len(used)} systems; give it in one system"
+            )
         try:
             rows = [
                 [

@@ -281,8 +281,8 @@ class IntegritySupport(Settings):
             return ()
         first = "" if self.valid_from is None else f"from {self.valid_from} "
         return (
-            f"integrity support message: valid {first}until {self.valid_until} (GPS time); epochs outside have no "
-            "ARAIM level, give a message of their time",
+            f"integrity support message: valid {first}until {self.valid_until} (GPS time); epochs outside "
+            "this time have no ARAIM level; give a message that is valid at their time",
         )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:

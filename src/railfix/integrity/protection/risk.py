@@ -151,7 +151,7 @@ class RiskBudget(Settings):
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
-            raise ValueError("n_excluded is a count, got a negative one")
+            raise ValueError("n_excluded must not be negative")
         each = [
             np.full(used.shape, 1.0 - 2.0 * self.exclusion_share),
             self.exclusion_share / (used + 1.0),

@@ -180,9 +180,9 @@ def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None
                 break
     if not parts:
         why = (
-            "its positions (UBX) carry no date, and no NAV-PVT with one is in the log; give one (date, --date)"
+            "its positions (UBX) have no date, and the log has no NAV-PVT with a date; give a date (date, --date)"
             if undated
-            else "holds no position of the receiver (UBX NAV-PVT or NAV-HPPOSLLH, SBF PVTGeodetic or PVTCartesian)"
+            else "contains no position of the receiver (UBX NAV-PVT or NAV-HPPOSLLH, SBF PVTGeodetic or PVTCartesian)"
         )
         raise InputFileError(path, why)
     columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -423,12 +423,12 @@ def scan_receiver_log(
         epochs += len(observations)
         yield replace(at_station(observations, piece.station), skipped=skipped)
     if not frames_seen:
-        raise InputFileError(path, "holds no UBX, RTCM 3, SBF or NMEA message with a valid checksum")
+        raise InputFileError(path, "contains no UBX, RTCM 3, SBF or NMEA message with a valid checksum")
     if not epochs:
         why = (
-            "its observations (RTCM 3) carry no date; give one (date, --date)"
+            "its observations (RTCM 3) have no date; give a date (date, --date)"
             if undated
-            else "holds no observations (UBX RXM-RAWX, SBF MeasEpoch, RTCM 3 MSM4 to MSM7)"
+            else "contains no observations (UBX RXM-RAWX, SBF MeasEpoch, RTCM 3 MSM4 to MSM7)"
         )
         if old:
             has = ", ".join(f"{what} ({number})" for what, number in sorted(old.items()))
@@ -445,6 +445,6 @@ def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 |
     why = f"the ephemerides of {', '.join(undated)} carry no full date (--date gives one)" if undated else ""
     if not whole.records:
         kinds = "UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046"
-        raise InputFileError(", ".join(names), why or f"holds no whole ephemeris ({kinds})")
+        raise InputFileError(", ".join(names), why or f"contains no complete ephemeris ({kinds})")
     navigation = assemble_navigation(whole, sources=names)
     return replace(navigation, notes=(f"{', '.join(names)}: left out: {why}",)) if undated else navigation
