@@ -1,15 +1,7 @@
-"""Generated networks of tracks: stations with loops along lines, switches with their legs; a town's grid of streets.
-
-``python tests/helpers/network_made.py 10 1000 100000`` prints memory and time per position on networks of that many km,
-``python tests/helpers/network_made.py town`` those of a town of 20,000 tracks, read from an OSM XML file.
-"""
+"""Generated networks of tracks: stations with loops along lines, switches with their legs."""
 
 from __future__ import annotations
 
-import resource
-import sys
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +9,7 @@ from pyproj import CRS, Transformer
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.network import Link, Network
-from railfix.track.network_match import PlanLog, match
-from railfix.track.network_read import read_network
+from railfix.track.network_match import PlanLog
 from railfix.track.route import ATTRIBUTES, NO_HEIGHTS, Segment
 from railfix.track.track import UNNAMED, Track
 from railfix.track.trajectory import Trajectory
@@ -122,37 +113,6 @@ def log_at(
     )
 
 
-#: Streets of a town are a grid of crossings, a track from each to the next, drawn with a point every 30 m.
-_BLOCK_M, _PIECES, _CROSSINGS = 150.0, 5, 100
-
-
-def write_town(path: Path) -> None:
-    """Write the ways between the crossings of a town, each of them a track, as OSM XML."""
-    nodes: dict[tuple[int, int], int] = {}
-    ways = []
-    for i in range(_CROSSINGS):
-        for j in range(_CROSSINGS):
-            for di, dj in ((1, 0), (0, 1)):
-                at = [(_PIECES * i + k * di, _PIECES * j + k * dj) for k in range(_PIECES + 1)]
-                ways.append([nodes.setdefault(place, len(nodes) + 1) for place in at])
-    latitude, longitude = to_degrees(*np.array([*nodes]).T * (_BLOCK_M / _PIECES))
-    with path.open("w") as file:
-        file.write("<osm version='0.6'>\n")
-        for number, lat, lon in zip(nodes.values(), latitude.tolist(), longitude.tolist(), strict=True):
-            file.write(f'<node id="{number}" lat="{lat:.9f}" lon="{lon:.9f}"/>\n')
-        for number, refs in enumerate(ways, start=1):
-            inside = "".join(f'<nd ref="{ref}"/>' for ref in refs)
-            file.write(f'<way id="{number}">{inside}<tag k="railway" v="tram"/></way>\n')
-        file.write("</osm>\n")
-
-
-def run_in_town(seconds: int) -> PlanLog:
-    """Positions each second at 10 m/s along a street of the town."""
-    error = lasting_errors(seconds, rng=np.random.default_rng(1), sigma_m=1.5)
-    along = np.arange(seconds) * 10.0 % (_BLOCK_M * _CROSSINGS)
-    return log_at(*to_degrees(along + error[:, 0], 50 * _BLOCK_M + error[:, 1]), 1.5)
-
-
 def write_stations(
     path: Path, track: Track, *, crs: str = "EPSG:4326", loops_m: list[tuple[float, float]], aside_m: float
 ) -> None:
@@ -188,36 +148,3 @@ def write_stations(
         geometry_type="LineString Z",
         crs=crs,
     )
-
-
-def main() -> None:
-    for text in sys.argv[1:]:
-        begin = time.process_time()
-        if text == "town":
-            with tempfile.TemporaryDirectory() as folder:
-                write_town(Path(folder) / "town.osm")
-                begin = time.process_time()
-                network, log = read_network([Path(folder) / "town.osm"]), run_in_town(1000)
-        else:
-            network = made_network(float(text))
-            log, on = made_run(network, [0, 2, 3], rng=np.random.default_rng(1), sigma_m=0.8)
-        network.near(log.latitude_deg[:1], log.longitude_deg[:1])
-        _ = network.graph
-        built = time.process_time() - begin
-        begin = time.process_time()
-        network.near(log.latitude_deg, log.longitude_deg)
-        searched = time.process_time() - begin
-        begin = time.process_time()
-        matched = match(network, log)
-        spent = time.process_time() - begin
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        right = np.abs(matched.offset_m) < 5.0 if text == "town" else matched.track == on
-        print(
-            f"{network.length_m.sum() / 1e3:.0f} km, {len(network.tracks)} tracks: built in {built:.1f} s, "
-            f"search {1e6 * searched / len(right):.0f} us, match {1e6 * spent / len(right):.0f} us a position, "
-            f"{right.mean():.3f} on the right track{' (within 5 m)' * (text == 'town')}, peak memory {memory:.0f} MB"
-        )
-
-
-if __name__ == "__main__":
-    main()

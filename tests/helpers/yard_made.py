@@ -1,12 +1,8 @@
-"""Simulated yards: trains at rest on parallel tracks, with the code errors of `StandstillErrors`.
-
-``python tests/helpers/yard_made.py 2000`` prints the calibration of the decisions.
-"""
+"""Simulated yards: trains at rest on parallel tracks, with the code errors of `StandstillErrors`."""
 
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -161,26 +157,3 @@ def decided(
             if name and risk not in answers:
                 answers[risk] = (name, look)
     return answers, "none" if missing else yard[own].name
-
-
-def main() -> None:
-    yards = int(sys.argv[1]) if len(sys.argv) > 1 else 200
-    errors = StandstillErrors()
-    for title, common, method in (
-        ("base station", 0.05, "model"),
-        ("no base station", 1.0, "model"),
-        ("base station, carrier phases", 0.05, "phase"),
-    ):
-        rows = [decided(k, errors=errors, common_sigma_m=common, method=method) for k in range(yards)]
-        for risk in RISKS:
-            given = [(a[risk], own) for a, own in rows if risk in a]
-            wrong = sum(name != own for (name, _), own in given)
-            times = [t for (_, t), _ in given]
-            print(
-                f"{title}, risk {risk:g}: {len(given)} of {yards} decided, {wrong} wrong "
-                f"({wrong / max(len(given), 1):.4f}), median time {np.median(times) if times else np.nan:.0f} s"
-            )
-
-
-if __name__ == "__main__":
-    main()
