@@ -309,7 +309,7 @@ def test_nothing_is_granted_after_a_start_until_every_train_is_heard(desk: Desk)
     assert {number: known.end_m for number, known in desk.state.trains.items()} == ends
     assert any("nothing is granted until" in alarm for alarm in desk.centre.alarms)
     desk.report(1, 1500.0, authority=900, authority_end_cm=245_000, speed_cmps=1000, direction=1, standstill=False)
-    assert "the newest in the centre's database is" in (desk.state.trains[1].stop or "")
+    assert "the newest in the centre's database at its start was" in (desk.state.trains[1].stop or "")
     assert desk.state.trains[1].interval_m[1] == 2450.0  # what it may still run to is occupied
     assert desk.state.granted >= 900
     desk.steps(0.2)

@@ -127,9 +127,9 @@ def survey(
 ) -> None:
     """Make one smoothed 3-D track map from several runs of ordinary receivers, with its standard deviation per point.
 
-    Laps, both directions, standstill and runs over a part of the line are allowed; outliers get no weight. Logs of
-    observations make a better map than their positions: changes of the carrier phase and Dopplers give the shape.
-    The map is the path of the antenna. Runs on different days average errors that all positions of one day share.
+    Laps, both directions, standstill and runs over a part of the line are allowed; outliers get little weight. Logs of
+    observations make a better map than their positions: changes of the carrier phase and Dopplers give the shape. The
+    map is the path of the antenna. Runs on different days average errors that all positions of one day share.
 
     Example: `railfix map survey monday.obs tuesday.obs --nav monday.nav --nav tuesday.nav --out line.csv`
 

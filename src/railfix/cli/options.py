@@ -218,8 +218,8 @@ class Choices(Settings):
 
     preset: str | None = option(
         "Base preset, which other settings override: default; strict, with fewer positions of higher "
-        "integrity; p1, the limits of the paper from which the screens are, for geodetic receivers at 10 "
-        "Hz.",
+        "integrity; p1, the limits of the paper from which the screens are taken, for geodetic receivers at "
+        "10 Hz.",
         None,
         metavar="NAME",
     )

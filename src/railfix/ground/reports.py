@@ -143,8 +143,8 @@ def unknown_authority(report: PlacedReport) -> str | None:
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None
-    newest = last if held < first else report.granted
-    return f"the train has authority {held}, the newest in the centre's database is {newest}"
+    newest = f"at its start was {last}" if held < first else f"is {report.granted}"
+    return f"the train has authority {held}, the newest in the centre's database {newest}"
 
 
 def wrong_turn(report: PlacedReport) -> str | None:

@@ -181,7 +181,8 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer the request; the route is released where the train agrees.
+    """Return the state after a report that may answer the request; the route is released where the train agrees,
+    otherwise kept.
 
     For a stopped train, whose report may be wrong, no answer is used until it is released.
     """
