@@ -37,7 +37,19 @@ from railfix.ground.links import (
     create_bearers,
     round_trips,
 )
-from railfix.ground.quic import RECEIVE_BYTES, LinkProtocol, configuration, connection
+from railfix.ground.quic import (
+    HANDSHAKE_S,
+    LATE_S,
+    MOST_HANDSHAKES,
+    MOST_OF_PEER,
+    RECEIVE_BYTES,
+    TURN,
+    Handshakes,
+    LinkProtocol,
+    configuration,
+    connection,
+    listen,
+)
 
 pytestmark = pytest.mark.requirement("F3")
 
@@ -685,3 +697,98 @@ def test_a_frame_and_its_answer_are_a_packet_each(keys: Path, monkeypatch: pytes
     run(work())
     assert 40 <= packets[False] <= 48
     assert 40 <= packets[True] <= 88
+
+
+class Opened:
+    """A connection whose handshake is in progress."""
+
+    def __init__(self) -> None:
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_handshakes_wait_for_room_and_end_where_they_take_too_long() -> None:
+    """Of one peer and of all; peers are invited by a Retry as far as there will be room for them."""
+    handshakes, now_s = Handshakes(), 100.0
+    mine: list[Any] = [Opened() for _ in range(MOST_OF_PEER)]
+    for protocol in mine:
+        assert handshakes.admits("10.0.0.1", now_s)
+        handshakes.begin(protocol, "10.0.0.1", now_s)
+    assert not handshakes.admits("10.0.0.1", now_s)
+    assert handshakes.admits("10.0.0.2", now_s)
+    others: list[Any] = [Opened() for _ in range(MOST_HANDSHAKES - MOST_OF_PEER)]
+    room = len(others)
+    assert [handshakes.invites(now_s) for _ in range(room + 2)] == [True] * room + [False, False]
+    for k, protocol in enumerate(others):
+        handshakes.begin(protocol, f"10.0.1.{k}", now_s + 1.0)
+    assert not handshakes.admits("10.0.0.3", now_s + 1.0)
+    assert not handshakes.invites(now_s + 1.0)
+    handshakes.end(mine[0])
+    assert handshakes.admits("10.0.0.3", now_s + 1.0)
+    handshakes.begin(mine[0], "10.0.0.3", now_s + 1.0)
+    assert handshakes.admits("10.0.0.1", now_s + HANDSHAKE_S)  # there is room for the peer, and the oldest of all ends
+    assert [protocol.closed for protocol in mine[1:4]] == [True, False, False]
+    assert not any(protocol.closed for protocol in others)
+
+
+def test_handshakes_and_connected_peers_take_turns(keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A queue of reports delays a handshake by a turn only, and the reverse; what has waited too long is dropped."""
+    order: list[str] = []
+
+    class Connected:
+        def datagram_received(self, data: bytes, _addr: Any) -> None:
+            order.append(data.decode())
+
+    monkeypatch.setattr(QuicServer, "datagram_received", lambda _self, data, _addr: order.append(data.decode()))
+
+    async def work() -> None:
+        settings = configuration(keys, "centre", is_client=False)
+        server, _ = await listen(("127.0.0.1", 0), settings, received=lambda *_: None, rejected=lambda: None)
+        now_s, peer = asyncio.get_running_loop().time(), ("127.0.0.1", 1)
+        queue: Any = server._connected
+        queue.extend((b"late", peer, Connected(), now_s - 1.5 * LATE_S) for _ in range(5))
+        queue.extend((b"report", peer, Connected(), now_s) for _ in range(3 * TURN))
+        server._opening.extend([(b"handshake", peer, False)] * 2)
+        for cid in (b"1", b"2"):
+            server._asking[cid] = b"first", peer, now_s
+        server._turn()
+        await asyncio.sleep(0.1)
+        assert (server.late, order.count("late")) == (5, 0)
+        server.close()
+
+    run(work())
+    turn = ["report"] * TURN
+    assert order == ["handshake", *turn, "handshake", *turn, "first", *turn, "first"]
+
+
+def test_a_silent_link_is_opened_again_although_round_trips_vary(keys: Path) -> None:
+    """QUIC alone would wait for three times its probe time-out, here more than a minute."""
+
+    async def work() -> float:
+        centre = CentreLinks(keys, HOSTS, received=lambda *_: None)
+        await centre.start()
+        relays = {name: Relay(centre.addresses[name], RelaySettings()) for name in BEARERS}
+        for name in BEARERS:
+            await relays[name].open(HOSTS[name])
+        bearers = create_bearers({n: r.address for n, r in relays.items()}, LOCAL)
+        train = TrainLinks(7, keys, bearers, limits=LinkLimits(idle_s=1.0))
+        await train.start()
+        await _until(lambda: len(train.protocols) == 2, 5.0)
+        for protocol in train.protocols.values():
+            protocol._quic._loss._rtt_variance = 5.0
+        for relay in relays.values():
+            relay.disturbance.up = False
+        train.send(b"place")
+        after_s = await _until(lambda: not train.protocols, 10.0)
+        for relay in relays.values():
+            relay.disturbance.up = True
+        assert await _until(lambda: len(train.protocols) == 2, 10.0) < 10.0
+        await train.stop()
+        await centre.stop()
+        for relay in relays.values():
+            relay.close()
+        return after_s
+
+    assert 0.9 < asyncio.run(work()) < 4.0

@@ -46,8 +46,8 @@ class LinkLimits(Settings):
     good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is used again.
     window: int = Field(default=60, ge=1)  #: Number of frames in the response rate.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
-    #: A connection without any packet for this time, at most 10 s, is opened again, so that trains reconnect after a
-    #: centre was killed.
+    #: A connection without any packet for this time since a frame was sent, at most 10 s, is opened again, so that
+    #: trains reconnect after a centre was killed.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 
 
@@ -275,7 +275,7 @@ class TrainLinks:
                     self._resend(name)
                     if protocol.peer is not None:
                         async with asyncio.timeout(protocol.peer.valid_s):
-                            await protocol.wait_closed()
+                            await protocol.wait_silent(idle_s)
             except (ConnectionError, TimeoutError, OSError):
                 pass  # retried after a time; the meter counts unanswered frames
             self.protocols.pop(name, None)

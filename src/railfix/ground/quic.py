@@ -11,8 +11,9 @@ import asyncio
 import errno
 import socket
 import ssl
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -21,10 +22,12 @@ from railfix.ground.keys import Peer
 
 with needs_extra():
     from aioquic.asyncio.protocol import QuicConnectionProtocol
-    from aioquic.asyncio.server import QuicServer, serve
+    from aioquic.asyncio.server import QuicServer
+    from aioquic.buffer import Buffer  # type: ignore[attr-defined]
     from aioquic.quic.configuration import QuicConfiguration
     from aioquic.quic.connection import QuicConnection
     from aioquic.quic.events import ConnectionTerminated, DatagramFrameReceived, HandshakeCompleted, QuicEvent
+    from aioquic.quic.packet import QuicPacketType, pull_quic_header
     from aioquic.tls import Alert, Epoch, verify_certificate
 
 #: Name of the protocol in the handshake.
@@ -35,11 +38,23 @@ IDLE_S: Final = 10.0
 WAIT_S: Final = 0.2
 #: Longest delay of QUIC acknowledgements, to be sent with a frame [s].
 ACKNOWLEDGE_S: Final = 1.5
-#: Largest number of handshakes of one peer in progress.
+#: Largest numbers of handshakes in progress, of one peer and of all; further ones wait.
+MOST_OF_PEER: Final = 16
 MOST_HANDSHAKES: Final = 64
+#: A handshake in progress for this time ends where another one waits: its peer has given up [s].
+HANDSHAKE_S: Final = 5.0
+#: Time in which peers begin the handshakes that they were invited to by a Retry, and between looks for room [s].
+INVITED_S: Final = 0.25
+ASKING_S: Final = 0.01
 #: Receive buffer for packets that arrive while the centre is busy; the default buffer overflows with a thousand trains
 #: after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
+#: Packets of connected peers that are processed for one packet of a handshake.
+TURN: Final = 16
+#: A packet of a connected peer that has waited so long is dropped: the peer has sent a newer message since [s].
+LATE_S: Final = 1.0
+#: Largest number of packets of handshakes that wait, and of packets that are read in a turn.
+MOST_WAITING: Final = 1024
 _REJECTED: Final = 0x101
 
 
@@ -59,26 +74,45 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
 
 
 class Handshakes:
-    """Handshakes in progress, at most `MOST_HANDSHAKES` per peer: a further one ends the oldest."""
+    """Handshakes in progress: a bounded number, so that each is done before its peer gives up."""
 
     def __init__(self) -> None:
-        self._open: dict[str, dict[LinkProtocol, None]] = {}
+        self._open: dict[LinkProtocol, tuple[str, float]] = {}  #: Peer, and begin [s].
+        self._invited, self._since_s = 0, float("-inf")
 
-    def begin(self, protocol: LinkProtocol, peer: str) -> None:
+    def invites(self, now_s: float) -> bool:
+        """Return whether a peer may prove its address: as many at a time as may begin a handshake then."""
+        if now_s - self._since_s > INVITED_S:
+            self._invited, self._since_s = 0, now_s
+        room = MOST_HANDSHAKES - self._invited
+        if room <= 0 or not self._has_room(list(self._open), room, now_s):
+            return False
+        self._invited += 1
+        return True
+
+    def admits(self, peer: str, now_s: float) -> bool:
+        """Return whether a peer that has proved its address may begin a handshake."""
+        mine = [protocol for protocol, (of, _) in self._open.items() if of == peer]
+        return self._has_room(mine, MOST_OF_PEER, now_s) and self._has_room(list(self._open), MOST_HANDSHAKES, now_s)
+
+    def _has_room(self, handshakes: list[LinkProtocol], most: int, now_s: float) -> bool:
+        """Return whether there are fewer handshakes; the oldest is ended where it takes too long."""
+        if len(handshakes) < most:
+            return True
+        oldest = handshakes[0]
+        if now_s - self._open[oldest][1] < HANDSHAKE_S:
+            return False
+        self.end(oldest)
+        oldest.close()
+        return True
+
+    def begin(self, protocol: LinkProtocol, peer: str, now_s: float) -> None:
         """Note the first packet of a connection."""
-        mine = self._open.setdefault(peer, {})
-        mine[protocol] = None
-        if len(mine) > MOST_HANDSHAKES:
-            oldest = next(iter(mine))
-            del mine[oldest]
-            oldest.close()
+        self._open[protocol] = peer, now_s
 
     def end(self, protocol: LinkProtocol) -> None:
         """Note that a handshake is done, or its connection has ended."""
-        for peer, mine in list(self._open.items()):
-            mine.pop(protocol, None)
-            if not mine:
-                del self._open[peer]
+        self._open.pop(protocol, None)
 
 
 class LinkProtocol(QuicConnectionProtocol):
@@ -104,6 +138,8 @@ class LinkProtocol(QuicConnectionProtocol):
         self._received = received
         self._rejected = rejected
         self._wait_s = wait_s
+        self.patience: Callable[[], None] | None = None  #: Called once, with the first packet of the other end.
+        self.unanswered_s: float | None = None  #: Time of the first message since the newest packet [s].
         self._answers: list[Callable[[], bytes]] = []
         self._waiting: asyncio.TimerHandle | None = None
         if not quic.configuration.is_client:
@@ -148,9 +184,13 @@ class LinkProtocol(QuicConnectionProtocol):
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
         """Process a packet; delayed acknowledgements to a verified peer halve packets and work."""
+        self.unanswered_s = None
+        if self.patience is not None:
+            self.patience()
+            self.patience = None
         if self._handshakes is not None and not self._begun:
             self._begun = True
-            self._handshakes.begin(self, str(addr[0]))
+            self._handshakes.begin(self, str(addr[0]), self._loop.time())
         if self._wait_s == 0.0 or self.peer is None or self.ended:
             super().datagram_received(data, addr)
             return
@@ -175,14 +215,50 @@ class LinkProtocol(QuicConnectionProtocol):
             if self.peer is not None and self._quic._datagrams_pending:
                 space = self._quic._spaces[Epoch.ONE_RTT]
                 space.ack_at = None if space.ack_at is None else 0.0
-        super().transmit()
+        self._transmit_task = None
+        for data, addr in self._quic.datagrams_to_send(now=self._loop.time()):
+            cast(asyncio.DatagramTransport, self._transport).sendto(data, addr)
+        self._arm_timer()
+
+    def _arm_timer(self) -> None:
+        """Set the timer of QUIC; one that is set for an earlier instant stays, and is set again when it ends."""
+        due = self._quic.get_timer()
+        if self._timer is not None and (due is None or due < cast(float, self._timer_at)):
+            self._timer.cancel()
+            self._timer = None
+        if self._timer is None and due is not None:
+            self._timer, self._timer_at = self._loop.call_at(due, self._handle_timer), due
+
+    def _handle_timer(self) -> None:
+        due = self._quic.get_timer()
+        if due is not None and self._timer_at is not None and due > self._timer_at:
+            self._timer = None
+            self._arm_timer()
+        elif self._timer_at is not None:
+            super()._handle_timer()
 
     def send(self, data: bytes) -> None:
         """Send a datagram; without a connection it is dropped."""
         if self.ended or self.peer is None:
             return
         self._quic.send_datagram_frame(data)
+        if self.unanswered_s is None:
+            self.unanswered_s = self._loop.time()
         self.transmit()
+
+    async def wait_silent(self, idle_s: float) -> None:
+        """Wait until the connection is closed, or no packet has come for a time since a message was sent.
+
+        QUIC itself waits for three times its probe time-out at least, which grows with the variation of round trips.
+        """
+        while not self.ended:
+            now_s = self._loop.time()
+            left_s = idle_s + (now_s if self.unanswered_s is None else self.unanswered_s) - now_s
+            if left_s <= 0.0:
+                return
+            with suppress(TimeoutError):
+                async with asyncio.timeout(left_s):
+                    await self.wait_closed()
 
 
 @contextmanager
@@ -198,6 +274,94 @@ def address_errors(host: str, port: int) -> Iterator[None]:
         raise OSError(error.errno, f"cannot listen at {host}:{port} ({error.strerror}); {todo}") from None
 
 
+class _Socket:
+    """Sending end of a server: a packet that the system does not take is lost."""
+
+    def __init__(self, bound: socket.socket) -> None:
+        self._bound = bound
+
+    def sendto(self, data: bytes, addr: Any) -> None:
+        with suppress(OSError):
+            self._bound.sendto(data, addr)
+
+    def close(self) -> None:
+        self._bound.close()
+
+
+class LinkServer(QuicServer):
+    """Server that reads all packets that have arrived, and takes turns between handshakes and connected peers.
+
+    Neither waits for more than a turn of the others: `TURN` packets of connected peers, and one of a handshake; those
+    in progress come before new ones, which wait here. `late` counts packets that had waited for too long.
+    """
+
+    def __init__(self, bound: socket.socket, handshakes: Handshakes, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.late = 0
+        self._bound, self._handshakes = bound, handshakes
+        self._connected: deque[tuple[bytes, Any, LinkProtocol, float]] = deque()
+        self._opening: deque[tuple[bytes, Any, bool]] = deque(maxlen=MOST_WAITING)
+        self._asking: dict[bytes, tuple[bytes, Any, float]] = {}  #: First packets, by the identifier of a connection.
+        self._next: asyncio.Handle | None = None
+        self.connection_made(_Socket(bound))  # type: ignore[arg-type]
+        self._loop.add_reader(bound, self._read)
+
+    def close(self) -> None:
+        """End all connections, and do not listen any more."""
+        self._loop.remove_reader(self._bound)
+        if self._next is not None:
+            self._next.cancel()
+        super().close()
+
+    def _read(self) -> None:
+        """Read the packets that have arrived."""
+        now_s, length = self._loop.time(), self._configuration.connection_id_length
+        with suppress(OSError):  # no more packets, or a peer that did not take one
+            for _ in range(MOST_WAITING):
+                data, addr = self._bound.recvfrom(65_536)
+                protocol = None if data[:1] >= b"\x80" else self._protocols.get(data[1 : 1 + length])
+                if isinstance(protocol, LinkProtocol) and protocol.peer is not None:
+                    self._connected.append((data, addr, protocol, now_s))
+                else:
+                    self._sort(data, addr, now_s)
+        if self._next is not None:
+            self._next.cancel()
+        self._turn()
+
+    def _sort(self, data: bytes, addr: Any, now_s: float) -> None:
+        """Enter a packet of a peer that is not connected."""
+        with suppress(ValueError):  # no packet of QUIC
+            header = pull_quic_header(Buffer(data=data), host_cid_length=self._configuration.connection_id_length)
+            first = header.packet_type == QuicPacketType.INITIAL and header.destination_cid not in self._protocols
+            if not first or header.token:
+                self._opening.append((data, addr, first))
+            elif len(self._asking) < MOST_WAITING or header.destination_cid in self._asking:
+                self._asking[header.destination_cid] = data, addr, now_s
+
+    def _turn(self) -> None:
+        """Process packets, as many as a turn has."""
+        now_s, self._next = self._loop.time(), None
+        if self._opening:
+            data, addr, first = self._opening.popleft()
+            if not first or self._handshakes.admits(str(addr[0]), now_s):
+                self.datagram_received(data, addr)
+        elif self._asking and self._handshakes.invites(now_s):
+            data, addr, _ = self._asking.pop(next(iter(self._asking)))
+            self.datagram_received(data, addr)
+        while self._connected and now_s - self._connected[0][3] > LATE_S:
+            self._connected.popleft()
+            self.late += 1
+        for _ in range(min(TURN, len(self._connected))):
+            data, addr, protocol, _ = self._connected.popleft()
+            protocol.datagram_received(data, addr)
+        if self._opening or self._connected:
+            self._next = self._loop.call_soon(self._turn)
+        elif self._asking:
+            for cid in [cid for cid, (_, _, at_s) in self._asking.items() if now_s - at_s > HANDSHAKE_S]:
+                del self._asking[cid]
+            self._next = self._loop.call_later(ASKING_S, self._turn)
+
+
 async def listen(
     address: tuple[str, int],
     settings: QuicConfiguration,
@@ -205,25 +369,33 @@ async def listen(
     received: Callable[[LinkProtocol, bytes], None],
     rejected: Callable[[], None],
     wait_s: float = WAIT_S,
-) -> tuple[QuicServer, tuple[str, int]]:
+) -> tuple[LinkServer, tuple[str, int]]:
     """Listen for connections at an address; port 0 takes a free port. Return the server and its address.
 
     Answers and acknowledgements to a verified peer are delayed up to `wait_s`, to be sent with a message. A peer must
-    prove its address before any of its data are stored (Retry, RFC 9000, 8.1.2).
+    prove its address before more than its first packet is stored (Retry, RFC 9000, 8.1.2).
     """
     handshakes = Handshakes()
     with address_errors(*address):
-        server = await serve(
-            *address,
-            configuration=settings,
-            create_protocol=lambda quic, stream_handler=None: LinkProtocol(
-                quic, stream_handler, received=received, rejected=rejected, wait_s=wait_s, handshakes=handshakes
-            ),
-            retry=True,
-        )
-    transport: Any = server._transport
-    transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
-    return server, transport.get_extra_info("sockname")[:2]
+        found = await asyncio.get_running_loop().getaddrinfo(*address, type=socket.SOCK_DGRAM)
+        bound = socket.socket(found[0][0], socket.SOCK_DGRAM)
+        try:
+            bound.setblocking(False)
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
+            bound.bind(found[0][4])
+        except OSError:
+            bound.close()
+            raise
+    server = LinkServer(
+        bound,
+        handshakes,
+        configuration=settings,
+        create_protocol=lambda quic, stream_handler=None: LinkProtocol(
+            quic, stream_handler, received=received, rejected=rejected, wait_s=wait_s, handshakes=handshakes
+        ),
+        retry=True,
+    )
+    return server, bound.getsockname()[:2]
 
 
 @asynccontextmanager
@@ -235,7 +407,7 @@ async def connection(
     received: Callable[[LinkProtocol, bytes], None],
     timeout_s: float = 5.0,
 ) -> AsyncIterator[LinkProtocol]:
-    """Connect from the local address of the bearer's interface.
+    """Connect from the local address of the bearer's interface, in three times `timeout_s` from the first answer on.
 
     ConnectionError, TimeoutError: the other end rejects the certificate, has another name, or does not answer.
     """
@@ -246,10 +418,12 @@ async def connection(
     try:
         protocol.connect(address)
         # `wait_for` would not retrieve the error of a connection that ends as it gives up.
-        async with asyncio.timeout(timeout_s):
+        async with asyncio.timeout(timeout_s) as limit:
+            protocol.patience = lambda: None if limit.expired() else limit.reschedule(loop.time() + 3.0 * timeout_s)
             await protocol.wait_connected()
         yield protocol
     finally:
+        protocol.patience = None
         protocol._connected_waiter = None  # after a time-out nothing retrieves the error set by closing
         protocol.close()
         await asyncio.sleep(0)
