@@ -262,13 +262,3 @@ def explore(start: World, length: int, *, events: int = 10**9) -> tuple[int, lis
                         return len(seen), None
         level = later
     return len(seen), None
-
-
-def after_running(world: World, *steps: tuple[int, str]) -> World:
-    """The world after some usual events."""
-    for number, event in steps:
-        later = world.after(number, event)
-        assert later is not None, (number, event)
-        assert later.violation is None
-        world = later
-    return world

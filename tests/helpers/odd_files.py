@@ -7,7 +7,6 @@ import gzip
 import io
 import lzma
 import re
-import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
@@ -17,8 +16,6 @@ from random import Random
 from typing import Final
 
 import ncompress
-
-from railfix.core.files import hatanaka_program
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -42,11 +39,6 @@ def _zip(content: bytes, name: str) -> bytes:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, content)
     return file.getvalue()
-
-
-def _hatanaka(content: bytes, _: str) -> bytes:
-    with hatanaka_program("rnx2crx") as program:
-        return subprocess.run([str(program), "-"], input=content, check=True, capture_output=True).stdout
 
 
 #: Forms of packed files: ending, and what packs the content of a file of a name.

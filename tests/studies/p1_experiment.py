@@ -1,4 +1,4 @@
-"""P1's experiments on simulated lines: chapter 5 (tables 4 to 6, figures 10 to 12), 3.2 and 3.3 (figures 7 and 8).
+"""P1's experiments on simulated lines: chapter 5 (tables 4 to 6, figures 10 to 12) and 3.2.
 
 Run ``python tests/studies/p1_experiment.py PART`` for the tables of docs/paper-experiments.md, one part at a time:
 
@@ -7,12 +7,10 @@ short      the first two minutes of that, in seconds
 commercial 145.2 km of the scenario p1-commercial: every configuration beside P1
 corrected  GPS alone on those lines and on five of other seeds, with and without simulated SBAS corrections
 filtered   the filter along the track on the lines of "commercial", without sensors and with two
-test-line  figures 7 and 8 and table 4
-figure-8   the picture of figure 8
 static     two and three satellites, standing at many points of the test line
 ========== =====================================================================
 
-Nothing but that picture is written; the simulated signals go from the simulator to the positioning in memory.
+Nothing is written; the simulated signals go from the simulator to the positioning in memory.
 """
 
 from __future__ import annotations
@@ -43,11 +41,11 @@ from p1_ride import (
 )
 from p1_rtklib import ABSENT, PROGRAM
 from p1_static import static_report
-from p1_test_line import PICTURE, SERVICE, figure_8, line_report
 from railfix.core.arrays import Masks
 from railfix.core.reasons import Status
 from railfix.simulate import Scenario
 from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.settings import SbasSettings
 
 #: P1, chapter 5: largest error and positioning rate, conventional and by P1's method.
 P1_LARGEST_M: Final = (65.8, 10.2)
@@ -200,7 +198,7 @@ def commercial(
         if not any(way.sensors for way in ways):
             scenario = scenario.replaced(sensors=None)
         if any(way.sbas for way in ways):
-            scenario = scenario.replaced(sbas=SERVICE)
+            scenario = scenario.replaced(sbas=SbasSettings(clock_sigma_m=0.1))
         if duration_s is not None:
             scenario = scenario.replaced(duration_s=duration_s)
         name = recipe.names[number] if seed is None else f"seed-{seed}"
@@ -313,15 +311,11 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from filtered_report(folder)
     elif part == "corrected":
         yield from corrected_report(folder)
-    elif part == "test-line":
-        yield from line_report()
-    elif part == "figure-8":
-        figure_8().savefig(PICTURE, dpi=100, metadata={"Software": None})
     else:
         yield from static_report()
 
 
-PARTS: Final = ("short", "commercial", "corrected", "filtered", "test-line", "figure-8", "static")
+PARTS: Final = ("short", "commercial", "corrected", "filtered", "static")
 
 
 def main(arguments: Sequence[str]) -> int:
