@@ -63,7 +63,7 @@ def kernel(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """Compile a function that only kernels call; its machine code becomes part of theirs."""
+    """Compile a function that only kernels call; its machine code becomes part of the kernels' machine code."""
     if is_plain():
         return function
     return cast(Function, numba.njit(**OPTIONS)(function))

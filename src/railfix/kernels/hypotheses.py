@@ -59,7 +59,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma and ratio of separation to threshold of the sets of excluded channels, in sequence."""
+    """Offset, sigma, and ratio of separation to threshold, of sets of excluded channels in their order."""
 
     offset: Floats
     sigma: Floats
@@ -273,7 +273,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write sets of two and more channels: all but the last are left out in sequence, `depth` of them so far."""
+    """Write sets of two and more channels: the first `depth` are left out in sequence, then the last two together."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

@@ -25,7 +25,7 @@ _MILLS = (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 _ROOT_HALF = math.sqrt(0.5)
-#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, with a relative error below 2e-8 (Cephes; exact in its range of 1 to 8).
+#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, with a relative error below 2e-8 (Cephes; meant for x of 1 to 8).
 _P = (
     2.46196981473530512524e-10, 5.64189564831068821977e-1, 7.46321056442269912687, 4.86371970985681366614e1,
     1.96520832956077098242e2, 5.26445194995477358631e2, 9.34528527171957607540e2, 1.02755188689515710272e3,

@@ -10,9 +10,9 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 
-#: Smallest effect of a satellite on the position, in position sigmas; a smaller effect counts as zero.
+#: Smallest effect of a satellite on the position, in position sigmas; a smaller effect is taken as zero.
 _NO_EFFECT = 1e-6
-#: Separations below this fraction of sigma count as zero.
+#: Separations below this fraction of sigma are taken as zero.
 _SAME = 1e-9
 #: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to map errors
 #: across and up, mean map error across and up, sigmas of the threshold, smallest threshold, 1 without the map, distance

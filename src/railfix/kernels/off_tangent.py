@@ -252,8 +252,8 @@ def risk_off_tangent(
     At a distance D along and across, a form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C) - c
     . s``: c is its lowest point and C the inverse of its matrix, both along and across, and s its slope. Without the
     channels J the matrix is at least ``1 - tau`` times the matrix of all channels, ``tau = trace(F_J C F_J^T S_JJ^-1)``
-    with their rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the others each
-    subset has its own bound.
+    with their rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the other
+    epochs each subset has its own bound.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def risk_off_tangent(
     sigma_m : tuple of float [m]
         Map sigmas in plan and height.
     enough : float
-        Probability up to which a loose bound will do.
+        Probability up to which a loose bound is sufficient.
 
     Returns
     -------
@@ -409,7 +409,7 @@ def risk_beyond(
     prior, form : ndarray
         Returned by `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` at the displacement d.
     radius_m : ndarray, shape (T, K)
-        A hypothesis counts if a part of the line beyond the level is nearer.
+        A hypothesis is included if a part of the line beyond the level is nearer than this.
     first : ndarray of int, shape (T + 1,)
         First section of each epoch.
     start_m, tangent : ndarray, shape (P, 3)

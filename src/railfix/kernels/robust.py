@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
-#: Smallest scale of whitened residuals: a closer agreement of the ranges is accidental.
+#: Smallest scale of whitened residuals: ranges that agree more closely do so by chance.
 _LEAST_SCALE = 0.05
 
 

@@ -196,8 +196,8 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return which conditions have been true for their required time, which are still active, and the state: see
-    `held`.
+    """Return masks of the conditions that have been true for their required time and of those that are still active,
+    and the state: see `held`.
 
     `before`: duration of each condition, and time of its last activity, shape (C,).
     """

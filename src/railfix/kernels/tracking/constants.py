@@ -41,8 +41,8 @@ CODE_CLOCK_SIGMA_M: Final = 1e3  #: Prior standard deviation of the code clock a
 WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
-#: Fraction of the map's height error that changes over `MAP_CORRELATION_M`; across it is 1. Height errors of a survey
-#: or a terrain model extend over longer distances.
+#: Fraction of the map's height error that changes over `MAP_CORRELATION_M`; laterally the fraction is 1. Height errors
+#: of a survey or a terrain model extend over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
 LEAST_STEP_M2: Final = 1e-6  #: Minimum variance of a step of position and of speed [m2, m2/s2].
 
@@ -85,7 +85,7 @@ CODE_LEAK: Final = 1.0
 
 # Satellites with persistent code errors.
 #: Time constant of the mean innovation [s], bound of a single innovation, and the means beyond which codes are left
-#: out: too long, and too short. Late codes of other satellites pull the clock, so that correct codes appear too short.
+#: out as too long, and as too short. Late codes of others pull the clock, so that correct codes appear too short.
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
@@ -95,7 +95,7 @@ NOMINAL_M: Final = 0.8
 #: No protection level is given if more satellites than this are beyond `BIAS_FAULTY` and one of them is too short: the
 #: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
-BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out; their innovations show the end.
+BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out; their innovations show its end.
 #: Standard deviation added to the position when a satellite is left out: its codes have affected it so far [m].
 INFLATED_M: Final = 15.0
 INFLATED_SIGMAS: Final = 3.0  #: Not added where all codes are off by more sigmas: they may have stepped together.
@@ -118,7 +118,7 @@ MISFIT_LARGEST: Final = 8.0
 SPEED_SIGMAS: Final = 4.0  #: A measured speed bounds the true speed within this many standard deviations.
 
 # Branches.
-#: Smallest distance of two branches at which half of their difference counts as the map's: three errors of 2 m.
+#: Smallest distance of two branches at which half of their difference is attributed to the map: three errors of 2 m.
 MAP_BRANCH_M: Final = 6.0
 #: Standard deviation of the common code error across the line: reflections from one side of a street.
 CODE_COMMON_M: Final = 10.0
@@ -179,7 +179,7 @@ LEVEL_HOLD_S: Final = 5.0  #: Time from the last contradiction until the protect
 #: The velocity is compared with the line at the position, and this many sigmas, or metres, ahead and behind.
 REACH_SIGMAS: Final = 2.0
 REACH_M: Final = 3.0
-#: Velocity error besides its covariance [m/s], and least error of the line's direction as a fraction of the speed.
+#: Velocity error in addition to its covariance [m/s]; least error of the line's direction as a fraction of the speed.
 VELOCITY_FLOOR_MPS: Final = 0.15
 DIRECTION_SHARE: Final = 0.03
 #: Cumulative sum of squared contradictions (E. S. Page, 1954): bound of one square, and decrement per second.
@@ -193,8 +193,8 @@ CONTRADICTION_TAKEN: Final = 60.0  #: Sum that is set after a takeover: larger t
 #: mean of the position shifts that codes imply, and log variance of the map's lengths (6 times the assumed error).
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
-#: Least mean weight of Dopplers and phases over `MOTION_FIT_S` while no sensor on board measures the speed. With less
-#: they agree on no speed, as beyond a bend that the estimated position has not reached.
+#: Least mean weight of Dopplers and phases over `MOTION_FIT_S` while no sensor on board measures the speed. With a
+#: smaller mean weight they agree on no speed, as beyond a bend that the estimated position has not reached.
 MOTION_FIT: Final = 0.6
 MOTION_FIT_S: Final = 2.0
 #: A lateral map displacement, estimated by the sub-filter for a wrong map, is significant beyond this many of its
@@ -219,5 +219,5 @@ PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
 #: The risk of a satellite pair below this fraction of the total is subtracted instead of adding a term for it.
 PAIR_SHARE: Final = 1e-3
-PAIR_LEFT: Final = 1e-3  #: With less of the position information left without a pair, nothing bounds the position.
+PAIR_LEFT: Final = 1e-3  #: Least part of the position information without a pair that bounds the position.
 AHEAD: Final = 0.3  #: Smallest component of the line of sight along the track for a satellite ahead or behind.

@@ -132,16 +132,16 @@ def _write_codes(
         channel = given.channel[t, k]
         along, right, up = -geometry.along[k, 0], -geometry.along[k, 1], -geometry.along[k, 2]
         sigma = channel.code_sigma_m
-        offset, satellite = ix.OFFSETS + channel.clock, ix.SATELLITES + channel.satellite
+        offset, code_error = ix.OFFSETS + channel.clock, ix.SATELLITES + channel.satellite
         unknown[j, 0], coefficient[j, 0] = ix.ARC, along
         unknown[j, 1], coefficient[j, 1] = ix.SLOW_CODE, along
         unknown[j, 2], coefficient[j, 2] = ix.MAP_RIGHT, right
         unknown[j, 3], coefficient[j, 3] = ix.MAP_UP, up
         unknown[j, 4], coefficient[j, 4] = offset, 1.0
-        unknown[j, 5], coefficient[j, 5] = satellite, sigma
+        unknown[j, 5], coefficient[j, 5] = code_error, sigma
         unknown[j, ix.CLOCK_TERM], coefficient[j, ix.CLOCK_TERM] = ix.CODE_CLOCK, 1.0
         predicted = along * (moved + x[ix.SLOW_CODE]) + right * x[ix.MAP_RIGHT] + up * x[ix.MAP_UP]
-        predicted += x[offset] + x[ix.CODE_CLOCK] + sigma * x[satellite]
+        predicted += x[offset] + x[ix.CODE_CLOCK] + sigma * x[code_error]
         equations.value[j] = channel.measured[ix.CODE] - geometry.distance[k] - predicted
 
 

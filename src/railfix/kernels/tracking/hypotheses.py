@@ -33,7 +33,7 @@ def reweigh(
     """Update the branch probabilities, and their part due to codes, by the evidence of motion and codes.
 
     The bounds of both are in docs/filter-equations.md. Branches within the map error have the same range difference at
-    every epoch. Errors of the motion are correlated over seconds, so that a second counts once at any epoch rate. All
+    every epoch. Errors of the motion are correlated over seconds, so that one second counts once at any rate. All
     satellites on one side of a street share code errors for minutes. For laps within `ALIKE` times map_branch_m the
     recent evidence of codes is kept as `log_recent`; only `find_leading` uses it.
 

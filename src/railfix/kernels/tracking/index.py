@@ -60,7 +60,7 @@ ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0,
 #: Bits of the reasons for a position search before an epoch: the track is lost, there were no measurements for a long
 #: time, or motion contradicts the position.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
-#: Flags of the first epoch of a call: predicted with the position search done; the same after a loss of track.
+#: Flags of the first epoch of a call: predicted, with the position search done; the same after a loss of track.
 NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 
@@ -79,12 +79,12 @@ class TrackStatus(IntEnum):
     EXPIRED = 4
     #: No position: no epoch so far had two codes more than unknowns.
     NOT_STARTED = 5
-    #: No position: every position for 10 s contradicted the line.
+    #: No position: all positions of the last 10 s contradicted the line.
     OFF_MAP = 6
     #: One position, but 3-D positions of the last minutes are beside or above the line, or another track of the network
     #: is more probable than `track_risk`.
     MAP_OFFSET = 7
-    #: One position, but within the last 20 s its distance from the other antenna's was wrong by more than 5 m, or their
+    #: One position, but within the last 20 s its distance from the other antenna was wrong by more than 5 m, or their
     #: speeds differed by more than 1.5 m/s, and by more than four standard deviations.
     ANTENNAS_DISAGREE = 8
     #: One position, but measurements, the velocity or a sub-filter contradict it: its error is not bounded.

@@ -39,7 +39,7 @@ EPOCH: Final = record_of({
 })  # fmt: skip
 #: One channel at one epoch: measurements of one satellite.
 CHANNEL: Final = record_of({
-    "satellite": np.intp,  # index of its code error in the state; -1 if never measured
+    "satellite": np.intp,  # index of the satellite, its code error and its sub-filter; -1 if never measured
     "clock": np.intp,  # index of its code clock in `CLOCKS`
     "sat_ecef_m": (float, (3,)),  # at the time of transmission [m]
     "sat_velocity_mps": (float, (3,)),  # [m/s]

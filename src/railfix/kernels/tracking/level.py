@@ -107,8 +107,8 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
     """Return the positions without both satellites of a pair, and the risk used by pairs that need no term.
 
     Information is additive; the standard deviation is mostly within a tenth of the value from a filter without both,
-    with few satellites down to half of it. Pairs need no term if they require less than the level so far, or if nothing
-    bounds the position without them.
+    with few satellites down to half of it. Pairs need no term if they require a lower level than the one so far, or if
+    nothing bounds the position without them.
     """
     source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
     most = satellites * (satellites - 1) // 2
@@ -133,7 +133,7 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
                 spent += prior
                 continue
             distance = abs(weighted_separation[i] - whole_separation + weighted_separation[j]) / remaining
-            tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # less on the far side
+            tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # the far tail is smaller
             if tail < constants.PAIR_SHARE * risk:
                 spent += tail
                 continue

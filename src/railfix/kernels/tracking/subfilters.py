@@ -71,7 +71,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 
     Each has its own equations, because the line may bend between its position and the filter's. If its own measurements
     contradict it, it restarts. The filter itself is the sub-filter of a source that it has not absorbed. If all
-    restart, a sub-filter with all satellites in view does too, for the pairs, until it equals the filter.
+    restart, so does a sub-filter with all satellites in view, which serves satellite pairs until it equals the filter.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_other(state, ix.ALL_IN_VIEW)
@@ -86,13 +86,13 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     sign = find_wheel_sign(best.x_prior, state.monitors[0].direction)
     for b in range(len(source)):
         one = source[b]
-        satellite = b < satellites
-        if leading != 0 or (satellite and not given.within_memory[t, b]):
+        is_satellite = b < satellites
+        if leading != 0 or (is_satellite and not given.within_memory[t, b]):
             one.running = False
         if one.running and one.contradicted_s >= constants.LOST_MOTION_S:
             one.running, absorbed[b] = False, True
         x, P = state.x[first + b], state.P[first + b]
-        fresh = satellite and before and needed[b] and not one.running and not absorbed[b] and one.prior > 0.0
+        fresh = is_satellite and before and needed[b] and not one.running and not absorbed[b] and one.prior > 0.0
         if fresh and source[all_in_view].running:
             x[:], P[:] = state.x[first + all_in_view], state.P[first + all_in_view]
             one.running, one.contradicted_s = True, 0.0
@@ -101,7 +101,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
             if b == find_other(state, ix.WRONG_MAP):
                 rotate_map_error(given, x, P)
             add_bend(given, at, P)
-            if (satellite or b == all_in_view) and not needed[b] and _has_joined(x, P, best):
+            if (is_satellite or b == all_in_view) and not needed[b] and _has_joined(x, P, best):
                 one.running = False
                 continue
         elif needed[b] and (one.prior > 0.0 or b == all_in_view):
@@ -174,7 +174,7 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
 
 @inner
 def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
-    """Return the variances of the measurements for a sub-filter, infinite for those of its source, shape (M,).
+    """Return the variances of the measurements for a sub-filter, infinite for measurements of its source, shape (M,).
 
     The Gaussian itself is not changed: a measurement of infinite variance is not used. `equations` belong to the
     leading hypothesis; the sign of their arc-length coefficients distinguishes satellites ahead from satellites behind.

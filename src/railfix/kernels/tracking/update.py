@@ -2,7 +2,7 @@
 
 The measurements depend on a Gaussian N(x, P) through the quantities ``q = H x`` of docs/filter-equations.md. Rounds of
 reweighting correct the Gaussian of the quantities, N(0, H P H'), instead of the state; all phases and Dopplers are
-compressed to six rows; and one measurement after the other is a division, so that no matrix is inverted.
+compressed to six rows; each measurement in turn is one division, so that no matrix is inverted.
 
 Named tuples of array views belong to one Gaussian: `Equations` has the measurements, `Fit` the results.
 """
@@ -176,7 +176,7 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the initial weights from the innovations, of GNSS less the median of their kind.
+    """Write the initial weights from the innovations; those of GNSS are less the median of their kind.
 
     Their variances are without the clocks, whose prior would hide every outlier.
     """
@@ -344,7 +344,7 @@ def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
 def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, float]:
     """Return the mean weights of codes that are not left out, and of phases and Dopplers; NaN without any.
 
-    Only measurements of finite variance count.
+    Only measurements of finite variance are included.
     """
     code, motion, codes, motions = 0.0, 0.0, 0, 0
     for j in range(rows.doppler.stop):
