@@ -1,15 +1,14 @@
-"""A release can be checked: its commit, two builds with one hash, its list of components."""
+"""A release can be checked: its commit, and two builds with one hash."""
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 import runpy
 import shutil
 import subprocess
 import sys
-from importlib.metadata import distribution, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,8 @@ from packaging.requirements import Requirement
 from conftest import ROOT
 from public_names import KEPT, public_names
 from python_matrix import PROJECT, interpreter, supported_versions
-from railfix.core.files import file_sha256, read_commit
+from railfix.core.files import read_commit
 from reproducible_build import built_twice
-from sbom import bill_of_materials
 
 
 def git(folder: Path, *words: str) -> str:
@@ -104,46 +102,6 @@ def test_two_builds_have_one_hash_and_know_their_commit(tmp_path: Path) -> None:
     said = subprocess.run(command, cwd=tmp_path, env=surroundings, capture_output=True, text=True, check=True).stdout
     changed = "+changed" if git(ROOT, "status", "--porcelain") else ""
     assert said == f"railfix {version('railfix')} (commit {git(ROOT, 'rev-parse', 'HEAD')}{changed})\n"
-
-
-def check(listed: dict[str, Any]) -> str:
-    """What the validator of CycloneDX says, "" where nothing is wrong."""
-    validators = pytest.importorskip("cyclonedx.validation.json")
-    schema = pytest.importorskip("cyclonedx.schema").SchemaVersion
-    return str(validators.JsonStrictValidator(schema.V1_6).validate_str(json.dumps(listed)) or "")
-
-
-@pytest.mark.slow
-def test_the_list_of_components_is_valid_and_the_same_each_time() -> None:
-    listed = bill_of_materials()
-    assert check(listed) == ""
-    assert listed == bill_of_materials()
-    broken = copy.deepcopy(listed)
-    del broken["components"][0]["name"]
-    assert "name" in check(broken)
-
-
-def test_the_list_has_what_is_installed_and_all_of_it() -> None:
-    wheel = ROOT / "pyproject.toml"
-    listed = bill_of_materials(["maps"], wheel)
-    entries = {entry["name"]: entry for entry in listed["components"]}
-    asked = [Requirement(text) for text in distribution("railfix").requires or []]
-    direct = {r.name.lower() for r in asked if r.marker is None or r.marker.evaluate({"extra": "maps"})}
-    assert {"numba", "rasterio"} <= direct <= set(entries)
-    assert not {"pytest", "sphinx", "starlette", "railfix"} & set(entries)
-    assert entries["llvmlite"]["version"] == version("llvmlite")  # asked for by numba alone
-    assert all(entry["purl"] == f"pkg:pypi/{name}@{version(name)}" for name, entry in entries.items())
-    depends = {item["ref"]: item["dependsOn"] for item in listed["dependencies"]}
-    railfix = listed["metadata"]["component"]
-    assert set(depends[railfix["purl"]]) == {entries[name]["purl"] for name in direct}
-    assert set(depends) == {entry["purl"] for entry in [railfix, *entries.values()]}
-    reached, waiting = set(), [railfix["purl"]]
-    while waiting:
-        reached.add(name := waiting.pop())
-        waiting += set(depends[name]) - reached
-    assert reached == set(depends)
-    assert railfix["hashes"] == [{"alg": "SHA-256", "content": file_sha256(wheel)}]
-    assert all(entry["licenses"] for entry in listed["components"])
 
 
 def test_a_public_name_that_is_gone_is_in_the_changes() -> None:
