@@ -210,7 +210,7 @@ def test_phases_of_one_frequency_are_refused() -> None:
 
 def test_a_base_station_of_one_frequency_is_refused() -> None:
     config = parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
-    with pytest.raises(SettingsError, match="a base station has codes of one; leave one of the two out"):
+    with pytest.raises(SettingsError, match="a base station corrects single-frequency codes; leave out SBAS"):
         BaseStation(config, "stream")
 
 

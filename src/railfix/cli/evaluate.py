@@ -308,7 +308,7 @@ def cn0_curve(
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Position of the antenna, in degrees and metres, within some kilometres; by default from the header.",
+            help="Position of the antenna to some kilometres, in degrees and metres; by default the header's.",
         ),
     ] = None,
     bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,

@@ -51,8 +51,8 @@ def service(
     """Report by chainage where satellites serve a line: satellites in view, reflections, fraction of ok epochs,
     protection levels.
 
-    Reflections show in the distance of the 3-D position, which does not use the map, from the line. Several runs at
-    different times of the day are more representative than one.
+    Reflections are visible in the distance from the line to the 3-D position, which is computed without the map.
+    Several runs at different times of the day are more representative than one.
 
     Example: `railfix map service monday-results tuesday-results --out service.csv --page service.html`
 

@@ -36,7 +36,7 @@ class Checked(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
-    if not TYPE_CHECKING:  # checkers see the settings
+    if not TYPE_CHECKING:  # type checkers use the signature that follows from the fields
 
         def __init__(self, **values: Any) -> None:
             try:

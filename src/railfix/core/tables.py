@@ -56,7 +56,7 @@ signed: Final = partial(number, sign="+")
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table whose first column names the rows; a page offers it as a CSV file of this name."""
+    """Table whose first column names the rows; a page has a link to it as a CSV file of this name."""
 
     kind: ClassVar[str] = "table"
     name: str

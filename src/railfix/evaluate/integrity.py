@@ -58,7 +58,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "unavailable_misleading": "AL < level < error",
     "unjudged": "a position, but no reference accurate enough",
     "no_position": "neither position nor level",
-    "available": "levels within AL, with or without an error",
+    "available": "epochs with a level within AL, whether or not the error is known",
     "availability": "available / epochs",
     "availability_of_observed": "fraction of `observed` with a level within the limit",
     "beyond": "errors above their level; the same at every AL",

@@ -148,7 +148,7 @@ class TrainRecord:
 
 
 class Rejection(Enum):
-    """Reason why a report changes nothing."""
+    """Reason for rejecting a report."""
 
     UNKNOWN_TRAIN = "of a train that is not supervised"
     OTHER_TRAIN = "of another train"

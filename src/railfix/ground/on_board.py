@@ -225,7 +225,7 @@ class OnBoard:
     def supervised(self, now_s: float | None = None) -> Supervised | None:
         """Return the permitted speeds of the train, None before its first position.
 
-        Its position is extrapolated from the newest, where the instants of both are known.
+        The front end is extrapolated from the newest position to `now_s`, where both instants are known.
         """
         if (motion := self._motion) is None:
             return None

@@ -156,8 +156,8 @@ class Interlocking:
     points: Mapping[PointName, PointState]
     stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
     granted: int = 0  #: Number of the last authorities that were sent.
-    #: Last number before this start by the database, and first number of this start; numbers between belong to a newer
-    #: database.
+    #: Last number before this start, according to the stored database, and first number of this start; numbers between
+    #: them were issued from a newer database.
     skipped: tuple[int, int] = (0, 0)
     #: Sections (`Layout.sections`) that no authority reaches into, each with its reason: `railfix.ground.stops.BARS`.
     bars: frozenset[tuple[str, str]] = frozenset()

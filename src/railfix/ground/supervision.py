@@ -153,8 +153,8 @@ class Supervision:
     def has_lapsed(self, train: int, now_s: float) -> bool:
         """Return whether every authority by which a train may run has lapsed on board.
 
-        Each authority answers a report that arrived before it was sent, so that its age is counted from its sending at
-        the latest.
+        An authority answers a report that arrived before the authority was sent, so that on board its age is counted
+        from an instant no later than its sending.
         """
         record = self.records.get(train)
         counted_s = math.inf if record is None or record.counted_s is None else record.counted_s
@@ -352,7 +352,7 @@ def is_obeyed(message: TrainMessage, number: int) -> bool:
 
 
 def counts(reason: Rejection | None) -> bool:
-    """Return whether a report is accepted, by the reason of its rejection."""
+    """Return whether a report is accepted: there is no reason for rejecting it."""
     return reason is None
 
 

@@ -18,7 +18,7 @@ RETRY_S: Final = 1.0
 
 
 class ThreadWriter:
-    """Executor of commits in a separate thread, which does not keep the process from ending.
+    """Executor of commits in a daemon thread: the process can end while it runs.
 
     `done` is called in that thread after each function.
     """

@@ -71,8 +71,8 @@ class BaseStation:
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
         if config.dual_frequency_sbas:
             raise SettingsError(
-                "SBAS on L5 corrects codes of two frequencies, but a base station has codes of one; "
-                "leave one of the two out, or set sbas_band = L1"
+                "SBAS on L5 corrects dual-frequency codes, but a base station corrects single-frequency codes; "
+                "leave out SBAS or the base station, or set sbas_band = L1"
             )
         self._config = config.replaced(frequencies="one")
         self._ecef_m = None if isinstance(ecef_m, str) else np.asarray(ecef_m, dtype=np.float64)

@@ -169,7 +169,7 @@ def feature_fixes(
     *,
     noise: tuple[float, float],
 ) -> tuple[list[FeatureFix], FeatureState]:
-    """Return verdicts on the passed features, and the state for the next chunk.
+    """Return verdicts on the features that the train has passed, and the state for the next chunk.
 
     A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without slip and faster
     than 1 m/s are used: heading and pitch are integrals, which a break restarts. `facing` is 1 if the front points to

@@ -81,7 +81,10 @@ def level_facts(config: Config) -> dict[str, Any]:
     if config.protection == "off":
         return {}
     risk = get_risk_budget(config)
-    sigmas = "noise settings times the receiver's estimated scale, at least 1: the tails are not bounded"
+    sigmas = (
+        "noise settings, multiplied by the receiver's estimated noise scale of at least 1; "
+        "the tails of the range errors are not bounded"
+    )
     return {
         "kind": choose_kind(config),
         "basis": choose_basis(config),

@@ -56,8 +56,8 @@ def check_observables(
 ) -> tuple[CorrectedRanges, list[str], ObservableState]:
     """Return the ranges of one antenna without Dopplers and phases of wrong sign or unit, and one sentence on each.
 
-    A factor is valid until its constellation's next factor; before the first one, the factor of all constellations is
-    used.
+    The ratio of observed to computed values of a constellation is used until its next ratio is estimated; before its
+    first estimate, the ratio over all constellations is used.
     """
     second = corrected.time.astype("datetime64[s]")
     chosen = np.diff(second, prepend=np.array([state.time], dtype=second.dtype)) != np.timedelta64(0, "s")

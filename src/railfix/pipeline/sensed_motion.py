@@ -72,11 +72,11 @@ class SensedMotion:
     doubt_mps: Floats  #: Largest speed of a slip not yet detected, shape (T,).
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Properties of the line under the body, toward rising arc length (P2 2.3): gradient by wheel and accelerometer (an
-    #: offset of 0.01 m/s2 is 0.001); curvature by the yaw rate, positive to the right; cant by the roll of the body
-    #: over the wheels' contact points, positive with the left rail higher; and chainage of the body's middle. They are
-    #: NaN unless the wheel rolls without slip and faster than `SLOWEST_MPS`; cant is also NaN without a vehicle; shape
-    #: (T,).
+    #: Properties of the line under the body, toward rising arc length (P2 2.3): gradient from wheel and accelerometer
+    #: (an offset of 0.01 m/s2 causes an error of 0.001); curvature from the yaw rate, positive to the right; cant over
+    #: the wheels' contact points from the roll of the body, positive with the left rail higher; and chainage of the
+    #: body's middle. They are NaN unless the wheel rolls without slip and faster than `SLOWEST_MPS`; cant is also NaN
+    #: without a vehicle; shape (T,).
     gradient: Floats
     curvature_1pm: Floats
     cant_m: Floats

@@ -190,7 +190,7 @@ def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
 def usable_ranges(
     states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
 ) -> Ranges:
-    """Return ranges to be fitted: those with a reason, or without a number, have weight 0 and finite values."""
+    """Return the ranges for the fit: those with a rejection reason, or NaN, have weight 0 and finite filler values."""
     used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
     return Ranges(
         sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, FILLER_SATELLITE_M)),

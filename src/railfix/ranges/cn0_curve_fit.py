@@ -64,8 +64,8 @@ def fit_cn0_curve(
 ) -> Cn0Curve:
     """Fit the mean C/N0 over elevation, one curve per kind and signal with enough bins.
 
-    `samples` are collected ones, or C/N0 (T, M), elevation (T, M), satellite and signal (M,), from a position with open
-    sky. ValueError: no kind and signal has enough samples.
+    `samples` is a `Cn0Samples`, or pieces of C/N0 (T, M), elevation (T, M), satellite and signal (M,), of an antenna
+    with open sky. ValueError: no kind and signal has enough samples.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):

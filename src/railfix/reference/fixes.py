@@ -81,7 +81,7 @@ class ReferenceSettings(Settings):
     )
     wheel_scale: float = _positive(0.01)  #: Relative standard deviation of that distance.
     slip_m: float = _positive(0.005)  #: Random error of the wheel's distance [m per square root of m].
-    #: Noise of the accelerometer, and standard deviation of its offset [m/s2 per square root of Hz] [m/s2].
+    #: Noise density of the accelerometer [m/s2 per square root of Hz].
     acceleration_mps2: float = _positive(0.02)
 
 

@@ -36,9 +36,9 @@ class Wheel:
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
         """Compute the cumulated distance along rising chainage at instants, shape (N,) [m].
 
-        `speed_hint_mps`, from another source, gives the direction of unsigned pulses; it changes at the longest
-        standstill. NaN where the table has no reading, and where the direction is undetermined because of a reversal
-        without a stop.
+        `speed_hint_mps`, from another source, gives the direction of unsigned pulses; between hints of opposite
+        directions, the direction changes at the longest standstill. NaN where the table has no reading, and where the
+        direction is undetermined because of a reversal without a stop.
         """
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)

@@ -118,7 +118,7 @@ def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed
     ]
     if not counts:
         return f"95 % of errors within {number(passed.get('normalised_p95'), 1)} sigma"
-    return "usable errors above their level: " + ", filtered ".join(f"{count:,}" for count in counts)
+    return "errors above the level, at usable positions: " + ", filtered ".join(f"{count:,}" for count in counts)
 
 
 def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:

@@ -65,7 +65,7 @@ class ReportedRun:
     notes: tuple[str, ...]
 
     def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
-        """Return the name of one of its tables of positions in the tables of an evaluation; empty if absent."""
+        """Return the name that an evaluation gives to a position table of this run; empty if it has no such table."""
         mine = (run for run in evaluation.runs if run.path.resolve() == self.folder.path.resolve())
         return next((run.name for run in mine if run.table == table), "")
 

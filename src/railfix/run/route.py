@@ -317,7 +317,7 @@ class LogPositions:
     parts: Callable[[], Iterable[Observations]]  #: The pieces of the log in order of time.
     navigation: Navigation
     config: Config
-    time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
+    time: np.datetime64 | None  #: Epoch of the transformation between frames; None without a navigation record.
     reading: TrackReading
     antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
     open_base: Callable[[], BaseObservations | None] = lambda: (

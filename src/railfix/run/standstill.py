@@ -22,7 +22,7 @@ from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.track_choice import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: Minimum fraction of the epochs with a satellite, so that all means are over the same satellites.
+#: Minimum fraction of the epochs in which a satellite has a residual, so that all means are over the same satellites.
 _SHARE: Final = 0.9
 #: Residual standard deviation of satellite and atmospheric errors with a base station [m]; it is at most 10 km away.
 _BESIDE_BASE_M: Final = 0.05

@@ -242,7 +242,10 @@ class WhichTrackOptions(Settings):
         "Weights of the tracks that the interlocking considers possible: T1=0.9,T2=0.1.", None, metavar="NAME=P,..."
     )
     moved: float | None = option(
-        "Distance moved since --last, by cold-movement detection (0: none) or odometer.", None, metavar="M", ge=0
+        "Distance moved since --last, from cold-movement detection (0: none) or odometer.",
+        None,
+        metavar="M",
+        ge=0,
     )
     missed_move: float = option(
         "Probability that the train was moved unnoticed since --last.", 1e-3, metavar="P", gt=0, lt=1

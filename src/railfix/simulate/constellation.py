@@ -35,7 +35,7 @@ _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": 
 
 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
-    """Read the records of satellites with a valid one at every moment of the scenario."""
+    """Read the records of the satellites that have a valid record throughout the scenario."""
     navigation = read_navigation(path)
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
         raise MismatchError(

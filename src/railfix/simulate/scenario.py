@@ -247,8 +247,8 @@ class Scenario(ScenarioSettings):
         reach = max(abs(v) for v in (self.vehicle.front[0], self.vehicle.rear[0], self.vehicle.bogie_distance_m / 2.0))
         if length_m <= 2.0 * margin or margin < reach + 1.0:
             return (
-                f"run.end_margin_m of {margin} m does not keep the vehicle "
-                f"({reach} m either way) on a line of {length_m:g} m"
+                f"run.end_margin_m is {margin} m; expected at least {reach + 1.0:g} m, for the vehicle extends "
+                f"{reach:g} m from its middle, and less than half of the line, which is {length_m:g} m long"
             )
         outside = [item.at_m for item in stations if not margin <= item.at_m <= length_m - margin]
         if outside:

@@ -177,7 +177,7 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
     },
     "wheel_slips": {
         "time_gpst": "ground truth: when the wheel begins to slip or slide, GPS time",
-        "end_gpst": "ground truth: when it rolls again",
+        "end_gpst": "ground truth: when the wheel rolls without slip again, GPS time",
         "ratio": "ground truth: most of (wheel speed - train speed) / train speed, in the middle; negative slides",
     },
     "inertial": {

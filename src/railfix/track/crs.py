@@ -153,7 +153,8 @@ SAME: Final = {
 TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later ones.
 #: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
 WORKING_FRAME: Final = "EPSG:9989"
-#: Usual frames of maps of a region: name, three-dimensional code. Of a point's frames the first is the likeliest.
+#: Usual frames of maps of a region: name, three-dimensional code. Of the frames whose areas contain a point, the first
+#: is the most likely.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",

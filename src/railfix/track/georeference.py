@@ -151,7 +151,7 @@ def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]
 
 
 def _find_chosen(crs: str, box: Box, *, path: str) -> _Chosen:
-    """Return the operation of a map over a box; SettingsError where none exists."""
+    """Return the coordinate operation for the frame of a map over a box; SettingsError where none exists."""
     chosen = _choose_operation(crs, _cells(box))
     if isinstance(chosen, str):
         chosen = _choose_operation(crs, box)

@@ -252,7 +252,9 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 
 
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
-    """Return whether a position far from all tracks is wrong: in `_WRONG_S` positions on both sides are near tracks."""
+    """Return whether a position far from all tracks is wrong: the last position near a track before it, and the first
+    one after it, are at most `_WRONG_S` apart.
+    """
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):
         return np.zeros(len(time), dtype=np.bool_)
@@ -311,7 +313,7 @@ def _residuals(
     spread = np.nanmax(above, axis=1, initial=-np.inf) - np.nanmin(above, axis=1, initial=np.inf)
     counts = not np.isnan(network.height_m).any() and bool((spread > _APART_UP_M).any())
     seconds = np.concatenate([[0.0], np.diff(log.time[given]) / np.timedelta64(1, "s")])
-    # no time, or a decreasing time: rows are in the order of travel
+    # where the time is missing or decreases, rows are in the order of travel, `_STEP_S` apart
     seconds = np.round(np.where(seconds >= 0.0, seconds, _STEP_S), 1).astype(np.float64)
     weight = np.clip(seconds / correlation_s, 1e-3, 1.0)
     weight[0] = 1.0

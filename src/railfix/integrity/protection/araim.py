@@ -85,7 +85,7 @@ class AraimLevels:
 
     #: Levels, NaN without a position, infinite where unchecked faults are likelier than the risk; shape (T, Q).
     level_m: Floats
-    #: Variance of the position with all observations, shape (T, Q).
+    #: Standard deviations of the position with all observations, for integrity and for accuracy; shape (T, Q).
     sigma_int_m: Floats
     sigma_acc_m: Floats
     modes: Integers  #: Number of fault modes, shape (T,).

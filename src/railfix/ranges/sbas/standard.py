@@ -102,7 +102,7 @@ class SbasLimits(Settings):
 
     #: Time-outs: for precision approach (shorter, the default), or for en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
-    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops its sender for 60 s, or has fast corrections.
+    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops use of its GEO for 60 s, or is read as type 2.
     range_rate: Literal["mops", "off"] = "mops"  #: Fast corrections change with their rate (DO-229D, A.4.4.3).
     #: Use of a satellite without degradation data: rejected, or used with the shortest time-out and its sigma increased
     #: by 8 m (DO-229D, J.2.2).

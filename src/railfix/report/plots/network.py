@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 _DRAWN: Final = 200_000
 #: Tracks that are named in the plan at most.
 _NAMED: Final = 400
-#: Margin of the view about a run, of its larger extent and at least [m]; names from a track, of the view's extent.
+#: Margin of the view around a run, as a fraction of its larger extent; smallest margin [m]; distance of a
+#: name from its track, as a fraction of the extent of the view.
 _MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
 #: Positions by the probability of their track: at least this, and the colour.

@@ -10,8 +10,8 @@ In a scenario file::
     to_m = 900.0
     kind = "urban"
 
-or, instead of the sections, ``[environment.shares]``: the fraction of each kind, from which they are drawn for the
-line's length.
+or, instead of the sections, ``[environment.shares]`` with the fraction of the line that each kind has; sections are
+then drawn at random over the length of the line.
 """
 
 from __future__ import annotations

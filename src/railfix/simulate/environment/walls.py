@@ -182,7 +182,7 @@ def second_reflection(
     return np.where(seen, amplitude, 0.0), 2.0 * (near + away) * lateral, growth
 
 
-_LEAST_SIDE: Final = 0.02  #: Least lateral and longitudinal component of a direction that is computed.
+_LEAST_SIDE: Final = 0.02  #: Lower limit of the lateral and longitudinal components of a direction.
 
 
 @dataclass(frozen=True, kw_only=True)
