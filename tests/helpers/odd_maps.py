@@ -329,7 +329,7 @@ CASES: Final[tuple[Odd, ...]] = (
         "station_equation.xml", _landxml("<CoordGeom>", '<StaEquation staAhead="9" staInternal="1"/><CoordGeom>'),
         "refused", "station equations do not rise from the start",
     ),
-    Odd("gap.xml", _landxml("650100</End></Line>", "650090</End></Line>"), "refused", "mend the elements that do not"),
+    Odd("gap.xml", _landxml("650100</End></Line>", "650090</End></Line>"), "refused", "correct the elements"),
     Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves turn to the other side"),
     Odd("unknown_frame.xml", _landxml('"25832"', '"99999999"'), "refused", "'EPSG:99999999' is unknown"),
     Odd("frame_without_grid.xml", _landxml('"25832"', '"4258"'), "refused", "no grid; a design is in one"),

@@ -140,7 +140,7 @@ def test_a_file_that_is_no_state_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     for content in (b"hello", b'{"form": "minutes"}', b"[1]"):
         path.write_bytes(content)
-        with pytest.raises(OutputError, match="is no state file of railfix live, which would overwrite it"):
+        with pytest.raises(OutputError, match="is not a state file of railfix live, which would overwrite it"):
             load_state(path, {})
         assert path.read_bytes() == content
 

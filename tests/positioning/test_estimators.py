@@ -75,7 +75,7 @@ def test_clocks_eliminated_is_clocks_solved_for():
 
 def test_channels_of_one_clock_stand_side_by_side():
     assert clock_groups(list("GGJEE")) == (slice(0, 3), slice(3, 5))
-    with pytest.raises(ValueError, match="side by side"):
+    with pytest.raises(ValueError, match="must be adjacent"):
         clock_groups(list("GEG"))
 
 

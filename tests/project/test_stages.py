@@ -227,9 +227,9 @@ NONSENSE: dict[str, tuple[int, Callable[[Any], Any], str]] = {
     "sigma 0": (2, lambda g: _first(g, 0.0), "sigma_m has 0 m; a standard deviation is positive"),
     "satellites in km": (0, lambda s: s / 1e3, "from the centre of the Earth, expected 20000000 to 60000000 m"),
     "codes in km": (1, lambda c: c / 1e3, "a pseudorange lies between 10000000 and 100000000 m"),
-    "system X": (3, lambda _: ["X"] * 9, "clock names 'X', which is no constellation; known are G"),
-    "system g": (3, lambda _: ["g"] * 9, "clock names 'g', which is no constellation"),
-    "mixed clocks": (3, lambda _: list("GEGGGEEEE"), "side by side"),
+    "system X": (3, lambda _: ["X"] * 9, "clock names 'X', which is not a constellation; known are G"),
+    "system g": (3, lambda _: ["g"] * 9, "clock names 'g', which is not a constellation"),
+    "mixed clocks": (3, lambda _: list("GEGGGEEEE"), "must be adjacent"),
     "clock too short": (3, lambda k: k[:5], "clock names 5 channels, code_m has 9"),
     "one epoch": (1, lambda c: c[0], r"code_m has shape \(9,\), expected \(T, M\)"),
     "objects": (1, lambda c: c.astype(object), "code_m has elements of type object, expected float64"),
@@ -266,7 +266,9 @@ def test_lists_are_arrays_and_systems_are_known() -> None:
     assert np.abs(fix.constrained.arc_m - arc).max() < 3.0
     channels = np.array(["G01", "E05"]), np.array(["1C", "1C"])
     for letter in ("X", "g"):
-        with pytest.raises(ValueError, match=f"systems names '{letter}', which is no constellation; known are G") as e:
+        with pytest.raises(
+            ValueError, match=f"systems names '{letter}', which is not a constellation; known are G"
+        ) as e:
             ranges.select_channels(*channels, systems=(letter,))
         assert f"`{e.value}`".replace("'g'", "'X'") in PAGE
 

@@ -127,7 +127,7 @@ def test_heights_come_from_a_raster(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     track = read_track(path, heights=raster, height_datum="ellipsoidal", sigma_height_m=0.4)
     assert np.abs(track.height_m - (480.0 + 700.0 * (LINE[:, 0] - 11.0))).max() < 0.01
     assert track.sigma_height_m == 0.4
-    assert "those of the ground" in track.provenance.notes[-1]
+    assert "heights of the ground" in track.provenance.notes[-1]
     monkeypatch.setattr("railfix.track.height_source._WINDOW_CELLS", 100)
     windows = read_track(path, heights=raster, height_datum="ellipsoidal", sigma_height_m=0.4)
     assert np.array_equal(windows.height_m, track.height_m)

@@ -11,9 +11,9 @@ code meaning
 2    the command line was misused (unknown option, missing argument)
 3    an input file is missing, unreadable, or not what it should be
 4    a setting is misspelt, out of range, or contradicts another
-5    the inputs are readable but do not match each other (other day, other place)
+5    the inputs are readable but do not match each other (another day, another location)
 6    the track map was checked and has errors
-7    not a single position: none in the results, or none in the inputs that can be used
+7    there is no position: none in the results, or no usable position in the inputs
 8    the output cannot be written
 9    two channels of a live session gave different answers to the same input
 ==== =====================================================================

@@ -152,7 +152,9 @@ def weighted_ranges(
     if len(clock) != code.shape[1]:
         raise ValueError(f"clock names {len(clock)} channels, code_m has {code.shape[1]}")
     if unknown := [str(letter) for letter in clock if str(letter) not in CLOCK_GROUP]:
-        raise ValueError(f"clock names {unknown[0]!r}, which is no constellation; known are {', '.join(CLOCK_GROUP)}")
+        raise ValueError(
+            f"clock names {unknown[0]!r}, which is not a constellation; known are {', '.join(CLOCK_GROUP)}"
+        )
     if (sigma <= 0.0).any():
         raise ValueError(f"sigma_m has {np.nanmin(sigma):g} m; a standard deviation is positive, NaN where unknown")
     used = np.isfinite(code) & np.isfinite(sigma) & np.isfinite(satellite).all(axis=-1)

@@ -185,8 +185,8 @@ def write_range_rate(channel: Record, point: Floats, u: Floats, per_velocity: Fl
     """Return the satellite's part of the range rate [m/s], and write its gradient with respect to the receiver
     velocity.
 
-    ``rate = (A + g . v) / (1 + A / c)`` with A from the satellite's velocity, u the unit vector to the satellite, and
-    the Earth's rotation in both; `point`, `u` and `per_velocity` have the shape (3,).
+    ``rate = (A + g . v) / (1 + A / c)``: A is the satellite's velocity along u, the unit vector to it; g is -u; both
+    include the Earth's rotation. `per_velocity` is ``g / (1 + A / c)``; it, `point` and `u` have the shape (3,).
     """
     sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
     moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]
