@@ -8,10 +8,19 @@ import numpy as np
 import pytest
 
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.motion.slip import MotionSamples, MotionState, find_slips
+from railfix.motion.slip import MotionSamples, MotionState, find_slips, heading_rate_radps, pitch_rate_radps
 from slip_motion import RATE_HZ, SLIPPING, even_motion, motion
 
 SLIPS = [(70.0 + 40.0 * k, 1.0 + 0.4 * (k % 5), (0.3, -0.3, 0.15, -0.5, 0.8)[k % 5]) for k in range(12)]
+
+
+@pytest.mark.requirement("E1")
+def test_a_body_that_leans_in_a_level_curve_turns_and_does_not_pitch() -> None:
+    lean, turn, speed = 0.15, 0.05, np.array([17.0])
+    rate = turn * np.array([[0.0, np.sin(lean), np.cos(lean)]])
+    force = np.array([[0.0, speed[0] * rate[0, 2] - 9.80665 * np.sin(lean), 0.0]])
+    assert heading_rate_radps(force, rate, speed) == pytest.approx(turn, rel=1e-9)
+    assert pitch_rate_radps(force, rate, speed) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.requirement("E1")

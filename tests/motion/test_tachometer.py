@@ -70,6 +70,8 @@ def test_lost_and_doubled_teeth_are_found() -> None:
     assert 21 in np.flatnonzero(doubled) or 20 in np.flatnonzero(doubled)
     assert not tooth_faults(_pulses(instants))[0].any()
     assert not tooth_faults(_pulses(instants))[1].any()
+    uneven = np.cumsum([0.010] * 8 + [0.026] + [0.016] * 8)  # twice the mean of neighbours that differ by 60 %
+    assert not tooth_faults(_pulses(uneven))[0].any()
 
 
 @pytest.mark.requirement("E2")
