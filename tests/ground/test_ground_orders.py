@@ -507,7 +507,6 @@ def test_no_authority_into_a_section_of_vehicles_that_report_nothing(desk: Desk)
     # train 2 may be in Mid to East: its detection needs no bar; that of West to Mid does
     for name in ("Mid to East", "West to Mid"):
         assert desk.orders["detect-section"]({"section": name, "occupied": True}) is None
-    desk.steps(0.2)
     assert desk.state.bars == {("West to Mid", OCCUPIED)}
     assert desk.orders["detect-section"]({"section": "West to Mid", "occupied": None}) is None
     assert desk.state.bars == {("West to Mid", OCCUPIED), ("West to Mid", UNKNOWN)}

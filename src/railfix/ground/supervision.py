@@ -180,7 +180,11 @@ class Supervision:
         return tuple(points)
 
     def set_section_detected(self, section: str, occupied: bool | None, now_s: float = -math.inf) -> None:
-        """Process the detection of a section; None where it is unknown."""
+        """Process the detection of a section; None where it is unknown.
+
+        An occupied section is compared with the intervals of the trains at once: a wrong report that arrives later can
+        extend an interval into the section, and the occupation would then be attributed to that train.
+        """
         self.detected[section] = occupied
         if section in self.answered_s:
             self.answered_s[section] = now_s
@@ -188,6 +192,8 @@ class Supervision:
         bars = {bar for bar in self.state.bars if bar[0] != section or bar[1] not in cleared}
         unknown = {(section, UNKNOWN)} if occupied is None else set()
         self.state = replace(self.state, bars=frozenset(bars | unknown))
+        if occupied:
+            self.state = occupied_detected(self.state, self.layout, [section])
 
     def set_route(self, train: int, **step: Any) -> str | None:
         """Set a route to the next station; return the reason of a refusal.
