@@ -215,27 +215,7 @@ class LinkProtocol(QuicConnectionProtocol):
             if self.peer is not None and self._quic._datagrams_pending:
                 space = self._quic._spaces[Epoch.ONE_RTT]
                 space.ack_at = None if space.ack_at is None else 0.0
-        self._transmit_task = None
-        for data, addr in self._quic.datagrams_to_send(now=self._loop.time()):
-            cast(asyncio.DatagramTransport, self._transport).sendto(data, addr)
-        self._arm_timer()
-
-    def _arm_timer(self) -> None:
-        """Set the timer of QUIC; one that is set for an earlier instant stays, and is set again when it ends."""
-        due = self._quic.get_timer()
-        if self._timer is not None and (due is None or due < cast(float, self._timer_at)):
-            self._timer.cancel()
-            self._timer = None
-        if self._timer is None and due is not None:
-            self._timer, self._timer_at = self._loop.call_at(due, self._handle_timer), due
-
-    def _handle_timer(self) -> None:
-        due = self._quic.get_timer()
-        if due is not None and self._timer_at is not None and due > self._timer_at:
-            self._timer = None
-            self._arm_timer()
-        elif self._timer_at is not None:
-            super()._handle_timer()
+        super().transmit()
 
     def send(self, data: bytes) -> None:
         """Send a datagram; without a connection it is dropped."""
