@@ -102,13 +102,13 @@ def railfix(
     - 0: done
     - 1: a defect of railfix itself (a traceback is shown)
     - 2: the command line was misused (unknown option, missing argument)
-    - 3: an input file is missing, unreadable, or not what it should be
+    - 3: an input file is missing, unreadable, or malformed
     - 4: a setting is misspelt, out of range, or contradicts another
     - 5: the inputs are readable but do not match each other (another day, another location)
     - 6: the track map was checked and has errors
     - 7: there is no position: none in the results, or no usable position in the inputs
     - 8: the output cannot be written
-    - 9: two channels of a live session gave different answers to the same input
+    - 9: two channels of a live session computed different outputs from the same input
 
     128 plus the number of a signal: the program was ended by that signal (143: SIGTERM; 141: the reader of its output
     ended first).

@@ -1,4 +1,4 @@
-"""Types of the arrays that functions accept and return, by element; dataclasses of arrays."""
+"""Array types by element, and dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -18,31 +18,34 @@ Rows = TypeVar("Rows", bound="DataclassInstance")
 Floats = NDArray[np.float64]  #: Real numbers in the unit at the end of the array's name; NaN where absent.
 Complexes = NDArray[np.complex128]  #: Complex numbers.
 Integers = NDArray[np.int64]  #: Counts and identifiers.
-Indices = NDArray[np.intp]  #: Positions in another array.
+Indices = NDArray[np.intp]  #: Indices into another array.
 Codes = NDArray[np.int8]  #: Members of an `IntEnum`, for example `railfix.core.reasons.Status`.
 Bits = NDArray[np.int64]  #: Members of an `IntFlag`, for example `railfix.core.reasons.Reason`.
 Masks = NDArray[np.bool_]  #: Conditions; True in a reject mask means rejected.
-Datetimes = NDArray[np.datetime64]  #: Instants, GPS time; NaT where absent.
+Datetimes = NDArray[np.datetime64]  #: GPS times; NaT where absent.
 Bytes = NDArray[np.uint8]  #: Raw bytes of a file.
 Strings = NDArray[np.str_]  #: Names, for example of satellites.
 
 
 def copy_with(instance: Instance, **values: Any) -> Instance:
-    """Copy a frozen dataclass with changes, without ``__init__``, ``__post_init__`` and cached properties."""
+    """Copy a frozen dataclass with changed attributes, without calling ``__init__`` and ``__post_init__``.
+
+    Values of cached properties are copied too.
+    """
     copy = object.__new__(type(instance))
     copy.__dict__.update(instance.__dict__, **values)
     return copy
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a read-only view of an array; the caller's own array stays writable."""
+    """Return a read-only view of an array; the array itself stays writable."""
     view = array.view()
     view.flags.writeable = False
     return view
 
 
 def kernel_array(array: NDArray[Any]) -> Floats:
-    """Return a read-only view of numbers in C order: kernels are compiled once for all callers."""
+    """Return a read-only float64 view or copy in C order, so that a kernel is compiled for one array type only."""
     flags = array.flags
     if flags.c_contiguous and not flags.writeable and array.dtype == np.float64:
         return array
@@ -50,7 +53,7 @@ def kernel_array(array: NDArray[Any]) -> Floats:
 
 
 def masked_median(values: Floats, known: Masks) -> Floats:
-    """Return the median of the known values of each row, shape (T,); NaN for a row without any."""
+    """Return the median of the known values of each row, shape (T,); NaN for a row without known values."""
     if not values.shape[1]:
         return np.full(len(values), np.nan)
     ordered, count = np.sort(np.where(known, values, np.inf), axis=1), known.sum(axis=1)
@@ -60,12 +63,15 @@ def masked_median(values: Floats, known: Masks) -> Floats:
 
 
 def freeze_arrays(instance: DataclassInstance) -> None:
-    """Replace the array fields of a dataclass by read-only views; to be called in its `__post_init__`."""
+    """Replace the array fields of a dataclass by read-only views; called in its `__post_init__`."""
     vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})
 
 
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
-    """Freeze the arrays of a dataclass with one row per item; ValueError where one is longer or shorter."""
+    """Freeze the arrays of a dataclass; ValueError if the number of rows of an array differs from that of `first`.
+
+    `of` names the rows in the message.
+    """
     rows = len(vars(instance)[first])
     for name, value in vars(instance).items():
         if isinstance(value, np.ndarray) and len(value) != rows:
@@ -74,7 +80,7 @@ def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> No
 
 
 class FrozenArrays:
-    """Base of dataclasses that freeze their arrays, also in copies and other processes: kernels compile once."""
+    """Base of dataclasses whose arrays are read-only, also after unpickling; see `kernel_array` for the reason."""
 
     def __post_init__(self) -> None:
         freeze_arrays(cast("DataclassInstance", self))
@@ -89,14 +95,15 @@ def _row_arrays(instance: DataclassInstance) -> dict[str, NDArray[Any]]:
 
 
 def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
-    """Return a dataclass with some rows of each of its arrays, and its other fields."""
+    """Return a copy of a dataclass with selected rows of each array; the fields that are not arrays are unchanged."""
     return replace(instance, **{name: value[rows] for name, value in _row_arrays(instance).items()})
 
 
 def join_rows(parts: Sequence[Rows]) -> Rows:
-    """Return a dataclass with the rows of several dataclasses concatenated, and the other fields of the first.
+    """Return a dataclass with the concatenated rows of several dataclasses of one type.
 
-    ValueError: they do not have the same arrays.
+    Fields that are not arrays are taken from the first dataclass. ValueError: the dataclasses differ in which fields
+    are arrays.
     """
     if len(parts) == 1:
         return parts[0]
@@ -107,7 +114,10 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
 
 
 def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
-    """Return a dataclass of arrays with some rows replaced, by index; every field has the rows on axis 0."""
+    """Return a copy of a dataclass of arrays in which the rows at given indices are replaced by those of `part`.
+
+    Every field is an array with the rows on axis 0.
+    """
     values = {}
     for item in fields(result):
         values[item.name] = array = np.array(getattr(result, item.name))
@@ -119,12 +129,12 @@ class RowArrays:
     """Base of dataclasses whose arrays have one row per item of a common axis."""
 
     def take(self, rows: NDArray[Any] | slice) -> Self:
-        """Return selected rows, by mask, index or slice, with the other fields unchanged."""
+        """Return the rows selected by a mask, indices or a slice; fields that are not arrays are unchanged."""
         return take_rows(self, rows)  # type: ignore[type-var]
 
 
 def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
-    """Return the group of each row, given the number of rows of each group, and its index in the group from 0.
+    """Return the group of each row and the index of the row in its group, given the number of rows of each group.
 
     >>> places_in_groups(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
@@ -134,9 +144,10 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
 
 
 def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
-    """Return one choice per layer (dynamic programming) with the least sum of node costs and step costs.
+    """Return the index of one node per layer for which the sum of node and step costs is smallest (Viterbi algorithm).
 
-    `costs` of the choices of a layer, shape (n,); step costs from the previous layer, shape (n, n before).
+    `costs` has the node costs of each layer, shape (n,). `steps` has the step costs to each layer but the first from
+    the layer before it with m nodes, shape (n, m).
     """
     total, came = costs[0], list[Indices]()
     for cost, step in zip(costs[1:], steps, strict=True):
@@ -150,15 +161,16 @@ def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]
 
 
 def channel_sums(values: Floats) -> Floats:
-    """Return sums over the channels, axis 1, in their order, so that channels of zeros leave each sum exactly as it is.
+    """Return sums over the channels, axis 1, added in the order of the channels.
 
-    The sums of a whole log, with the channels of all its epochs, therefore equal the sums of its single epochs.
+    Channels of zeros therefore do not change the rounding of a sum, and an epoch has the same sum whether its chunk has
+    only its own channels or those of the whole log.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
 
 
 def medians(values: Floats) -> Floats:
-    """Return the medians along the last axis, ignoring NaN; NaN where all are NaN."""
+    """Return the medians along the last axis, ignoring NaN; NaN if all values are NaN."""
     *shape, width = values.shape
     if not width:
         return np.full(shape, np.nan)
@@ -170,7 +182,7 @@ def medians(values: Floats) -> Floats:
 
 
 def over_blocks(function: Callable[[Indices], None], blocks: Iterable[Indices]) -> None:
-    """Call a function for blocks of rows, several at a time: kernels and numpy release the interpreter lock."""
+    """Call a function for blocks of rows in parallel threads; kernels and numpy release the interpreter lock."""
     if len(every := list(blocks)) == 1:
         return function(every[0])
     with ThreadPoolExecutor() as threads:

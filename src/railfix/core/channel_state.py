@@ -1,7 +1,7 @@
-"""State per channel across chunks, stored by channel key and age, independent of the channels of a chunk.
+"""State per channel across chunks, independent of the channels of a chunk.
 
-A chunk has the channels that were observed in it: a live epoch may lack a satellite that the previous and the next
-epoch have. A stage with a state per channel operates on the channels of the chunk and of its state.
+A chunk has the channels that were observed in it. A live epoch, for example, may lack a satellite that the previous and
+the next epoch have. A stage with a state per channel therefore processes the channels of both the chunk and the state.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedChannels:
-    """Channels of the chunk, then channels of the states that the chunk lacks; U in total."""
+    """Channels of a chunk, followed by the channels of the states that the chunk lacks; U in total."""
 
     channel: Strings  #: Shape (U,).
     present: int  #: Number of channels of the chunk, which come first.
-    #: Index of each channel in each state, -1 where the state does not have it; shape (U,) each.
+    #: For each state, the index of each channel in that state, shape (U,); -1 if the state lacks the channel.
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
-        """Return values of a state, channels on the last axis, for all channels: `fill` for channels that it lacks."""
+        """Return values of a state, channels on the last axis, for all U channels; `fill` if the state lacks one."""
         place = self.places[state]
         known = place >= 0
         out: NDArray[Value] = np.full((*values.shape[:-1], len(place)), fill, dtype=values.dtype)
@@ -36,7 +36,7 @@ class JoinedChannels:
         return out
 
     def widen(self, values: NDArray[Value], fill: Any) -> NDArray[Value]:
-        """Return values of the chunk, shape (T, K), for all channels, shape (T, U): `fill` where it lacks a channel."""
+        """Extend values of the chunk, shape (T, K), to all channels, shape (T, U), with `fill` in the added columns."""
         if values.shape[1] == len(self.channel):
             return values
         out: NDArray[Value] = np.full((len(values), len(self.channel)), fill, dtype=values.dtype)
@@ -45,9 +45,9 @@ class JoinedChannels:
 
 
 def join_channels(channel: Strings, states: Sequence[Strings], kept: Sequence[Masks | None] = ()) -> JoinedChannels:
-    """Return the channels of a chunk and of states together.
+    """Return the union of the channels of a chunk and of states.
 
-    `kept` marks the channels of each state that are recent enough; None, or nothing, keeps all.
+    `kept` has, for each state, a mask of the channels that are recent enough; None or a missing mask keeps all of them.
     """
     names = channel.tolist()
     place = {name: k for k, name in enumerate(names)}

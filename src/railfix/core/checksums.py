@@ -1,4 +1,4 @@
-"""Checksums of messages: CRC-24Q of RTCM, SBAS and navigation messages."""
+"""CRC-24Q checksums of RTCM, SBAS and navigation messages."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _CRC24: Final = _crc24_table()
 
 
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many ranges of a buffer, from `start` to `end`, shape (N,), byte by byte for all ranges at once."""
+    """Compute the CRC-24Q of N byte ranges of a buffer, from `start` up to but excluding `end`, shape (N,)."""
     crc = np.zeros(len(start), dtype=np.int64)
-    order = np.argsort(start - end, kind="stable")  # longest first: the unfinished ranges are a prefix
+    order = np.argsort(start - end, kind="stable")  # longest first, so that the unfinished ranges are a prefix
     first, length = start[order], (end - start)[order]
     state = np.zeros(len(start), dtype=np.int64)
     running = len(start)

@@ -1,4 +1,4 @@
-"""Physical constants and signal frequencies, each with its unit and source; none is tuned."""
+"""Physical constants and signal frequencies with units and sources, and constants shared by kernels and callers."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ GRAVITY_MPS2: Final = 9.806_65  #: Standard gravity [m/s2] (CGPM 1901).
 
 BDT_MINUS_GPST_S: Final = -14.0  #: BDT - GPST [s]: BeiDou time lags GPS time by a constant (BDS-SIS-ICD-B1I 3.0, 3.3).
 
-#: GPS L1 carrier [Hz], the frequency the Klobuchar model is given for (IS-GPS-200, 20.3.3.5.2.5).
+#: GPS L1 carrier [Hz], to which the delay of the Klobuchar model refers (IS-GPS-200, 20.3.3.5.2.5).
 FREQUENCY_L1: Final = 1_575.42e6
 
 #: Carrier frequency [Hz] by constellation letter and RINEX 3 band digit (RINEX 3.05, tables 4 to 10).
-#: GLONASS bands 1 and 2 are the centre of the FDMA comb; add the channel times `GLONASS_STEP`.
+#: For GLONASS bands 1 and 2 it is the frequency of channel 0; add the channel number times `GLONASS_STEP`.
 CARRIER_FREQUENCY: Final[dict[str, dict[str, float]]] = {
     "G": {"1": 1_575.42e6, "2": 1_227.60e6, "5": 1_176.45e6},
     "J": {"1": 1_575.42e6, "2": 1_227.60e6, "5": 1_176.45e6, "6": 1_278.75e6},
@@ -39,26 +39,27 @@ CARRIER_FREQUENCY: Final[dict[str, dict[str, float]]] = {
     "I": {"1": 1_575.42e6, "5": 1_176.45e6, "9": 2_492.028e6},
 }
 
-#: Frequency step of one GLONASS channel [Hz] by band digit (GLONASS ICD 5.1, 3.3.1.1).
+#: Spacing of the GLONASS FDMA channels [Hz] by band digit (GLONASS ICD 5.1, 3.3.1.1).
 GLONASS_STEP: Final[dict[str, float]] = {"1": 0.5625e6, "2": 0.4375e6}
 
-#: Constellations that share one receiver clock: QZSS time is steered to GPS time (IS-QZSS-PNT, 3.2.1).
+#: Clock group by constellation letter; a group shares one receiver clock, as QZSS with GPS (IS-QZSS-PNT, 3.2.1).
 CLOCK_GROUP: Final[dict[str, str]] = {"G": "G", "J": "G", "E": "E", "C": "C", "R": "R", "S": "G", "I": "I"}
 
 # Constants that kernels and their callers share.
 #: Gradient of the Earth-rotation term of a range with respect to the receiver's position, rounded up (see `geodesy`).
 ROTATION_GRADIENT: Final = 1.1e-5
-#: Children of a stretch of line in the search.
+#: Number of parts into which the section search divides a stretch of line.
 FAN_OUT: Final = 8
-#: Least redundancy number of a range whose error can be estimated.
+#: Smallest redundancy number of a range whose error can be estimated.
 LEAST_REDUNDANCY: Final = 1e-9
-#: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
+#: Cosine of the largest angle to the tangent (6 deg) at which the linear model of the protection level holds.
 ALONG: Final = 0.9945
-#: Distance over which the line is searched first for parts off the tangent [m].
+#: Distance over which the line is first searched for parts that deviate from the tangent [m].
 CLEAR_M: Final = 200.0
-#: Points this near to a tangent are not off it beyond any level [m].
+#: Largest distance from a tangent at which a point counts as lying on the tangent [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Prior of one reflection from a side of the track that the largest data set supports: 2 of 30 943 blocks of 30 s in 70
-#: simulated hours in a city, 95 % (docs/level-results.md); recordings, which are shorter, support 1e-2.
+#: Smallest prior probability of a joint fault of the low satellites on one side of the track that the largest data set
+#: supports: 2 of 30 943 blocks of 30 s in 70 simulated hours in a city, 95 % (docs/level-results.md). The recordings
+#: are shorter and support 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

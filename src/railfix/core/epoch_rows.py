@@ -1,4 +1,4 @@
-"""Rows of dataclasses of arrays: selection of epochs, and concatenation."""
+"""Selection and concatenation of epochs in nested dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from railfix.core.arrays import Indices
 
 Value = TypeVar("Value")
-#: Members that are the same for all rows, because they depend on the channels alone.
+#: Fields without rows, because they depend on the channels only.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
 EVERY: Final = slice(None)  #: All rows.
 
 
 class OnDemand:
-    """Base of dataclasses whose fields are taken at first access, as most are not used for each epoch."""
+    """Base of dataclasses whose fields are evaluated at first access, because few fields are used in each epoch."""
 
     if not TYPE_CHECKING:
 
@@ -29,24 +29,24 @@ class OnDemand:
             return own.setdefault(name, own["_later"](name))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all fields, for another process."""
+        """Return the values of all fields for pickling."""
         return {name: getattr(self, name) for name in _members(cast(Any, type(self)))}
 
 
 @cache
 def _members(kind: Any) -> dict[str, bool]:
-    """Return whether each member of a dataclass has rows, or may have; none for other types."""
+    """Return, for each field of a dataclass, whether it can have rows; an empty dictionary for other types."""
     return {f.name: f.name not in _OF_CHANNELS for f in fields(kind)} if is_dataclass(kind) else {}
 
 
 @cache
 def _defaults(kind: Any) -> tuple[str, ...]:
-    """Return the members of a dataclass that have a default."""
+    """Return the fields of a dataclass that have a default."""
     return tuple(name for name in _members(kind) if hasattr(kind, name))
 
 
 def join_epochs(values: Sequence[Value]) -> Value:
-    """Concatenate arrays, or dataclasses or tuples of them, row by row; other values are taken from the first."""
+    """Concatenate the rows of arrays, or of the arrays in dataclasses or tuples; keep other values of the first."""
     first: Any = values[0]
     if len(values) == 1:
         return values[0]
@@ -68,7 +68,7 @@ def _join(values: Sequence[Any]) -> Any:
 
 
 def take_epochs(value: Value, rows: slice | Indices) -> Value:
-    """Return some rows of an array, or of the arrays of a dataclass and of those within it."""
+    """Return selected rows of an array, or of all arrays in a dataclass and in dataclasses nested in it."""
     return value if rows is EVERY else cast(Value, _take_epochs(value, rows))
 
 
@@ -80,7 +80,7 @@ def _take_epochs(value: Any, rows: slice | Indices) -> Any:
     own, members = value.__dict__, dict[str, Any]()
     if isinstance(value, OnDemand):
         members = {n: item[rows] for n, item in own.items() if item.__class__ is np.ndarray and has_rows[n]}
-        for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field has not been taken yet
+        for name in _defaults(cast(Any, value.__class__)):  # a default would hide that a field is not evaluated yet
             members[name] = _take_epochs(own[name], rows)
         members["_later"] = lambda n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)
         return _make(type(value), members)
@@ -93,7 +93,7 @@ def _take_epochs(value: Any, rows: slice | Indices) -> Any:
 
 
 def _make(kind: Any, members: dict[str, Any]) -> Any:
-    """Return a dataclass with given members, which have been checked before."""
+    """Return a dataclass with given field values, without calling ``__init__``."""
     instance = object.__new__(kind)
     instance.__dict__.update(members)
     return instance

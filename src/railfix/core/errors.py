@@ -1,7 +1,7 @@
 """The errors that railfix raises, and the exit code of the command line for each.
 
-Every message is one sentence: the file (and line or field), the expected content, and the remedy.
-Array functions raise `ValueError` when their contract is violated.
+Every message is one sentence that names the file (and line or field), the expected content, and the remedy.
+Array functions raise `ValueError` when an argument violates their contract.
 
 ==== =====================================================================
 code meaning
@@ -9,13 +9,13 @@ code meaning
 0    done
 1    a defect of railfix itself (a traceback is shown)
 2    the command line was misused (unknown option, missing argument)
-3    an input file is missing, unreadable, or not what it should be
+3    an input file is missing, unreadable, or malformed
 4    a setting is misspelt, out of range, or contradicts another
 5    the inputs are readable but do not match each other (another day, another location)
 6    the track map was checked and has errors
 7    there is no position: none in the results, or no usable position in the inputs
 8    the output cannot be written
-9    two channels of a live session gave different answers to the same input
+9    two channels of a live session computed different outputs from the same input
 ==== =====================================================================
 """
 
@@ -35,11 +35,11 @@ class RailfixError(Exception):
 
 
 class RailfixWarning(UserWarning):
-    """A limitation of a result that the caller may be unaware of: the command line prints it as a note."""
+    """A limitation of a result that the caller may be unaware of; the command line prints it as a note."""
 
 
 def warn_of(notes: Iterable[str]) -> None:
-    """Issue each note once as a `RailfixWarning` at the line that called the caller of this function."""
+    """Issue each distinct note as a `RailfixWarning`, attributed to the line that called this function's caller."""
     for note in dict.fromkeys(notes):
         warnings.warn(note, RailfixWarning, stacklevel=3)
 
@@ -67,7 +67,7 @@ class SettingsError(RailfixError):
     exit_code = 4
 
 
-#: Functions that return an object of a type, by its name.
+#: Name of the function that returns an object of a type, by the name of the type.
 _MAKERS: Final = {
     "Track": "read_track",
     "Trajectory": "antenna_trajectory",
@@ -82,13 +82,13 @@ _MAKERS: Final = {
 
 
 def check_type(value: object, expected: type, what: str) -> None:
-    """Raise SettingsError where an argument is not of the expected type; it names the function for that type."""
+    """Raise SettingsError if the argument `what` is not of the expected type, and name the function that returns it."""
     if not isinstance(value, expected):
         maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")
 
 
-#: Optional packages, and the extra of railfix that installs each.
+#: Extra of railfix that installs each optional package.
 _EXTRAS: Final = {
     **dict.fromkeys(("cbor2", "serial", "h11"), "live"),
     "paho": "mqtt",
@@ -101,7 +101,10 @@ _EXTRAS: Final = {
 
 @contextmanager
 def needs_extra(what: object = "this") -> Iterator[None]:
-    """Raise SettingsError where a package imported inside is not installed; it names `what` needs it, and the extra."""
+    """Raise SettingsError if an optional package imported in the block is not installed.
+
+    The message names `what` needs the package, and the extra of railfix that installs it.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
@@ -113,7 +116,7 @@ def needs_extra(what: object = "this") -> Iterator[None]:
 
 
 class MismatchError(RailfixError):
-    """Inputs are readable but do not match each other (another day, another place)."""
+    """Inputs are readable but do not match each other (another day, another location)."""
 
     exit_code = 5
 
@@ -125,7 +128,7 @@ class MapQualityError(RailfixError):
 
 
 class NoPositionError(RailfixError):
-    """Inputs are readable, but not a single position of them can be used."""
+    """There is no position: none in the results, or no usable position in the inputs."""
 
     exit_code = 7
 
@@ -137,6 +140,6 @@ class OutputError(RailfixError):
 
 
 class ChannelsDisagreeError(RailfixError):
-    """Two channels of a live session gave different answers to the same input."""
+    """Two channels of a live session computed different outputs from the same input."""
 
     exit_code = 9

@@ -1,8 +1,8 @@
-"""Files from receivers and archives: plain, gzip, compress (.Z), bzip2, xz, zstd, zip; Hatanaka; commit of the source.
+"""Reading of plain, compressed (gzip, compress (.Z), bzip2, xz, zstd, zip) and Hatanaka files; commit of the source.
 
-The first bytes of a file determine how it is read, never its name. Memory is bounded: plain and gzip are streamed,
-compress is unpacked to a temporary file by `ncompress`, Hatanaka is piped through ``crx2rnx`` (a packed CRX file by a
-temporary file).
+The first bytes of a file determine how it is read, never its name. Memory is bounded: plain files and most compressed
+files are streamed, a compress file is unpacked to a temporary file by `ncompress`, and Hatanaka data are piped through
+``crx2rnx`` (from a temporary file if the CRX file is compressed).
 """
 
 from __future__ import annotations
@@ -35,22 +35,23 @@ from railfix.core.staged_files import FilePath as FilePath
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
-Reader = Literal["railfix", "georinex"]  #: Program that reads RINEX observation files.
-#: Last clause of the error of a broken line: how to continue.
+Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation files.
+#: Last clause of the message about a broken line: the option with which reading continues.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
-#: Endings of compressed files; the ending before them gives the kind.
+#: Endings of the names of compressed files; the ending before them shows the kind of file.
 _SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
-#: Whole files: text compresses by a factor of 20 to 50; a larger factor is no text, and could fill the memory.
+#: Limits of files that are read as a whole. Text compresses by a factor of 20 to 50; a file with a much larger factor
+#: is not text, and could fill the memory.
 _LARGEST_RATIO: Final = 100
 _LARGEST_BYTES: Final = 64_000_000
 
 
 class ByteStream(io.BufferedIOBase):
-    """Stream of the decompressed bytes of one file; `read` raises `InputFileError` where they end early."""
+    """Stream of the decompressed bytes of a file; `read` raises InputFileError if the data are cut short or damaged."""
 
     def __init__(self, path: FilePath, source: IO[bytes], held: ExitStack, *, disk: IO[bytes] | None = None) -> None:
         self.path = str(path)
@@ -65,11 +66,11 @@ class ByteStream(io.BufferedIOBase):
         return os.lseek(number, 0, os.SEEK_CUR) / max(os.fstat(number).st_size, 1)
 
     def readable(self) -> bool:
-        """Always true."""
+        """Return True."""
         return True
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Up to `size` bytes, all when negative or None; ``b""`` at the end."""
+        """Return up to `size` bytes, or all remaining bytes if it is negative or None; ``b""`` at the end."""
         try:
             return self._source.read(-1 if size is None else size)
         except EOFError as error:
@@ -80,11 +81,11 @@ class ByteStream(io.BufferedIOBase):
             raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
 
     def read1(self, size: int = -1, /) -> bytes:
-        """As `read`."""
+        """Return the same as `read`."""
         return self.read(size)
 
     def close(self) -> None:
-        """Close the file, end the decoder, remove temporary files."""
+        """Close the file, end the decoder, and remove temporary files."""
         if not self.closed:
             self._held.close()
         super().close()
@@ -121,7 +122,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; SettingsError where none is given, or it is not a path."""
+    """Return one or several paths as a list of strings; SettingsError if none is given, or a value is not a path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise SettingsError("no file was given")
@@ -131,10 +132,11 @@ def path_names(paths: Paths) -> list[str]:
 
 
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
-    """Open a file as a stream of its decompressed bytes; with "text" a binary file is an error.
+    """Open a file as a stream of its decompressed bytes.
 
-    Line ends are as in the file; a byte order mark at the beginning of text is left out. InputFileError: the file is
-    missing, a folder, unreadable, empty, binary, an archive of another kind.
+    Line ends are as in the file. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed.
+    InputFileError: the file is missing, a folder, unreadable, empty, an archive of another kind, or, with "text",
+    binary.
     """
     held = ExitStack()
     with held:
@@ -163,7 +165,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             raise InputFileError(path, "is empty")
         if content == "text" and head.startswith(_UTF16):
             source = _as_utf8(path, source, held)
-        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # a power cut leaves them at the end
+        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # zeros at the end are left by a power failure
             raise InputFileError(path, "is binary, a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
@@ -174,9 +176,10 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 
 @contextmanager
 def unpacked_file(path: FilePath) -> Iterator[Path]:
-    """Yield a file on disk with the unpacked content, for programs that open files themselves.
+    """Yield the path of a file with the decompressed content, for programs that open files themselves.
 
-    A file that is not compressed is returned as it is; all files of a zip archive are extracted into one folder.
+    For a file that is not compressed it is the given path. All files of a zip archive are extracted into one folder.
+    The temporary files are removed at the end of the block.
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
@@ -198,9 +201,9 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
 
 
 def read_bytes(path: FilePath) -> bytes:
-    """Read the decompressed content of a small file (navigation, SP3, map); errors as `open_stream`.
+    """Read the decompressed content of a small file (navigation, SP3, map); raises the errors of `open_stream`.
 
-    InputFileError: packed data that become more than `_LARGEST_RATIO` times their size, and more than `_LARGEST_BYTES`.
+    InputFileError: the content exceeds both `_LARGEST_RATIO` times the size of the file and `_LARGEST_BYTES`.
     """
     content = bytearray()
     with open_stream(path) as stream:
@@ -215,7 +218,10 @@ def read_bytes(path: FilePath) -> bytes:
 
 
 def read_text(path: FilePath) -> str:
-    """Read the decompressed content of a small UTF-8 file, without a byte order mark; errors as `open_stream`."""
+    """Read the text of a small UTF-8 file, without a byte order mark; raises the errors of `read_bytes`.
+
+    InputFileError: the content is not UTF-8.
+    """
     content = read_bytes(path)
     try:
         return content.decode("utf-8")
@@ -225,8 +231,7 @@ def read_text(path: FilePath) -> str:
 
 
 def ending(path: FilePath) -> str:
-    """Return the ending of a file name in lower case, ignoring endings of compression; for a zip archive the ending of
-    its file.
+    """Return the lower-case ending of a file name (for a zip archive, of the file in it), ignoring compression.
 
     >>> ending("Line.GeoJSON.gz")
     '.geojson'
@@ -239,7 +244,7 @@ def ending(path: FilePath) -> str:
 
 
 def file_sha256(path: FilePath) -> str:
-    """Return the SHA-256 of a file as hexadecimal digits; InputFileError where it cannot be read."""
+    """Return the SHA-256 of a file as hexadecimal digits; InputFileError if the file cannot be read."""
     try:
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -248,13 +253,16 @@ def file_sha256(path: FilePath) -> str:
 
 
 def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[str, Any]:
-    """Return kind, path (or the `name` to record), size and SHA-256 of a file, as plain values for JSON."""
+    """Return the kind, path (or `name` instead of it), size [byte] and SHA-256 of a file as plain values for JSON."""
     digest = file_sha256(path)
     return {"input": kind, "path": name or str(path), "bytes": Path(path).stat().st_size, "sha256": digest}
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file; `what` names the expected kind, with its article ("the record of a run")."""
+    """Read the object in a JSON file; InputFileError if the file does not contain one.
+
+    `what` names the expected kind of file in messages, with its article ("the record of a run").
+    """
     try:
         content = json.loads(read_text(path))
     except RecursionError:
@@ -267,7 +275,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
 
 
 def read_text_lines(path: FilePath) -> list[str]:
-    """Read the lines of a small, possibly compressed file without line ends, as Latin-1: columns stay columns."""
+    """Read the lines of a small file without line ends, as Latin-1, so that one byte remains one column."""
     lines = [line.removesuffix("\r") for line in read_bytes(path).decode("latin-1").split("\n")]
     return lines if lines[-1] else lines[:-1]
 
@@ -287,7 +295,7 @@ def _open_plain(path: FilePath) -> IO[bytes]:
 
 
 def _as_utf8(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[bytes]:
-    """Return UTF-16 text, as spreadsheets write it, as UTF-8 in a temporary file."""
+    """Convert UTF-16 text, which spreadsheets write, to UTF-8 in a temporary file."""
     with ByteStream(path, source, ExitStack()) as unpacked:
         try:
             text = unpacked.read().decode("utf-16")
@@ -314,20 +322,20 @@ def _unpack_compress(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[b
 
 
 def hatanaka_program(name: str) -> AbstractContextManager[Path]:
-    """Return the path of a program of the package `hatanaka`, in a context in which it exists."""
+    """Return a context manager that yields the path of a program of the package `hatanaka`."""
     file = f"{name}.exe" if sys.platform == "win32" else name
     return importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / file)
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source; it owns the resources in `held` from then on."""
+    """Start the decoder on an open source and return its output as a stream, which takes over the resources `held`."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
         spool.flush()
         source = spool
-    # the decoder inherits the descriptor; `seek` need not move its position within the buffer
+    # the decoder inherits the file descriptor, whose position `source.seek` does not move within its buffer
     os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
     program = held.enter_context(hatanaka_program("crx2rnx"))
@@ -344,16 +352,16 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-#: Written into wheels and source archives by their build (``.ci/hatch_build.py``), never in a checkout.
+#: File with the commit, which the build adds to wheels and source archives (``.ci/hatch_build.py``).
 FROM_BUILD: Final = Path(__file__).parents[1] / "_commit.txt"
 
 
 @cache
 def source_commit() -> str:
-    """Return the commit of the source, "unknown" where neither the build nor a checkout has it.
+    """Return the commit of the source, or "unknown" if neither the build nor a checkout states it.
 
-    "+changed" follows where files were not as committed when the package was built. For a checkout (``pip install -e``)
-    git's files are read; changes since its commit are not detected.
+    "+changed" is appended if the files differed from the commit when the package was built. In a checkout
+    (``pip install -e``) the commit is read from git's files; uncommitted changes are not detected.
     """
     if FROM_BUILD.is_file():
         return FROM_BUILD.read_text(encoding="ascii").strip()
@@ -361,7 +369,7 @@ def source_commit() -> str:
 
 
 def read_commit(root: Path) -> str:
-    """Return the commit that is checked out in a folder (or a further work tree), from git's files; "" without any."""
+    """Read the commit checked out in a folder (also an additional work tree) from git's files; "" if there is none."""
     git = root / ".git"
     if git.is_file():
         git = root / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()

@@ -1,7 +1,6 @@
-"""Frames: ECEF (WGS 84), geodetic, local east-north-up; ranges with the Earth's rotation.
+"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges with the Earth's rotation.
 
-Degrees and metres at the edges, ECEF metres inside. All functions take any leading shape and
-return NaN where an input is NaN.
+Where an input is NaN, the result is NaN.
 """
 
 from __future__ import annotations
@@ -51,7 +50,10 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
 
 
 def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
-    """Compute unit vectors east, north, up in ECEF, rows of (..., 3, 3): ``axes @ (ecef - origin)`` is (e, n, u)."""
+    """Compute the unit vectors east, north and up in ECEF as the rows of (..., 3, 3).
+
+    ``axes @ (ecef - origin)`` is the position relative to an origin in east, north and up.
+    """
     lat = np.radians(np.asarray(latitude_deg, dtype=np.float64))
     lon = np.radians(np.asarray(longitude_deg, dtype=np.float64))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
@@ -63,13 +65,13 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
 
 
 def axes_at(ecef_m: ArrayLike) -> Floats:
-    """Compute `enu_axes` at ECEF positions of shape (..., 3)."""
+    """Compute `enu_axes` at ECEF positions of shape (..., 3) [m]."""
     latitude, longitude, _ = geodetic_from_ecef(ecef_m)
     return enu_axes(latitude, longitude)
 
 
 def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Floats:
-    """Compute the sigma along unit vectors (T, 3) from uncorrelated sigmas east, north and up, at positions (T, 3)."""
+    """Compute the sigma along ECEF unit vectors (T, 3) from uncorrelated sigmas east, north, up at positions (T, 3)."""
     components = np.einsum("tij,tj->ti", axes_at(ecef_m), direction)
     return np.asarray(np.sqrt(np.sum((components * sigma_enu_m) ** 2, axis=1)))
 
@@ -82,22 +84,22 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
 
 
 def compute_angles(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
-    """Compute elevation and azimuth of lines to satellites (T, N, 3) by the `enu_axes` of receivers."""
+    """Compute elevation and azimuth [deg], shape (T, N), from vectors to satellites (T, N, 3) and `enu_axes`."""
     enu = np.matmul(axes, line_ecef_m.swapaxes(1, 2))
     east, north, up = enu[:, 0], enu[:, 1], enu[:, 2]
     azimuth = np.degrees(np.arctan2(east, north))
     azimuth[azimuth < 0.0] += 360.0
-    azimuth[azimuth == 360.0] = 0.0  # a negative angle below the last digit
+    azimuth[azimuth == 360.0] = 0.0  # a tiny negative azimuth is rounded to 360
     return np.degrees(np.arctan2(up, np.sqrt(east * east + north * north))), azimuth
 
 
 def range_with_rotation(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Compute the geometric range with the Sagnac correction, and the line of sight, shapes (...) and (..., 3).
+    """Compute the geometric range with the Sagnac correction [m] and the line of sight, shapes (...) and (..., 3).
 
-    The satellite is in the Earth-fixed frame of its transmit time. To first order, rotating it into the frame of
-    reception adds ``omega / c * (s_x r_y - s_y r_x)`` to the distance (Sagnac; IS-GPS-200, 20.3.3.4.3.4); the neglected
-    terms are below 0.2 mm. The unit vector from receiver to satellite `u` is such that d(range)/d(receiver) = -u (the
-    gradient of the Sagnac term, 6e-6, is neglected).
+    The satellite position `s` is in the Earth-fixed frame at its transmit time. To first order, rotating it into the
+    frame at reception adds ``omega / c * (s_x r_y - s_y r_x)`` to the distance from the receiver position `r` (Sagnac;
+    IS-GPS-200, 20.3.3.4.3.4). The neglected terms are below 0.2 mm. The line of sight `u` is the unit vector from
+    receiver to satellite: d(range)/d(receiver) = -u, with the gradient of the Sagnac term, 6e-6, neglected.
     """
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Objects shown in a notebook, and texts of values."""
+"""HTML for objects in a notebook, and short texts of values."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _MAX_CHARACTERS: Final = 100
 
 
 class NotebookTable:
-    """Base of dataclasses that notebooks show as a table: `repr` as caption, one row per field.
+    """Base of dataclasses that notebooks show as a table with the `repr` as caption and one row per field.
 
-    Classes without a `repr` of their own are dataclasses with ``repr=False``: names of the fields, with shapes.
+    The `repr` defined here, for dataclasses with ``repr=False``, lists the fields and the shapes of arrays.
     """
 
     def __repr__(self) -> str:
@@ -40,25 +40,25 @@ class NotebookTable:
 
 
 def html_table(rows: Sequence[Mapping[str, str]], *, caption: str) -> str:
-    """Return rows of texts as an HTML table, headed by the keys of the first."""
+    """Return rows of texts as an HTML table; the keys of the first row are the header."""
     heads = "".join(f"<th>{escape(name)}</th>" for name in rows[0]) if rows else ""
     body = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row.values())}</tr>" for row in rows)
     return f"<table><caption>{escape(caption)}</caption><tr>{heads}</tr>{body}</table>"
 
 
 def html_list(lines: Sequence[str]) -> str:
-    """Return lines as an HTML list; empty without any."""
+    """Return lines as an HTML list; "" without lines."""
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
 def median_text(values: Floats) -> str:
-    """Return the median of the finite values with two decimals; a dash without any."""
+    """Return the median of the finite values with two decimals; a dash if there is no finite value."""
     finite = values[np.isfinite(values)]
     return f"{np.median(finite):.2f}" if finite.size else "-"
 
 
 def value_text(value: Any) -> str:
-    """Return a value in one line: arrays by shape, type and range, containers by length.
+    """Return a short text of a value: type, shape and range of an array, items or keys of a container.
 
     >>> value_text(np.array([1.0, np.nan, 3.0]))
     'float64 (3), 1 to 3, 33 % NaN'
@@ -74,7 +74,7 @@ def value_text(value: Any) -> str:
 
 
 def time_span_text(time: Datetimes) -> str:
-    """Return the first and last of times in order: ``2024-03-05 03:10:00 to 03:16:40``; empty without any."""
+    """Return the first and last of ascending times, as in ``2024-03-05 03:10:00 to 03:16:40``; "" without times."""
     known = time[~np.isnat(time)]
     if not known.size:
         return ""
@@ -83,7 +83,7 @@ def time_span_text(time: Datetimes) -> str:
 
 
 def plural(number: int | Sized, noun: str) -> str:
-    """Return a count with its noun: ``1 epoch``, ``2,000 epochs``."""
+    """Return a count (or the length of a container) with its noun, as in ``1 epoch`` or ``2,000 epochs``."""
     count = number if isinstance(number, int) else len(number)
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 

@@ -1,4 +1,4 @@
-"""Compression formats, detected by the first bytes of a file: gzip, bzip2, xz, zstd, compress, zip."""
+"""Compressed files, detected by their first bytes: gzip, bzip2, xz, zstd, compress, zip."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ FilePath = str | PathLike[str]
 
 
 def _zstd() -> Any:
-    """Return the zstd module of the standard library (3.14), or its backport."""
+    """Return the zstd module of the standard library (Python 3.14 and newer), or its backport."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
 def damage_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that the readers of packed data raise where the data are damaged."""
+    """Return the errors that decompression raises if the data are damaged."""
     return zlib.error, gzip.BadGzipFile, lzma.LZMAError, zipfile.BadZipFile, _zstd().ZstdError
 
 
 def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
-    """Return an open zip archive; InputFileError where it is damaged."""
+    """Open a zip archive; InputFileError if it is damaged."""
     try:
         return zipfile.ZipFile(source)
     except zipfile.BadZipFile as error:
@@ -38,7 +38,10 @@ def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
 
 
 def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
-    """Return the name of the only file of a zip archive, or of its KML file; InputFileError where there are several."""
+    """Return the name of the file to read in a zip archive: its only file, or its only KML or SHP file.
+
+    InputFileError: there is no such file, or the archive is a document (spreadsheet).
+    """
     names = [
         item.filename
         for item in archive.infolist()

@@ -1,6 +1,6 @@
-"""Rejection reasons of observations and solution status of epochs.
+"""Rejection reasons of observations and solution statuses of epochs.
 
-Each reason is one bit; an observation has the bits of all reasons that apply, 0 if it was used. Each epoch of an
+Each reason is one bit. An observation has the bits of all reasons that apply, or 0 if it was used. Each epoch of an
 antenna has exactly one status.
 """
 
@@ -35,7 +35,7 @@ class Reason(IntFlag):
     UNHEALTHY = 1 << 6
     #: Below the elevation mask.
     ELEVATION_MASK = 1 << 7
-    #: The only usable satellite of its clock group: it determines that clock alone.
+    #: The only usable satellite of its clock group: its range only determines the clock of that group.
     ALONE_ON_ITS_CLOCK = 1 << 8
     #: No group delay of the signal is broadcast, or the satellite is at the horizon.
     NO_CORRECTION = 1 << 9
@@ -47,7 +47,7 @@ class Reason(IntFlag):
     SBAS_TIMED_OUT = 1 << 12
     #: SBAS: do not use, not monitored, UDRE too large, or the GEO sends "do not use" (message type 0).
     SBAS_DO_NOT_USE = 1 << 13
-    #: SBAS: no ionospheric delay at the pierce point; on L5: no second code.
+    #: SBAS: no ionospheric delay at the pierce point, or, for SBAS on L5, no code on the second frequency.
     SBAS_NO_IONOSPHERE = 1 << 14
     #: C/N0 below the absolute limit.
     CN0_FLOOR = 1 << 15
@@ -59,12 +59,12 @@ class Reason(IntFlag):
     ANTENNA_PAIR = 1 << 18
     #: Excluded by RAIM: its estimated range error exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
-    #: Persistent range error: residuals of one sign and size for a minute.
+    #: Persistent range error: the residuals have had the same sign and size for a minute.
     LASTING_ERROR = 1 << 20
-    #: Left out by the setting `exclude`.
+    #: Excluded by the setting `exclude`.
     EXCLUDED_BY_SETTING = 1 << 21
-    #: Off by more than 100 m, where the other ranges agree on a position: its phase and Doppler are still used by the
-    #: filter.
+    #: The range error exceeds 100 m, while the other ranges agree on a position; the filter still uses the channel's
+    #: carrier phase and Doppler.
     GROSS_ERROR = 1 << 22
 
 
@@ -73,8 +73,8 @@ class Status(IntEnum):
 
     #: A position along the line.
     OK = 0
-    #: A position, but another position on the line fits the ranges equally well, or, at the level's risk, one beyond
-    #: the protection level.
+    #: A position, but another position on the line fits the ranges equally well, or the ranges do not exclude, at the
+    #: integrity risk, a position beyond the protection level.
     AMBIGUOUS = 1
     #: A position, but the ranges put it far beyond an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2
@@ -97,20 +97,20 @@ class Status(IntEnum):
     MAP_OFFSET = 10
     #: A position that passed every check, but interference with the signals is suspected: jamming.
     JAMMING_SUSPECTED = 11
-    #: A position, but the signals may be those of a spoofer: nothing bounds its error.
+    #: A position, but the signals may be those of a spoofer: its error has no bound.
     SPOOFING_SUSPECTED = 12
-    #: A position, but clamped to an end of the map: the ranges put it beyond, within their noise.
+    #: A position, but moved to an end of the map: the ranges put it beyond that end, by no more than their noise.
     MAP_END = 13
 
     @property
     def text(self) -> str:
-        """Name as written to files: ``too_few_satellites``."""
+        """Name of the status in lower case, as written to files, for example ``too_few_satellites``."""
         return self.name.lower()
 
 
 #: Statuses of positions that failed a check; `Config.failed_checks` keeps or drops their coordinates.
 CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN, Status.SPOOFING_SUSPECTED)
-#: Statuses with coordinates (those of `CHECK_FAILED` unless they are dropped).
+#: Statuses with coordinates; positions with a status of `CHECK_FAILED` have none if `Config.failed_checks` drops them.
 POSITIONED: Final = (
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, Status.MAP_END,
     *CHECK_FAILED,
@@ -118,13 +118,16 @@ POSITIONED: Final = (
 
 
 _ADDED: dict[str, Reason] = {}  #: Reasons of screens that are added to the package, by name in lower case.
-#: First free bit, and the last one of the tables' 32-bit column.
+#: First bit that no reason uses, and last bit that the 32-bit column of the tables can store.
 _FIRST_FREE_BIT: Final = 23
 _LAST_BIT: Final = 30
 
 
 def screen_reason(name: str) -> Reason:
-    """Return the reason of a screen by its name in lower case; the next free bit where `Reason` does not have it."""
+    """Return the reason of a screen by its lower-case name.
+
+    A name that `Reason` does not have receives the next free bit; ValueError if no bit is left.
+    """
     if name.upper() in Reason.__members__:
         return Reason[name.upper()]
     if name not in _ADDED:
@@ -136,13 +139,13 @@ def screen_reason(name: str) -> Reason:
 
 
 def reason_names() -> dict[int, str]:
-    """Return the name of every reason in lower case by its bit, in order of the bits; `USED` is not among them."""
+    """Return the lower-case name of every reason by its bit, in ascending order of the bits, without `USED`."""
     members = {int(bit): name.lower() for name, bit in Reason.__members__.items() if bit}
     return members | {int(bit): name for name, bit in _ADDED.items()}
 
 
 def reason_text(reason: int) -> str:
-    """Join the names of the bits of one reason by ``+``; ``used`` for 0.
+    """Return the names of the bits of a reason, joined by ``+``; ``used`` for 0.
 
     >>> reason_text(Reason.UNHEALTHY | Reason.ELEVATION_MASK)
     'unhealthy+elevation_mask'
@@ -153,6 +156,6 @@ def reason_text(reason: int) -> str:
 
 
 def first_reason(reasons: ArrayLike) -> Integers:
-    """Return the lowest set bit of each reason: the first stage that rejected the observation."""
+    """Return the lowest set bit of each reason, which is the first reason for rejection; 0 for a used observation."""
     value = np.asarray(reasons, dtype=np.int64)
     return value & -value

@@ -1,4 +1,4 @@
-"""Settings and limits: frozen pydantic models, and model files read from TOML."""
+"""Base classes of settings and messages as frozen pydantic models, and messages for invalid values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.core.notebook import html_table
 
 
 def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
-    """Return unknown names that are close to a known name, each with that name.
+    """Return the unknown names that resemble a known name, as a mapping to the most similar known name.
 
     Examples
     --------
@@ -32,7 +32,7 @@ def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
 
 
 class Checked(BaseModel):
-    """Base of settings and messages: frozen, validated on construction, unknown names rejected."""
+    """Base of settings and messages: frozen models that are validated on construction and reject unknown names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
@@ -44,7 +44,7 @@ class Checked(BaseModel):
             except ValidationError as error:
                 raise SettingsError(f"{type(self).__name__}: {first_fault(type(self), error)}") from None
 
-        __init__.__pydantic_base_init__ = True  # validation of files does without it
+        __init__.__pydantic_base_init__ = True  # pydantic then skips this method when it validates the values of a file
 
         def __setattr__(self, name: str, value: Any) -> None:
             raise SettingsError(
@@ -74,14 +74,14 @@ class Checked(BaseModel):
 
 
 class Settings(Checked):
-    """Base of all settings, which people write in files and on the command line."""
+    """Base of all settings, which users write in files and on the command line."""
 
     @field_validator("*", mode="before")
     @classmethod
     def _as_written(cls, value: Any, info: ValidationInfo) -> Any:
-        """Reject true and false for a number, which pydantic accepts as 1 and 0; accept words or a path for a list.
+        """Reject a truth value for a number, which pydantic accepts as 1 or 0; accept a path or a text for a list.
 
-        Words have commas between them: ``systems=G,E``.
+        The items in a text are separated by commas, as in ``systems=G,E``.
         """
         if not isinstance(value, (bool, str, Path)):
             return value
@@ -95,19 +95,19 @@ class Settings(Checked):
 
 
 class Message(Checked):
-    """Base of messages, which programs exchange by the thousand: one pass over all values instead of one per field."""
+    """Base of messages between programs, validated in one pass over all values because they are numerous."""
 
     _numbers: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Note the fields that are numbers."""
+        """Store the names of the fields that are numbers."""
         cls._numbers = frozenset(name for name, field in cls.model_fields.items() if is_number(field.annotation))
 
     @model_validator(mode="before")
     @classmethod
     def _truth_for_a_number(cls, values: Any) -> Any:
-        """Reject true and false for a number, which pydantic accepts as 1 and 0."""
+        """Reject a truth value for a number, which pydantic accepts as 1 or 0."""
         for name, value in values.items() if isinstance(values, dict) else ():
             if (value is True or value is False) and name in cls._numbers:
                 raise ValueError(f"{name}: a number was expected")
@@ -115,7 +115,7 @@ class Message(Checked):
 
 
 def is_number(kind: Any) -> bool:
-    """Return whether the type of a field is a number, or a number or None, and no truth value."""
+    """Return whether the type of a field allows a number (or a number or None), and no truth value."""
     parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
     return bool not in parts and (int in parts or float in parts)
 
@@ -133,17 +133,17 @@ def option(
     panel: str = "Choices",
     **limits: Any,
 ) -> Any:
-    """Return a field of a `Settings` model that is an option of the command line as well; required without `default`.
+    """Return a field of a `Settings` model that is also an option of the command line; required without a `default`.
 
-    `name` is ``--field-name`` unless given; a field with two words (`Literal`) and a default becomes a switch where it
-    has a name. `panel` is the heading in the help text; `limits` are passed to `pydantic.Field`.
+    The option is called ``--field-name`` unless `name` is given. A field with a `name`, a default and two allowed words
+    (`Literal`) becomes a switch. `panel` is the heading in the help text; `limits` are passed to `pydantic.Field`.
     """
     extra: Any = {"option": name, "metavar": metavar, "panel": panel}
     return Field(default, description=text, json_schema_extra=extra, **limits)
 
 
 def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
-    """Validate plain values as settings; the SettingsError names the `source`: a path, or "--set"."""
+    """Validate plain values as settings; SettingsError names the `source` of an invalid value (a path, or "--set")."""
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
@@ -151,8 +151,8 @@ def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> M
 
 
 def first_fault(model: type[BaseModel], error: ValidationError) -> str:
-    """Return the message for the first fault: the setting, the expected value, the known or intended name."""
-    # a misspelt name is reported before the name that is missing because of it
+    """Return a message on the first fault: the setting with the expected value, or the known and the intended name."""
+    # an unknown name is reported first, because another name may be missing only because it was misspelt
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"] if part != "[key]")
     if first["type"] == "extra_forbidden":
@@ -169,7 +169,7 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> str:
 
 
 def _in_groups(model: type[BaseModel], name: str) -> list[str]:
-    """Return the settings of this name in the groups of a model, dotted; at most one, for a short message."""
+    """Return the dotted setting of this name if exactly one group of a model has it; an empty list otherwise."""
     groups = {key: field.annotation for key, field in model.model_fields.items()}
     found = [
         f"{key}.{name}"
@@ -180,7 +180,7 @@ def _in_groups(model: type[BaseModel], name: str) -> list[str]:
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
-    """Return the names of the settings of the group at a location of a nested model."""
+    """Return the names of the settings in the group at a location of a nested model; empty if it is not a group."""
     kind: Any = model
     for part in location:
         if get_origin(kind) is dict:

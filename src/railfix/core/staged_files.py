@@ -1,4 +1,4 @@
-"""Paths, and atomic writing of files."""
+"""Atomic writing of files, and checks of paths."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ FilePath = str | os.PathLike[str]
 
 
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
-    """Write a text file under a temporary name, then rename it: a failed write leaves no file.
+    """Write a text file under a temporary name and rename it, so that a failed write leaves no partial file.
 
-    `what` is the kind of file, for the OutputError raised where it cannot be written.
+    OutputError: the file cannot be written; `what` names the kind of file in the message.
     """
     with stage_file(path, what=what) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -25,7 +25,10 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 @contextmanager
 def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a temporary path in the folder of a file, which replaces the file if the block ends without error."""
+    """Yield a temporary path in the folder of a file; if the block ends without an error, it replaces the file.
+
+    OutputError: a system error occurred in the block or while replacing the file.
+    """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
@@ -39,7 +42,7 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
         raise write_error(target, error, what=f"the {what} ") from error
 
 
-#: Errors of a full file system, and the remedy.
+#: Remedy for each error number of a full file system.
 _FULL: Final = {
     errno.ENOSPC: "free some space on the disk, or give a folder on another disk",
     errno.EDQUOT: "free some of your quota, or give a folder elsewhere",
@@ -48,12 +51,12 @@ _FULL: Final = {
 
 
 def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
-    """Return the error of a file that cannot be written: the system's reason, and the remedy."""
+    """Return the error for a file that cannot be written, with the system's reason and a remedy."""
     hint = _FULL.get(error.errno or 0, "give a folder that can be written to")
     return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 
 
 def check_path(path: object, *, what: str = "a path") -> None:
-    """Raise SettingsError where a value is not a path; `what` names the expected item."""
+    """Raise SettingsError if a value is not a path; `what` names the expected item in the message."""
     if not isinstance(path, str | os.PathLike):
         raise SettingsError(f"{what} was expected, got {type(path).__name__}")

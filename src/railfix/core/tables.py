@@ -1,4 +1,4 @@
-"""Tables for terminal and HTML, and errors of reading tables."""
+"""Tables for the terminal and HTML pages, and errors of reading table files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from railfix.core.errors import InputFileError
 def reading_table(
     path: str | PathLike[str], message: str = "cannot be read as a table ({}); run railfix run again"
 ) -> Iterator[None]:
-    """Raise errors of reading a table, also of a lazy one, as `InputFileError` with the reason in its message."""
+    """Convert errors of reading a table in the block to `InputFileError`; `message` has ``{}`` for the reason."""
     try:
         yield
     except (PolarsError, PanicException, OSError) as error:
@@ -28,63 +28,63 @@ def reading_table(
 
 
 def number(value: float | None, digits: int = 2, unit: str = "", *, sign: str = "") -> str:
-    """Return a number with thousands separators; an en dash for NaN or None."""
+    """Format a number with thousands separators, `digits` decimals and the unit; an en dash for NaN or None."""
     if value is None or value != value:
         return "–"
     return f"{round(value, digits) + 0.0:{sign},.{digits}f}{unit}".replace("-", "−")
 
 
 def digits(places: int, value: float | None) -> str:
-    """Return a number without separators; blank for None."""
+    """Format a number with `places` decimals and without thousands separators; empty for None."""
     return "" if value is None else f"{value:.{places}f}"
 
 
 def share(part: float | None, digits: int = 2) -> str:
-    """Return a fraction in per cent."""
+    """Format a fraction in per cent; an en dash for NaN or None."""
     return "–" if part is None or part != part else f"{100.0 * part:.{digits}f} %"
 
 
 def percent(part: float | None) -> str:
-    """Return a fraction in per cent, for a column whose header has the sign."""
+    """Format a fraction in per cent without the sign ``%``, for a column whose header has the sign."""
     return share(part).removesuffix(" %")
 
 
-#: A whole number, and a number that always has its sign.
+#: Format a number without decimals, and a number with its sign.
 count: Final = partial(number, digits=0)
 signed: Final = partial(number, sign="+")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Table whose first column names the rows; a page has a link to it as a CSV file of this name."""
+    """Table whose first column names the rows; a page links to the table as a CSV file called `name`."""
 
     kind: ClassVar[str] = "table"
     name: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
-    #: Columns of numbers, of code.
+    #: Indices of the columns with numbers, and of the columns with code.
     numeric: Sequence[int] = ()
     code: Sequence[int] = ()
-    marked: Sequence[int] = ()  #: Highlighted rows.
-    links: Sequence[str] = ()  #: Address of the page on each row, blank without one; empty where no row has one.
-    boxed: bool = False  #: Whether a terminal draws a frame around it.
+    marked: Sequence[int] = ()  #: Indices of the highlighted rows.
+    links: Sequence[str] = ()  #: Address of a page on each row, "" for a row without a page; empty without any page.
+    boxed: bool = False  #: Whether a terminal draws a frame around the table.
 
 
 def plain_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", *, texts: int = 1, boxed: bool = False
 ) -> Table:
-    """Return a table that is printed alone; all columns but the first `texts` are numbers."""
+    """Return a table without a name, for the terminal; all columns but the first `texts` are numbers."""
     return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 
-Column = tuple[str, str, Callable[[Any], str]]  #: Header, source column and format of a table column.
+Column = tuple[str, str, Callable[[Any], str]]  #: Header, column of the frame, and format of a table column.
 
 
 def listing(
     name: str, rows: pl.DataFrame, columns: Sequence[Column], caption: str = "", *, marked: Sequence[int] = ()
 ) -> Table:
-    """Return a table of the rows of a frame; columns of formats other than `str` are numbers."""
+    """Return a table with the rows of a frame; a column whose format is not `str` is a column of numbers."""
     return Table(
         name=name,
         head=[head for head, _, _ in columns],

@@ -1,4 +1,4 @@
-"""Time as ``datetime64[ns]`` in GPS time, the only scale inside, and the conversions to and from it."""
+"""GPS time as ``datetime64[ns]``, the internal time scale, and conversions to and from other time scales."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SECONDS_PER_DAY: Final = 86_400
 _NS: Final = 1_000_000_000
 _NAT: Final = np.iinfo(np.int64).min
 
-#: UTC instants from which GPST - UTC takes a new value [s] (IERS Bulletin C).
+#: UTC instants at which GPST - UTC changes: it is 0 s at the first, and 1 s more at each later one (IERS Bulletin C).
 _LEAP_UTC: Final = np.array(
     [
         "1980-01-06", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01",
@@ -35,7 +35,7 @@ _LEAP_UTC: Final = np.array(
 
 
 def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
-    """Return a GPS time; ValueError where it is no time, or has a time zone, which numpy would convert to UTC."""
+    """Parse a GPS time; ValueError if it is not a time, or has a time zone, which numpy would convert to UTC."""
     text = str(value).strip().replace(" ", "T")
     if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
         raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind it by the leap seconds")
@@ -43,7 +43,7 @@ def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
 
 
 def seconds(delta: ArrayLike) -> Floats:
-    """Convert time differences to seconds; NaN where they are NaT."""
+    """Convert time differences to seconds; NaT becomes NaN."""
     count = np.asarray(delta, dtype="timedelta64[ns]").view(np.int64)
     whole, rest = np.divmod(count, _NS)
     return np.where(count == _NAT, np.nan, whole + rest / _NS)
@@ -82,7 +82,7 @@ def bdt_to_gpst(time: ArrayLike) -> Datetimes:
 
 
 def gpst_minus_utc(utc: ArrayLike) -> Integers:
-    """Look up the leap seconds GPST - UTC [s] in force at UTC instants."""
+    """Return the leap seconds GPST - UTC [s] that are in force at UTC instants."""
     at = np.asarray(utc, dtype="datetime64[ns]")
     return np.asarray(np.searchsorted(_LEAP_UTC, at, side="right") - 1, dtype=np.int64)
 
@@ -95,19 +95,22 @@ def utc_to_gpst(utc: ArrayLike) -> Datetimes:
 
 
 def gps_now_ns() -> int:
-    """Return the computer's clock as GPS time since `GPS_EPOCH` [ns]."""
+    """Return the time of the computer's clock as GPS time since `GPS_EPOCH` [ns]."""
     return int((utc_to_gpst(np.datetime64(clock.time_ns(), "ns")) - GPS_EPOCH).astype(np.int64))
 
 
 def gpst_to_utc(time: ArrayLike) -> Datetimes:
-    """Convert GPS time to UTC; the leap second itself becomes the second after it."""
+    """Convert GPS time to UTC; a time in an inserted leap second becomes the time one second later in UTC's count."""
     at = np.asarray(time, dtype="datetime64[ns]")
     leap = np.searchsorted(utc_to_gpst(_LEAP_UTC), at, side="right") - 1
     return np.asarray(at - leap.astype("timedelta64[s]"), dtype="datetime64[ns]")
 
 
 def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
-    """Return the row of rising times nearest to each requested time, the earlier of two; -1 where none is near."""
+    """Return the index of the nearest of ascending times to each wanted time; -1 if none is within `within_ns` [ns].
+
+    Of two equally near times the earlier one is returned.
+    """
     have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
     if not len(have):
         return np.full(len(want), -1, dtype=np.intp)
@@ -118,7 +121,7 @@ def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indic
 
 
 def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Resolve the day of seconds of day, in any scale: the time nearest to another time of that scale."""
+    """Return the times with given seconds of day [s] nearest to reference times, which are in the same time scale."""
     other = np.asarray(near, dtype="datetime64[ns]")
     same_day = other.astype("datetime64[D]").astype("datetime64[ns]") + timedelta(second_of_day)
     days = np.rint(seconds(other - same_day) / SECONDS_PER_DAY).astype(np.int64)
@@ -126,7 +129,7 @@ def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Resolve the week of seconds of week: the GPS time nearest to another time, known to within half a week."""
+    """Return the GPS times with given seconds of week [s] nearest to reference times, right to within half a week."""
     week, sow = to_week(near)
     shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)
     return from_week(week + shift.astype(np.int64), seconds_of_week)
