@@ -391,8 +391,8 @@ def test_no_sequence_leads_to_an_authority_into_a_train(seeds: Sequence[int]) ->
 
 @pytest.mark.parametrize(
     "seeds",
-    [(0, 1, 2, 100_983), pytest.param(range(20_000), marks=pytest.mark.slow)],
-    ids=["4 sequences", "20,000 sequences"],
+    [(0, 1, 2, 100_983, 301_301), pytest.param(range(20_000), marks=pytest.mark.slow)],
+    ids=["5 sequences", "20,000 sequences"],
 )
 def test_no_sequence_with_changes_of_trains_leads_into_a_train_or_a_vehicle(seeds: Sequence[int]) -> None:
     """Hauled, divided and joined trains, vehicles that report nothing, orders at any moment, older copies."""

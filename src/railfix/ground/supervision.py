@@ -97,10 +97,11 @@ class Supervision:
         if counts(reason):
             if self.state.skipped[1] <= max(message.authority or 0, message.brake_order or 0) <= self.state.granted:
                 self.awaited.discard(number)
-            elapsed_s, clock = self._read_clock(message, before, now_s)
+            elapsed_s, clock, is_new = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
-            if self.state.trains[number].contradiction is None:
-                self._clocks[number] = clock  # the time of a contradicted report would permit longer distances later
+            # the delay of a contradicted report by the same clock would permit longer distances later
+            if is_new or self.state.trains[number].contradiction is None:
+                self._clocks[number] = clock
             self.state = answer_received(self.state, message)
             self.heard.add(number)
         if reason not in (Rejection.REPEATED, Rejection.EARLIER_START, Rejection.FAR_AHEAD):
@@ -121,11 +122,12 @@ class Supervision:
 
     def _read_clock(
         self, message: TrainMessage, record: TrainRecord, now_s: float
-    ) -> tuple[float | None, tuple[float, float]]:
-        """Return the longest time since the train's previous position (None: unknown), and the clock's delay.
+    ) -> tuple[float | None, tuple[float, float], bool]:
+        """Return the longest time since the train's previous position (None: unknown), the clock's delay and its state.
 
         The least delay of earlier reports is used; after an on-board start, whose clock is new, the centre's clock
-        alone.
+        alone. The third value is True for a new clock and for a clock that has been set back: its earlier delays do not
+        apply, because they would lengthen the time since every later position.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -134,11 +136,12 @@ class Supervision:
         before = self._clocks.get(number) if same else None
         if before is None:
             heard = not same and number in self._clocks
-            return (now_s - record.measured_s + tolerance_s if heard else None), (apart_s, now_s)
+            return (now_s - record.measured_s + tolerance_s if heard else None), (apart_s, now_s), True
         least_s = before[0] + CLOCK_DRIFT * (now_s - before[1])
         assert known.measured_ns is not None
         elapsed_s = now_s - least_s + tolerance_s - known.measured_ns / 1e9
-        return elapsed_s, (min(apart_s, least_s), now_s)
+        set_back = message.time_ns < known.measured_ns
+        return elapsed_s, (apart_s if set_back else min(apart_s, least_s), now_s), set_back
 
     @property
     def awaited_text(self) -> str:
