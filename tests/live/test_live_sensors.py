@@ -265,7 +265,9 @@ def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, t
             result = replace(output.result, antennas={"front": later}, fusion={"front": track})
             watch.take(replace(output, result=result))
     (note,) = said
-    assert re.search(r"from .* its speeds are \+[34].\d % off those by satellites, [+-]0.\d % before", note), note
+    assert re.search(r"from .* on, its speeds differ from satellite speeds by \+[34].\d % \([+-]0.\d % before", note), (
+        note
+    )
 
 
 @pytest.fixture

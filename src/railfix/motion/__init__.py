@@ -1,4 +1,4 @@
-"""Motion of the train from its sensors: speeds, slips, features of the line, two-way ranges."""
+"""Motion of the train from on-board sensors: speed, distance, wheel slip, and positions from features of the line."""
 
 import lazy_loader
 

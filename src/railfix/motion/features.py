@@ -1,8 +1,8 @@
-"""Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of a measured feature.
+"""Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of measured features.
 
-P2 uses the points of change, not the values, so that slow biases have no effect. A position is accepted where its
-distance to the earlier features agrees, the other quantity fits, and no other position explains the measurement nearly
-as well.
+P2 uses the positions of changes instead of the values, so that slow sensor biases have no effect. A position is
+accepted if the distance from the last accepted feature agrees, the values of the second quantity agree with the map,
+and no other position fits the measurement nearly as well.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.track.trajectory import Trajectory
 
-#: Quantities of a feature.
+#: Quantity that changes at a feature.
 Quantity = Literal["gradient", "curvature"]
 QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 
-#: Least change: 3 permille, and from straight to a radius of 1000 m.
+#: Smallest change that is a feature: 3 permille, and from straight track to a radius of 1000 m.
 _GRADIENT_CHANGE: Final = 0.003
 _CURVATURE_CHANGE_1PM: Final = 1e-3
-_LIKELIHOOD_RATIO: Final = 1e3  #: Distance of the accepted position to any other position in the window.
-_GAP_SIGMAS: Final = 3.0  #: Disagreement with the distance to the last accepted feature.
-_FIT_LIMIT: Final = 3.0  #: Mean square of the other quantity's residual over its variance.
-SCALE_SIGMA: Final = 2e-3  #: Error of a distance by wheel, as a fraction.
+_LIKELIHOOD_RATIO: Final = 1e3  #: Least likelihood ratio of the accepted position to any other in the window.
+_GAP_SIGMAS: Final = 3.0  #: Largest deviation of the distance from the last accepted feature, in sigmas.
+_FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity, in units of its variance.
+SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
-HALF_LENGTH_M: Final = 60.0  #: Length of line before and behind a feature that is compared.
-#: A change of less than this fraction of another within `HALF_LENGTH_M` is the ripple of a curve through sparse points.
+HALF_LENGTH_M: Final = 60.0  #: Length of line before and after a feature that is compared.
+#: Changes below this fraction of a change within `HALF_LENGTH_M` are ignored: a curve through sparse points ripples.
 _RIPPLE: Final = 0.2
-#: Length over which a change is computed: about the distance of a vehicle's bogies, which smooths shorter changes.
+#: Length over which a change is computed, about the distance between a vehicle's bogies, which smooth shorter changes.
 BASE_M: Final = 15.0
 
 
@@ -40,8 +40,8 @@ class LineSeries:
     """Gradient and curvature along a line, at N points `STEP_M` apart."""
 
     arc_m: Floats  #: Shape (N,).
-    gradient: Floats  #: Climb over horizontal length in rising arc length, shape (N,).
-    curvature_1pm: Floats  #: + to the right in rising arc length, shape (N,).
+    gradient: Floats  #: Height change per horizontal length, in the direction of rising arc length; shape (N,).
+    curvature_1pm: Floats  #: Curvature, positive to the right in the direction of rising arc length; shape (N,).
 
     def of(self, quantity: Quantity) -> Floats:
         """Return the values of one quantity."""
@@ -58,7 +58,7 @@ class Feature:
 
 
 def line_series(trajectory: Trajectory) -> LineSeries:
-    """Return gradient and curvature of a trajectory over chords of `BASE_M`, as for a vehicle on two bogies."""
+    """Compute gradient and curvature of a trajectory over chords of `BASE_M`, as for a vehicle on two bogies."""
     half = 0.5 * BASE_M
     arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)
@@ -71,17 +71,16 @@ def line_series(trajectory: Trajectory) -> LineSeries:
     ahead = flat[1:] / np.linalg.norm(flat[1:], axis=1, keepdims=True)
     behind = flat[:-1] / np.linalg.norm(flat[:-1], axis=1, keepdims=True)
     turn = -(np.cross(behind, ahead) * up[1:]).sum(axis=1) / STEP_M
-    # each change of direction belongs to the middle of its step
+    # the change of direction over a step is valid at the middle of the step
     curvature = np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])
     return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=curvature)
 
 
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
-    """Return the features of a line in order: where gradient or curvature change most within `BASE_M`, the middle of a
-    change that is longer.
+    """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
-    `least`, by quantity, shape (N,), of a measured line: a change must also exceed the root sum of squares of both
-    sides.
+    A feature is at the middle of its change. `least` gives for each quantity of a measured line a lower bound of
+    changes at the points, shape (N,): a change must also exceed the root sum of squares of the bounds at its two ends.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []
@@ -93,7 +92,7 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
             size[size < np.hypot(least[quantity][reach:], least[quantity][:-reach])] = 0.0
         while len(size) and size.max() >= limit:
             k = int(np.argmax(size))
-            # a change that is longer lies in the middle of where it is half as large
+            # the feature is in the middle of the stretch where the change has at least half of its maximum
             less = np.flatnonzero(np.where(change * change[k] > 0.0, size, 0.0) < 0.5 * size[k])
             first, end = int(np.max(less[less < k], initial=-1)) + 1, int(np.min(less[less > k], initial=len(size)))
             arc = 0.5 * float(series.arc_m[first] + series.arc_m[end - 1 + reach])
@@ -109,9 +108,11 @@ class LocatedFeature:
     """Position of a measured series on the line."""
 
     verdict: Literal["accepted", "ambiguous", "none"]
-    arc_m: float  #: Position of the middle of the series; NaN unless accepted.
-    sigma_m: float  #: ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity.
-    reason: str = ""  #: Reason for rejection.
+    arc_m: float  #: Arc length of the middle of the series; NaN unless accepted.
+    #: Standard deviation ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity q; NaN
+    #: without a change that is sharper than the prediction.
+    sigma_m: float
+    reason: str = ""  #: Reason for a rejection.
 
 
 def locate(
@@ -124,23 +125,30 @@ def locate(
     noise: tuple[float, float],
     last: tuple[float, float, float] | None = None,
 ) -> LocatedFeature:
-    """Return the position of a measured stretch by maximum likelihood within four sigmas of the predicted one.
+    """Estimate the position of a measured series by maximum likelihood, within four sigmas of the predicted position.
 
-    A constant offset of the quantity is free: a bias of the sensor does not matter.
+    A constant offset of the quantity is estimated, too, so that a bias of the sensor has no effect.
 
     Parameters
     ----------
     measured : LineSeries
-        Over travelled distance in rising arc length, `arc_m` about the predicted position (0 in its middle).
+        Measured series over the distance travelled, in the direction of rising arc length; `arc_m` is 0 at its middle.
     line : LineSeries
+        Series of the map.
     predicted_m, sigma_m : float [m]
-        A-priori arc length of the middle of the stretch.
+        Predicted arc length of the middle of the series, and its standard deviation.
     quantity : {"gradient", "curvature"}
-        Quantity that is matched; the other quantity must fit there.
+        Quantity that is matched. The second quantity must agree with the map at the estimated position.
     noise : tuple of float
-        Standard deviations of the two quantities in one step.
+        Standard deviations of gradient and curvature at one point of the series.
     last : tuple of float, optional
-        Position of the last accepted feature, its sigma, and the distance by wheel since then [m].
+        Arc length of the last accepted feature, its sigma, and the wheel distance from that feature [m].
+
+    Returns
+    -------
+    LocatedFeature
+        Verdict "ambiguous" if another position fits nearly as well or the best fit is at the edge of the window, "none"
+        if the series has no sharp change or contradicts the second quantity or `last`.
     """
     offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + STEP_M, 0.25 * STEP_M)
     at = predicted_m + offsets[:, None] + measured.arc_m
@@ -179,7 +187,7 @@ def _unplaced(verdict: Literal["ambiguous", "none"], sigma_m: float, reason: str
 
 
 def _vertex(values: Floats, best: int) -> float:
-    """Return the offset in steps of the vertex of the parabola through a maximum and its neighbours."""
+    """Return the offset of the vertex of the parabola through a maximum and its two neighbours, in steps."""
     if best in (0, len(values) - 1):
         return 0.0
     left, middle, right = values[best - 1 : best + 2]

@@ -1,4 +1,4 @@
-"""Alarms for a radar with a scale step or without output, by comparison with satellite (Doppler) speeds."""
+"""Detection of a scale step or missing output of a radar, by comparison with speeds from satellite Dopplers."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.timescale import nearest_rows
 from railfix.motion.samples import RadarSpeeds
 
-#: The ratio is computed over windows of this length [ns] with this many speeds, of a train faster than this [m/s].
-_WINDOW_NS: Final = 30_000_000_000
-_LEAST_SPEEDS: Final = 10
-_NEAR_NS: Final = 150_000_000  #: Largest time between the speeds that are compared [ns].
-_MOVING_MPS: Final = 3.0
-#: Windows before a step that are compared, at least and at most, and windows after it.
+_WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].
+_LEAST_SPEEDS: Final = 10  #: Minimum number of speeds in a window.
+_NEAR_NS: Final = 150_000_000  #: Largest time between a radar speed and the satellite speed compared with it [ns].
+_MOVING_MPS: Final = 3.0  #: Lowest speed of the train at which speeds are compared [m/s].
+#: Minimum and maximum number of windows before a step, and number of windows after a step.
 _LEAST_BEFORE: Final = 5
 _MOST_BEFORE: Final = 20
 _AFTER: Final = 3
-_SILENT: Final = 2  #: Windows without a speed that are reported.
-#: Least reported step, absolute and as a multiple of the scatter of the windows.
+_SILENT: Final = 2  #: Number of consecutive windows without a radar speed that raises an alarm.
+#: Smallest reported step of the ratio, absolute and as a multiple of the scatter of the windows before the step.
 _STEP: Final = 0.01
 _SCATTERS: Final = 5.0
-_LEAST_SCATTER: Final = 0.001
+_LEAST_SCATTER: Final = 0.001  #: Lower bound of that scatter.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """Comparison of the radar's speeds with satellite speeds."""
+    """Alarm raised by the comparison of radar speeds with satellite speeds."""
 
-    kind: Literal["mounting", "silent"]  #: A step of the ratio of the speeds; no speed while the train moves.
-    time: np.datetime64  #: Start of the alarm.
-    #: Ratio less 1 before a step and after it.
+    kind: Literal["mounting", "silent"]  #: Step of the ratio of the speeds, or no radar speed while the train moves.
+    time: np.datetime64  #: Start of the first window with the fault.
+    #: Ratio of radar to satellite speed less 1, before and after a step; NaN for the kind "silent".
     before: float = float("nan")
     after: float = float("nan")
 
@@ -43,28 +42,31 @@ class RadarAlarm:
         """Note for the user."""
         at = np.datetime_as_string(self.time, unit="s")
         if self.kind == "silent":
-            return f"radar: from {at} on it has no speed while the train moves; is it covered, by snow or dirt?"
+            return f"radar: no speed since {at} while the train moves; check whether snow or dirt covers the radar"
         after, before = (f"{round(100.0 * share, 1) + 0.0:+.1f} %" for share in (self.after, self.before))
         return (
-            f"radar: from {at} on its speeds are {after} off those by satellites, {before} before; has its mounting "
-            "moved?"
+            f"radar: from {at} on, its speeds differ from satellite speeds by {after} ({before} before); "
+            "check its mounting"
         )
 
 
 @dataclass(kw_only=True)
 class RadarWatch:
-    """Ratios by window of GPS time, added in order of time; memory does not grow with the length of a session."""
+    """Ratios of radar to satellite speed in the last windows of GPS time; memory is bounded in a long session."""
 
-    #: Ratios of the last windows.
+    #: Ratio less 1 in each window.
     ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
-    #: Window numbers since the epoch of the clock.
+    #: Number of each window, counted from the origin of datetime64.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
-    silent: int = 0  #: Consecutive windows without a speed.
+    silent: int = 0  #: Number of consecutive windows without a radar speed.
     _open: int = -1
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Add speeds of both at the same later instants (NaN: not measured); return the alarms that they raise."""
+        """Add radar and satellite speeds at instants after all earlier instants, and return the alarms raised.
+
+        All arrays have shape (N,); a speed is NaN where not measured. `right_mps` are the satellite speeds.
+        """
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])
         radar, right = np.abs(np.nan_to_num(radar_mps[moving])), np.abs(right_mps[moving])
@@ -80,12 +82,12 @@ class RadarWatch:
         return found
 
     def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
-        """Add satellite speeds, each with the nearest radar speed; see `take`."""
+        """Add satellite speeds, each with the radar speed nearest in time, and return the alarms raised."""
         row = nearest_rows(radar.time, time, within_ns=_NEAR_NS)
         return self.take(time, np.append(radar.speed_mps, np.nan)[row], right_mps)
 
     def _close(self) -> list[RadarAlarm]:
-        """End a window; return the alarm that it completes, if any."""
+        """Close the open window, and return the alarms raised by it."""
         moving, count, product, square = self._sums.tolist()
         if moving >= _LEAST_SPEEDS:
             self.silent = self.silent + 1 if count == 0 else 0
@@ -105,7 +107,7 @@ class RadarWatch:
         if not (np.abs(apart).min() > max(_STEP, _SCATTERS * scatter) and abs(np.sign(apart).sum()) == _AFTER):
             return []
         begin = np.datetime64(self.window[-_AFTER] * _WINDOW_NS, "ns")
-        for _ in range(len(ratios) - _AFTER):  # the next windows are compared with these
+        for _ in range(len(ratios) - _AFTER):  # later windows are compared with the windows after the step
             self.ratio.popleft()
             self.window.popleft()
         return [RadarAlarm(kind="mounting", time=begin, before=middle, after=float(np.median(after)))]

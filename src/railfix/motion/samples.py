@@ -1,7 +1,7 @@
-"""Samples of the sensors on board, as frozen arrays; GPS time, not falling; NaN where not measured.
+"""Samples of the on-board sensors as read-only arrays, and formulas of Doppler radar and two-way ranges (P2 3).
 
-Formulas of the Doppler radar and two-way ranges (P2 3). The relative speed error of a radar that looks down at the
-angle alpha is ``tan(alpha)`` times the angle's error.
+Times are GPS times in ascending order. Values are NaN where not measured. If a radar beam points alpha below the
+direction of travel, the relative error of its speed is ``tan(alpha)`` times the error of alpha.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, RowArrays, Strings, freeze_rows, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 
-#: Sensors on board by the names of their samples.
+#: Names of the on-board sensors, which are fields of `SensorSamples`.
 SENSORS: Final = ("tachometer", "inertial", "radar", "ranging", "balises")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Samples(RowArrays):
-    """N samples: read-only arrays with one row each."""
+    """N samples of one sensor, as read-only arrays with one row per sample."""
 
     #: Instant of each sample, shape (N,).
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
@@ -34,40 +34,40 @@ class Samples(RowArrays):
 
 @dataclass(frozen=True, kw_only=True)
 class TachometerPulses(Samples):
-    """Pulses of a tachometer, N of them."""
+    """N pulses of a tachometer."""
 
-    #: Number of the pulse: a gap means lost pulses; shape (N,).
+    #: Consecutive number of the pulse; a gap in the numbers means lost pulses; shape (N,).
     pulse: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    #: 1 when the vehicle moves forward, -1 backward, 0 where the sensor does not report it; shape (N,).
+    #: 1 if the vehicle moves forward, -1 if backward, 0 if the sensor does not report the direction; shape (N,).
     direction: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class InertialSamples(Samples):
-    """Samples of an inertial unit fixed to the vehicle body, N of them."""
+    """N samples of an inertial measurement unit fixed to the vehicle body."""
 
-    #: Specific force forward, right, down; about (0, 0, -9.8) at rest; shape (N, 3).
+    #: Specific force along the forward, right and down axes; about (0, 0, -9.8) at rest; shape (N, 3).
     force_mps2: Floats = field(default_factory=lambda: np.empty((0, 3)))
-    #: Angular rate about forward (roll), right (pitch), down (yaw); shape (N, 3).
+    #: Angular rate about the forward (roll), right (pitch) and down (yaw) axes; shape (N, 3).
     rate_radps: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RadarSpeeds(Samples):
-    """Speeds over ground of a Doppler radar, N of them."""
+    """N speeds over ground, measured by a Doppler radar."""
 
-    #: Forward positive; NaN without a signal; shape (N,).
+    #: Speed, positive forward; NaN without a signal; shape (N,).
     speed_mps: Floats = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class StationRanges(Samples):
-    """Two-way ranges to N radio stations near the track."""
+    """N two-way ranges to radio stations near the track."""
 
-    #: Name of the station on the ground, shape (N,).
+    #: Name of the radio station, shape (N,).
     station: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
-    range_m: Floats = field(default_factory=lambda: np.empty(0))  #: Shape (N,).
-    #: Standard deviation that the device reports; NaN where it reports none; shape (N,).
+    range_m: Floats = field(default_factory=lambda: np.empty(0))  #: Distance to the station, shape (N,).
+    #: Standard deviation reported by the ranging device; NaN if not reported; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
 
 
@@ -75,8 +75,8 @@ class StationRanges(Samples):
 class GroundUnits:
     """Positions of U surveyed radio stations near the track."""
 
-    name: Strings  #: Shape (U,).
-    ecef_m: Floats  #: Shape (U, 3).
+    name: Strings  #: Name of each station, shape (U,).
+    ecef_m: Floats  #: Position of each station's antenna, shape (U, 3).
 
     def __len__(self) -> int:
         return len(self.name)
@@ -84,52 +84,51 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """Balises passed by the train's reader, at `time`; for a group, the reading that matches the list."""
+    """N passages of the train's balise reader over a balise; a group has one, of the balise that the list contains."""
 
-    balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity, shape (N,).
-    #: Standard deviation along the line that the reader reports; NaN where it reports none; shape (N,).
+    balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity of the balise, shape (N,).
+    #: Standard deviation along the line, reported by the reader; NaN if not reported; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ListedBalises:
-    """Balises, or reporting points without one, along a line, M of them."""
+    """M balises and virtual balises (points whose passage is reported) along a line."""
 
-    name: Strings  #: Shape (M,).
-    chainage_m: Floats  #: Shape (M,).
+    name: Strings  #: Name of each balise, shape (M,).
+    chainage_m: Floats  #: Chainage of each balise, shape (M,).
     sigma_m: Floats  #: Standard deviation of the chainage, shape (M,).
-    virtual: Masks  #: Points whose passing is reported, without a balise; shape (M,).
+    virtual: Masks  #: True for a point whose passage is reported although there is no balise; shape (M,).
 
     def __len__(self) -> int:
         return len(self.name)
 
     def find_index(self, names: Strings) -> Indices:
-        """Return the rows of the balises with these names, -1 for a balise that is not listed."""
+        """Return the rows of physical balises with given names; -1 for a name that is not listed or is virtual."""
         rows = {str(self.name[k]): k for k in np.flatnonzero(~self.virtual)}
         return np.array([rows.get(str(name), -1) for name in names], dtype=np.intp)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSamples:
-    """Samples of all sensors on board received since the previous chunk."""
+    """Samples of all on-board sensors received since the previous chunk; no rows for a sensor that sent nothing."""
 
     tachometer: TachometerPulses = field(default_factory=TachometerPulses)
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
-    #: Each has no rows where the sensor is absent or has sent nothing.
     balises: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Sensors without samples up to the epoch (live): their values since the previous epoch are unknown.
-    #: Their samples may arrive with the next epoch.
+    #: Sensors whose samples up to the epoch have not arrived (live positioning), so that their values since the
+    #: previous epoch are unknown. The samples may arrive with the next epoch.
     silent: frozenset[str] = frozenset()
 
     @property
     def tables(self) -> dict[str, Samples]:
-        """Samples by sensor."""
+        """Samples by the name of the sensor."""
         return {name: getattr(self, name) for name in SENSORS}
 
     def between(self, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
-        """Return the samples after a first instant (all where it is NaT) up to a second one."""
+        """Return the samples after `begin` up to and including `end`; from the first sample on if `begin` is NaT."""
         parts: dict[str, Any] = {}
         for name, rows in self.tables.items():
             first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))
@@ -138,7 +137,7 @@ class SensorSamples:
         return SensorSamples(**parts, silent=self.silent)
 
     def merge(self, later: SensorSamples) -> SensorSamples:
-        """Return both sets of samples in order of time; late samples are sorted in."""
+        """Return both sets of samples in order of time; `silent` is that set of `later`."""
         parts: dict[str, Any] = {}
         for name, after in later.tables.items():
             before: Samples = getattr(self, name)
@@ -153,10 +152,16 @@ class SensorSamples:
 
 
 def two_way_range_m(delay_s: Floats, answer_s: float) -> Floats:
-    """Return the range by the delay of an answer: ``r = (dt_A - dt_B) c / 2`` (P2 3.3, equation 1)."""
+    """Return the two-way range [m]: ``(delay_s - answer_s) c / 2`` (P2 3.3, equation 1).
+
+    `delay_s` is the time from request to answer, `answer_s` the processing time of the station.
+    """
     return np.asarray((delay_s - answer_s) * SPEED_OF_LIGHT / 2.0)
 
 
 def radar_speed_mps(shift_hz: Floats, carrier_hz: float, angle_rad: float) -> Floats:
-    """Return the speed by a Doppler shift: ``v = c f_d / (2 f_0 cos(alpha))`` (P2 3.1, figure 9)."""
+    """Return the speed from the Doppler shift of a radar [m/s]: ``v = c f_d / (2 f_0 cos(alpha))`` (P2 3.1, figure 9).
+
+    `angle_rad` (alpha) is the angle between the beam and the direction of travel.
+    """
     return np.asarray(SPEED_OF_LIGHT * shift_hz / (2.0 * carrier_hz * np.cos(angle_rad)))

@@ -1,4 +1,4 @@
-"""Motion with a time-correlated acceleration."""
+"""Singer model: motion with a time-correlated acceleration."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from railfix.core.arrays import Floats
 
 
 def singer_steps(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """Compute the transition of position, speed and acceleration, and the covariance of its noise, shapes (K, 3, 3).
+    """Compute transition matrices and process noise covariances of position, speed and acceleration, shape (K, 3, 3).
 
     The acceleration is a first-order Gauss-Markov process (R. A. Singer 1970, doi:10.1109/TAES.1970.310128) with the
-    standard deviation `sigma_mps2` [m/s2] and the time constant `tau_s` [s]; `dt`, shape (K,) [s]. Discretised by a
-    matrix exponential (C. F. Van Loan 1978, doi:10.1109/TAC.1978.1101743), in units in which a step takes 1; a step
-    longer than `tau_s` by halves, as the exponential would lose digits.
+    standard deviation `sigma_mps2` [m/s2] and the time constant `tau_s` [s]. `dt` [s] are the time steps, shape (K,).
+    The process is discretised with a matrix exponential (C. F. Van Loan 1978, doi:10.1109/TAC.1978.1101743). A step
+    longer than `tau_s` is halved repeatedly and composed again, because the exponential would lose digits.
     """
     halvings = np.ceil(np.log2(np.maximum(dt / tau_s, 1.0))).astype(np.int64)
     part = dt / 2.0**halvings

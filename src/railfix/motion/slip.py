@@ -1,17 +1,17 @@
-r"""Slip, slide, low speed and rolling away, detected by the vehicle's pitch (P2 2.1) and bridged by inertia.
+r"""Slip, slide, low speed and rolling away, detected from the vehicle's pitch (P2 2.1) and bridged by inertia.
 
-``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch while the wheel rolls; with slip it
-has values that no line has. Two rules:
+While the wheel rolls, ``sin(theta_T) = (f_x - a_T) / g`` from accelerometer and tachometer is the sine of the pitch.
+During a slip it has values that no line has. There are two rules:
 
-* ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
-  slip, not its speed. It detects nothing at constant slip speed, so that most of a long slide remains in the distance.
-* ``"map"``: against the gradient of the line at the present position, with a latch: a slip ends only when the wheel has
-returned to the inertial speed and the pitch fits, or when wheel and train are at rest.
+* ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient and the pitching of the body. It only
+  detects a change of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
+* ``"map"`` compares the pitch with the gradient of the line at the present position, and has a latch: a slip ends only
+  when the wheel has returned to the inertial speed and the pitch agrees, or when wheel and train are at rest.
 
-During a slip, speed and distance come from the accelerometer less the pitch and its offset, estimated while the wheel
-rolls, from `LOOK_BACK_S` before the detection. The pitch is the line's where the position is known; with a gyro
-it is the integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and
-accelerometer (P2 2.1(3)).
+During a slip, speed and distance are integrated from the accelerometer less the components of pitch and offset, from
+`LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. The pitch is that of the line where
+the position is known. With a gyro it is the integral of the pitch rate, with a slow correction to the line or, where
+the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
 """
 
 from __future__ import annotations
@@ -32,132 +32,133 @@ from railfix.core.settings import Settings
 
 
 class MotionState(IntEnum):
-    """Source of the speed of a sample."""
+    """State of motion, which determines the source of the speed."""
 
-    INIT = 0  #: Not yet initialised.
-    STANDING = 1  #: No pulse for a second and the body at rest.
-    LOW_SPEED = 2  #: Moving too slowly for the tachometer; speed by inertia.
-    NORMAL = 3  #: The wheel rolls.
-    INERTIAL_SPIN = 4  #: The wheel is faster than the train; speed by inertia.
-    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; speed by inertia.
-    ROLLING = 6  #: Rolling away below the tachometer's least speed; speed by inertia.
-    EXPIRED = 7  #: By inertia for too long: no speed.
+    INIT = 0  #: Not yet initialised; no speed.
+    STANDING = 1  #: At rest: no pulse for a second, and the inertial speed is small.
+    LOW_SPEED = 2  #: The train moves too slowly for the tachometer; inertial speed.
+    NORMAL = 3  #: The wheel rolls; speed of the wheel.
+    INERTIAL_SPIN = 4  #: The wheel is faster than the train; inertial speed.
+    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; inertial speed.
+    ROLLING = 6  #: The train rolls away from rest, too slowly for the tachometer; inertial speed.
+    EXPIRED = 7  #: The inertial speed is too old or implausible; no speed.
 
 
-#: Limit of the sine of the pitch minus the line's: a difference of 0.1 m/s2 between wheel and train.
+#: Limit of the difference of the pitch sines of vehicle and line: 0.15 m/s2 between wheel and train.
 _MAP_LIMIT: Final = 0.015
-#: The limit is at least this many standard deviations while the wheel rolls, over this time: a pitching body shakes its
-#: accelerometer too, more so the higher it is mounted.
+#: Lower bound of the limit, in standard deviations of the difference while the wheel rolls, and their time constant. A
+#: pitching body accelerates its accelerometer, the more the higher it is mounted.
 _NOISE_SIGMAS: Final = 5.0
 _NOISE_S: Final = 30.0
-#: A slip ends when wheel and inertia agree within this limit for this time.
+#: A slip ends when wheel and inertial speeds agree within the larger of these two limits for this time.
 _LATCH_MPS: Final = 0.15
 _LATCH_SHARE: Final = 0.01
 _LATCH_S: Final = 0.5
 LOOK_BACK_S: Final = 0.3  #: Time before the detection at which the inertial speed begins.
-#: After this time the inertial speed has expired: `carry_drift_mps2` has become 0.3 m/s.
+#: Time after which the inertial speed expires; `carry_drift_mps2` then amounts to 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
-#: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
+#: Time constant of the low-pass filter of the pitch, against pitching of the body at about 1 Hz and vibration.
 SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
-_STANDING_MPS: Final = 0.5  #: An inertial speed below this agrees with a stationary wheel.
-_PITCH_S: Final = 20.0
-_STEEPEST: Final = 0.1  #: Sine beyond which a pitch is implausible: 35 permille of line, body and mounting [1].
-_FASTEST_MPS: Final = 100.0  #: An inertial speed beyond this has expired.
-#: Time for which the body swings after a stop; its pitch afterwards is the pitch at standstill.
+_STANDING_MPS: Final = 0.5  #: Largest inertial speed that agrees with a stationary wheel.
+_PITCH_S: Final = 20.0  #: Time constant of the correction of the gyro's pitch.
+_STEEPEST: Final = 0.1  #: Largest plausible sine of the pitch; a line has 0.035 at most, the rest is body and mounting.
+_FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
+#: Time for which the body pitches after a stop, before its pitch is taken as the pitch at standstill.
 _SETTLING_S: Final = 2.0
-#: Change of the pitch at standstill, duration and speed that mean rolling away.
+#: Change of the pitch sine at standstill, its duration, and the inertial speed that indicate rolling away.
 _ROLLING_LIMIT: Final = 0.002
 _ROLLING_S: Final = 0.3
 _ROLLING_MPS: Final = 0.05
 
 
 class SlipLimits(Settings):
-    """Limits of the detection."""
+    """Limits of the slip detection."""
 
-    #: Reference of the pitch, the line's gradient or P2's limit; "p2" has neither latch nor look-back.
+    #: Whether the pitch is compared with the gradient of the line ("map"), or with P2's constant limit ("p2"), without
+    #: latch and look-back.
     rule: Literal["map", "p2"] = "map"
-    #: Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
+    #: Largest sine of the pitch without slip, for the rule "p2": 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
-    confirm_s: float = Field(default=0.1, ge=0)  #: Time over the limit after which a slip is declared.
-    #: The limit grows by this much per second of carrying: 1e-3 of gravity, the offset of the accelerometer and the
-    #: error of the pitch together.
+    confirm_s: float = Field(default=0.1, ge=0)  #: Time for which the limit is exceeded before a slip is declared.
+    #: Drift of the inertial speed, by which the speed limit of the latch grows. 1e-3 of gravity covers accelerometer
+    #: offset and pitch error together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
-    offset_s: float = Field(default=60.0, gt=0)  #: Time constant of the accelerometer's offset.
-    #: Time constants of the gyro's pitch and bias. Without a line the pitch by wheel and accelerometer is used instead.
+    offset_s: float = Field(default=60.0, gt=0)  #: Time constant of the estimated accelerometer offset.
+    #: Time constant of the estimated gyro bias.
     bias_s: float = Field(default=200.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlipResult:
-    """Speed and its source at N samples."""
+    """Speed, distance and state of motion at N samples."""
 
     state: Codes  #: `MotionState`, shape (N,).
-    speed_mps: Floats  #: Speed of the wheel where it rolls, otherwise inertial; NaN in INIT and EXPIRED; shape (N,).
-    #: Integral of the speed from the first sample. Each slip is corrected from its look-back on; at its end by the
-    #: difference of wheel and inertia, which is assumed to have grown linearly; shape (N,).
+    speed_mps: Floats  #: Wheel speed in NORMAL, 0 or inertial speed otherwise, NaN in INIT and EXPIRED; shape (N,).
+    #: Integral of the speed from the first sample, shape (N,). A slip is bridged by inertia from its look-back on. At
+    #: its end the distance is corrected for the difference of wheel and inertial speeds, assumed to grow linearly.
     distance_m: Floats
-    #: Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses; shape (N,).
+    #: Sine of the pitch by wheel and accelerometer less `pitch`; NaN without pulses; shape (N,).
     metric: Floats
-    smooth: Floats  #: Mean of the metric over `SMOOTHING_S` less the accelerometer's offset; shape (N,).
-    pitch: Floats  #: Sine of the reference pitch; NaN before it is known; shape (N,).
-    gyro_bias_radps: Floats  #: Estimated offset of the pitch rate; 0 without a gyro; shape (N,).
+    smooth: Floats  #: Metric less the accelerometer offset, low-pass filtered with `SMOOTHING_S`; shape (N,).
+    pitch: Floats  #: Sine of the reference pitch; NaN before the first estimate; shape (N,).
+    gyro_bias_radps: Floats  #: Estimated bias of the pitch rate; 0 without a gyro; shape (N,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlipState:
     """State of `find_slips` after a call."""
 
-    time_s: float  #: Of the last sample.
+    time_s: float  #: Time of the last sample.
     automaton: _Automaton
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the rate of the pitch from body rates (N, 3), the roll in curves eliminated, shape (N,) [rad/s].
+    """Compute the rate of the pitch angle from the body rates, shape (N, 3), and the roll, shape (N,) [rad/s].
 
-    The body leans with the cant: ``w_y cos(phi) - w_z sin(phi)`` with ``sin(phi) = (v w_z - f_y) / g``. Raw it would be
-    wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.
+    The rate is ``w_y cos(phi) - w_z sin(phi)`` with the roll ``sin(phi) = (v w_z - f_y) / g``, as the body leans with
+    the cant. Without the roll it is wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
     """
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
 
 
 def heading_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the rate of the heading from body rates, shape (N,) [rad/s]: ``w_z cos(phi) + w_y sin(phi)``."""
+    """Compute the rate of the heading from the body rates, shape (N,) [rad/s]: ``w_z cos(phi) + w_y sin(phi)``."""
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 2] * np.sqrt(1.0 - sine**2) + rate_radps[:, 1] * sine)
 
 
 def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the sine of the roll to the right, shape (N,): difference of the force to the right from ``v w_z``."""
+    """Compute the sine of the roll to the right, ``(v w_z - f_y) / g`` limited to +-0.5, shape (N,)."""
     return np.clip((speed_mps * rate_radps[:, 2] - force_mps2[:, 1]) / GRAVITY_MPS2, -0.5, 0.5)
 
 
 class MotionSamples(NamedTuple):
-    """N samples of wheel and body, 10 to 100 a second."""
+    """N samples of wheel and body motion, 10 to 100 per second."""
 
-    time_s: Floats  #: Rising, shape (N,).
-    #: Speed of the wheel at the samples, and its acceleration; NaN without pulses; shape (N,).
+    time_s: Floats  #: Times in rising order, shape (N,).
+    #: Speed and acceleration of the wheel; NaN without pulses; shape (N,).
     wheel_mps: Floats
     wheel_mps2: Floats
-    force_mps2: Floats  #: Specific force along the vehicle, shape (N,).
-    #: Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known; shape (N,).
+    force_mps2: Floats  #: Specific force in the forward direction of the vehicle, shape (N,).
+    #: Sine of the line's slope angle at the vehicle, positive if the line rises forward; NaN if unknown; shape (N,).
     line_sine: Floats
-    #: Specific force to the right, pitch rate and yaw rate of the body, for the pitch rate (`pitch_rate_radps`) at the
-    #: speed carried through a slip; the speed of the slipping wheel would yield a false lean; NaN for none; shape (N,
-    #: 3) [m/s2, rad/s, rad/s].
+    #: Specific force to the right, pitch rate and yaw rate of the body, shape (N, 3) [m/s2, rad/s, rad/s]; NaN if
+    #: missing. The pitch rate (`pitch_rate_radps`) is computed with the inertial speed during a slip, because the speed
+    #: of the slipping wheel would result in a wrong roll.
     body: Floats | None = None
-    #: Time since the last pulse, since a creeping train has pulses without a speed; otherwise since the last speed;
-    #: shape (N,).
+    #: Time since the last pulse, shape (N,). It is needed where a creeping train has pulses without a speed; without it
+    #: the time since the last speed is used.
     since_pulse_s: Floats | None = None
 
 
 def find_slips(
     samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
 ) -> tuple[SlipResult, SlipState | None]:
-    """Return the state of motion, speed and distance, each from its own and earlier samples.
+    """Compute the state of motion, speed and distance at each sample from this sample and all earlier samples.
 
-    `state` is the state after the samples before, None at the start; the returned state is for the next samples.
+    `state` is the state returned for the previous samples, None at the start.
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
@@ -184,7 +185,7 @@ def find_slips(
 
 
 class _Automaton:
-    """Sequential state from one sample to the next."""
+    """State machine of the motion, updated sample by sample."""
 
     def __init__(self, limits: SlipLimits) -> None:
         self.limits = limits
@@ -196,11 +197,11 @@ class _Automaton:
             self._learnt
         ) = 0.0
         self._rest = float("nan")
-        #: Time, speed and acceleration by inertia of past samples, to which a detection looks back.
+        #: Time, speed and inertial acceleration of past samples, from which a slip is recomputed after its detection.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return a copy: states that were returned stay unchanged."""
+        """Return a copy with the given limits, so that states already returned stay unchanged."""
         other = copy.copy(self)
         other.limits, other._past = limits, self._past.copy()
         return other
@@ -230,7 +231,7 @@ class _Automaton:
         if self.metric == self.metric:
             share = min(dt / SMOOTHING_S, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
-        # A constant pitch belongs to an earlier position.
+        # without line and gyro the reference pitch is constant, and valid only at an earlier position
         least = _MAP_LIMIT if sine == sine or rate == rate else limits.p2_limit
         self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
@@ -245,16 +246,17 @@ class _Automaton:
         self._past.append((self._age, self.speed, inertial))
 
     def _pitch_rate(self, wheel: float, right: float, pitching: float, yawing: float) -> float:
-        """`pitch_rate_radps` of a sample at the speed of the train."""
+        """Return `pitch_rate_radps` of a sample, with the inertial speed during a slip."""
         slips = self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)
         speed = self.speed if slips or wheel != wheel else wheel
         lean = min(max(((speed if speed == speed else 0.0) * yawing - right) / GRAVITY_MPS2, -0.5), 0.5)
         return float(pitching * (1.0 - lean * lean) ** 0.5 - yawing * lean)
 
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float, *, rests: bool) -> None:
-        """Reference pitch: from the line, with a gyro its fast part; without a line from the wheel, slowly.
+        """Update the reference pitch and the gyro bias.
 
-        The rate of a body at rest is the bias of the gyro: its mean over `bias_s` is used.
+        Without a gyro the pitch is that of the line. With a gyro it is the integrated rate, corrected slowly to the
+        line, or to the wheel's pitch without a line. At rest the mean rate over `bias_s` is the bias of the gyro.
         """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
@@ -283,12 +285,12 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _stand(self, force: float) -> None:
-        """Begin a standstill with the force at rest."""
+        """Begin a standstill, with the present force as the force at rest."""
         self.state, self.speed, self._rest = MotionState.STANDING, 0.0, force
         self._apart = self._carried = self._stood = 0.0
 
     def _release(self, dt: float, wheel: float, force: float, *, heard: bool) -> None:
-        """Latch: the wheel must return to the inertial speed, with a pitch that fits, or be at rest with the train."""
+        """End a slip if wheel and train are at rest, or if both the wheel speed and the pitch are plausible again."""
         limits = self.limits
         if self._silent >= _STANDING_S and abs(self.speed) < _STANDING_MPS:
             self._stand(force)
@@ -308,7 +310,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """The wheel turns: its distance is used unless the pitch contradicts it."""
+        """Use the speed of the wheel, or declare a slip if the pitch contradicts it for `confirm_s`."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")
@@ -331,7 +333,7 @@ class _Automaton:
                 self._look_back(inertial, dt)
 
     def _look_back(self, inertial: float, dt: float) -> None:
-        """Replace speed and distance by the inertial solution from shortly before the detection."""
+        """Recompute speed and distance by inertia from shortly before the detection on."""
         begin = self._age - LOOK_BACK_S - self.limits.confirm_s - SMOOTHING_S
         past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
         if not past:
@@ -346,7 +348,7 @@ class _Automaton:
         self.distance += new_distance - old_distance
 
     def _quiet(self, dt: float, force: float, inertial: float) -> None:
-        """No pulse: at rest, starting or stopping slowly, or rolling away."""
+        """Update state and speed without a pulse: low speed, standstill or rolling away."""
         if self.state == MotionState.NORMAL:
             self.state = MotionState.LOW_SPEED
         if self.state == MotionState.LOW_SPEED:
@@ -362,7 +364,7 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """At rest the force is the component of gravity; its fall toward zero at release is the motion."""
+        """Detect rolling away from a change of the force at rest, which is the gravity component along the vehicle."""
         limits = self.limits
         self._stood += dt
         if self.state == MotionState.STANDING and self._stood < _SETTLING_S:
@@ -375,8 +377,8 @@ class _Automaton:
                 self._rest += min(dt / limits.offset_s, 1.0) * change
                 self.speed = 0.0
                 return
-            # While the train rolls freely the accelerometer reads zero; the acceleration is the gravity component read
-            # at rest.
+            # The accelerometer of a freely rolling train measures zero; the acceleration is the gravity component
+            # measured at rest.
             self.speed += change * dt
             if self._apart >= _ROLLING_S and abs(self.speed) > _ROLLING_MPS:
                 self.state = MotionState.ROLLING

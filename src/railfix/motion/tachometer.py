@@ -1,7 +1,7 @@
-"""Speed, acceleration and distance from the instants of a tachometer's pulses (P2 2.2), and checks of its settings.
+"""Speed, acceleration and distance from the pulse times of a tachometer (P2 2.2), and checks of its settings.
 
-Over the pulses k0 to k the mean speed is ``(k - k0) p / (t_k - t_k0)``; where the acceleration is even it is the speed
-at the middle of the interval, and that instant is returned with it.
+From pulse k0 to pulse k the mean speed is ``(k - k0) p / (t_k - t_k0)``, with the distance per pulse p. At constant
+acceleration this is the speed at the middle of the interval, so that speeds are returned with that instant.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import TachometerPulses
 
-#: Ratios of a speed in a wrong unit to one in m/s, and the names of the units.
+#: Names of speed units by their conversion factors from m/s.
 _UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
-#: A ratio within this fraction of a unit's is that unit: more than a worn wheel (2 %), less than between two units.
+#: Largest relative deviation from the factor of a unit: more than wheel wear (2 %), less than between two units.
 _UNIT_SHARE: Final = 0.05
-LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Lowest speed of the output (P2 1; 1 km/h).
+LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Lowest speed that is returned: 1 km/h (P2 1).
 
 
 class TachometerLimits(Settings):
-    """Wheel and window of a tachometer."""
+    """Parameters of a tachometer and of its evaluation."""
 
-    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: As configured on board.
-    pulses_per_turn: int = Field(default=60, ge=1)  #: After multiplication of edges.
-    #: Time over which speeds are taken. P2 3.2 gives 0.1 s as the usual smoothing of a tachometer; with uneven teeth
-    #: use the time of a whole turn.
+    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: Wheel diameter that is configured on board.
+    pulses_per_turn: int = Field(default=60, ge=1)  #: Pulses per turn of the wheel, after multiplication of edges.
+    #: Time over which a speed is computed. P2 3.2 gives 0.1 s as the usual smoothing of a tachometer. If the teeth are
+    #: uneven, use the time of a full turn.
     window_s: float = Field(default=0.1, gt=0)
-    silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which the output is NaN.
-    #: Standard deviation of a pulse's instant, and the step of its clock.
+    silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which the speed is NaN.
+    #: Standard deviation of a pulse time, and resolution of the clock.
     jitter_s: float = Field(default=5e-6, ge=0)
     resolution_s: float = Field(default=1e-6, ge=0)
 
@@ -45,16 +45,19 @@ class TachometerLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PulseSpeeds:
-    """Speeds at N requested instants."""
+    """Speeds from the pulses before N requested instants."""
 
-    #: Instant at which each speed is valid, earlier than requested; NaT where there is none; shape (N,).
+    #: Instant at which the speed is valid, before the requested instant; NaT without a speed; shape (N,).
     time: Datetimes
-    speed_mps: Floats  #: Signed by the direction; NaN where the pulses give no speed; shape (N,).
-    sigma_mps: Floats  #: Standard deviation by jitter and clock; the wheel's scale error is separate; shape (N,).
+    speed_mps: Floats  #: Speed, negative backward; NaN where the pulses give no speed; shape (N,).
+    sigma_mps: Floats  #: Standard deviation by jitter and clock, without the wheel scale error; shape (N,).
 
 
 def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> PulseSpeeds:
-    """Return speeds from the intervals of pulses, each from pulses up to its instant, shape (N,)."""
+    """Compute the speed at each instant from the pulses of the last `window_s` up to it, shape (N,).
+
+    The speed is NaN below `LEAST_SPEED_MPS`, after `silence_s` without a pulse, and before the second pulse.
+    """
     limits = limits or TachometerLimits()
     last = np.searchsorted(pulses.time, time, side="right") - 1
     some = last >= 1
@@ -70,7 +73,7 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
     valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
-    # The absence of a pulse bounds the speed, too.
+    # the time since the last pulse is an upper bound of the speed
     valid &= limits.pulse_m / np.maximum(since, 1e-9) >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
     middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
@@ -82,22 +85,25 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
 
 
 def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
-    """Return the last pulse not after a window before each pulse, at least one pulse back; the first at the start."""
+    """Return the index of the pulse at which the window of each pulse `last` starts.
+
+    It is the last pulse at least `window_s` earlier, and at least one pulse earlier; near the start it is the first.
+    """
     start = np.searchsorted(time, time[last] - timedelta(np.full(len(last), window_s)), side="right") - 1
     return np.asarray(np.maximum(np.minimum(start, last - 1), 0), dtype=np.intp)
 
 
 def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
-    """Return the difference of two speeds over the time between them [m/s2]; NaN where one is missing."""
+    """Return the acceleration between two speeds [m/s2]; NaN where either speed is missing."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((late.speed_mps - early.speed_mps) / seconds(late.time - early.time))
 
 
 def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
-    """Return the signed distance run up to instants, from pulses up to each, shape (N,) [m].
+    """Return the signed distance travelled up to each instant, from the pulses up to it, shape (N,) [m].
 
-    Between pulses the distance continues at the last speed, by less than one pulse. It is 0 before the first pulse.
-    Where the sensor has no direction every pulse counts forward.
+    Between pulses the distance is extrapolated with the last speed, by one pulse at most. It is 0 before the first
+    pulse. A pulse without direction counts as forward.
     """
     limits = limits or TachometerLimits()
     if not len(pulses):
@@ -113,10 +119,10 @@ def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerL
 
 
 def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
-    """Return pulses before which one was lost, and pulses that are one of a doubled pair, shapes (P,).
+    """Return masks of the pulses that follow a lost pulse, and of the pulses that are doubled, shape (P,) each.
 
-    An interval twice as long as both neighbours hides a lost pulse (also shown by `pulse` numbers); two successive
-    intervals that together equal one neighbour are a doubled pulse.
+    A pulse is lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are missing. A
+    pulse is doubled where two successive intervals together equal a neighbouring interval.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
@@ -136,7 +142,10 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses detected up to instants, two pulses late, shape (N,)."""
+    """Return the number of lost and doubled pulses detected up to each instant, two pulses late, shape (N,).
+
+    Lost pulses that the `pulse` numbers show are not counted.
+    """
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
     return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
@@ -144,22 +153,22 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedCheck:
-    """Comparison of logged speeds with correct speeds."""
+    """Scale, unit and delay of logged speeds relative to reference speeds."""
 
-    ratio: float  #: Logged over right, without the unit.
-    unit: str  #: "m/s", or the actual unit of the log.
-    lag_s: float  #: Delay of its time tags.
+    ratio: float  #: Ratio of logged to reference speed, after conversion from `unit`.
+    unit: str  #: Detected unit of the logged speeds, "m/s" unless the ratio is near another unit's factor.
+    lag_s: float  #: Delay of the logged speeds.
 
 
-#: Largest lag that is searched for [s].
+#: Largest delay in the search, of either sign [s].
 _LARGEST_LAG_S: Final = 3.0
 
 
 def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck:
-    """Return scale, unit and lag of logged speeds (N,) by the least squares of their sizes over a search of lags.
+    """Estimate scale, unit and delay of logged speeds, shape (N,), by least squares over a grid of delays.
 
-    `right_time`, `right_mps`, shape (M,), for example by Doppler. ValueError with fewer than ten speeds over 1 m/s in
-    common.
+    `right_time` and `right_mps` are reference speeds, shape (M,), for example from Dopplers. Absolute speeds are
+    compared. Raise ValueError with fewer than ten common speeds over 1 m/s.
     """
     known = np.isfinite(right_mps)
     right_t = seconds(right_time[known] - right_time[0])

@@ -1,7 +1,7 @@
-"""Screens: one file each, with its limits, metric, verdict, reason, columns and picture.
+"""Screens that test observations and positions; each file defines one screen with its limits, columns and picture.
 
-A screen measures one quantity in physical units and returns which observations fail. It never re-admits an observation
-that another screen rejected; it returns verdicts, which the pipeline applies. `SCREENS` lists them.
+A screen compares one physical quantity with a limit, and returns the observations that fail as verdicts, which the
+pipeline applies. No screen re-admits an observation that another screen rejected. `SCREENS` lists all screens.
 """
 
 import lazy_loader

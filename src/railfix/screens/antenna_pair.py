@@ -1,14 +1,16 @@
-"""Pseudorange difference of two antennas against their spacing (P1 2.3(3), figure 5, table 6: 5 m).
+"""Comparison of the pseudoranges of two antennas, given their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
-The range of a satellite from the rear antenna is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
-gradient)``. An inconsistent difference indicates multipath at one of the two antennas; which one is unknown.
+The range from the rear antenna to a satellite is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
+gradient)``, with L the antenna spacing. Another difference indicates multipath at one of the two antennas, but does not
+show at which antenna.
 
-Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median have separate clocks, and the screen is not run, as
-in P1 6. Otherwise the clock difference is the median over the satellites of a constellation; with range rates given,
-the satellites' motion between the two instants is removed (1 ms is up to 0.8 m).
+With clocks "common" the receivers must share a clock: where the median difference exceeds `SEPARATE_CLOCKS_M`, the
+screen is not run (P1 6). With clocks "median" the clock difference is the median over the satellites of a
+constellation. If range rates are given, the satellites' motion between the two time tags is removed (0.8 m in 1 ms at
+most).
 
-Gradient, sway and map leave the elevation uncertain by 3 deg and the azimuth relative to the car body by 3.5 deg (P1).
-Multipath below the difference that these explain is not detected.
+Errors of gradient, sway and map make the elevation uncertain by 3 deg, and the azimuth relative to the car body by
+3.5 deg (P1). Multipath errors smaller than the effect of these angle errors are not detected.
 """
 
 from __future__ import annotations
@@ -35,31 +37,32 @@ from railfix.screens.base import ObservationPicture, ScreenColumn, Screened, Ver
 from railfix.screens.medians import clock_medians
 from railfix.screens.pairs import PairedEpochs, PairScreen, on_pairs, pair_channels
 
-#: Treatment of the receiver clocks, in the words of the output.
+#: Treatment of the receiver clocks, as described in results.
 CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
     "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
 }
-#: Median difference over all satellites [m] that multipath cannot cause: the receivers' clocks are separate.
+#: Median pseudorange difference over all satellites [m] that multipath cannot cause and that shows separate clocks.
 SEPARATE_CLOCKS_M: Final = 100.0
 
 
 class AntennaPairLimits(Settings):
     """Limits of the antenna-pair screen."""
 
-    #: Largest deviation from the expected difference; P1 table 6: 5.
+    #: Largest deviation of the pseudorange difference from the expected difference; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Error of the satellite's direction relative to the car body; P1 2.3(3): 3 and 3.5.
+    #: Errors of the satellite's direction relative to the car body; P1 2.3(3): 3 and 3.5.
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
-    #: Receiver clocks: common by hardware, or eliminated by the median of each constellation.
+    #: Whether the receivers share a clock ("common"), or the median of each constellation eliminates the clock
+    #: difference ("median").
     clocks: Literal["common", "median"] = "median"
-    #: For "median": minimum number of common satellites in a constellation.
+    #: Minimum number of common satellites in a constellation, if clocks are eliminated with the median.
     least_satellites: int = Field(default=4, ge=3)
     #: Largest difference of the time tags of a pair of epochs.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
-    #: Treatment of a satellite with an inconsistent difference: its sigma is increased on both antennas, because the
-    #: faulty one is unknown, or it is rejected on both, as in P1.
+    #: Whether the sigma of an inconsistent satellite is increased ("weigh"), or the satellite rejected ("reject"), as
+    #: in P1. Both antennas are treated alike, because the faulty antenna is unknown.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
@@ -67,20 +70,20 @@ class AntennaPairLimits(Settings):
 class AntennaPairScreened(Screened):
     """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m]."""
 
-    expected_m: Floats  #: Pseudorange of the rear antenna less that of the front one, from the spacing; shape (P, C).
-    #: Eliminated clock difference, rear receiver less front receiver; 0 if common; shape (P, C).
+    expected_m: Floats  #: Rear less front pseudorange that follows from the spacing, shape (P, C).
+    #: Eliminated clock difference, rear less front receiver; 0 for a common clock; NaN if unknown; shape (P, C).
     clock_m: Floats
-    clocks: str  #: Treatment of the clocks, in words.
-    zone: Callable[[], Floats]  #: Returns `ambiguity_m`.
+    clocks: str  #: Description of the treatment of the clocks, from `CLOCKS`.
+    zone: Callable[[], Floats]  #: Function that computes `ambiguity_m`.
 
     @cached_property
     def ambiguity_m(self) -> Floats:
-        """Difference explained by errors of the angles; nothing within it is rejected; shape (P, C)."""
+        """Largest effect of the angle errors, shape (P, C); no smaller metric is rejected."""
         return self.zone()
 
 
 class Spacing(NamedTuple):
-    """Line from the rear to the front antenna, shape (P,) or scalar each; NaN where unknown: not tested."""
+    """Direction and length of the line from the rear to the front antenna, shape (P,) or scalar; NaN where unknown."""
 
     heading_deg: ArrayLike
     gradient_permille: ArrayLike
@@ -90,18 +93,18 @@ class Spacing(NamedTuple):
 class TagDifference(NamedTuple):
     """Time-tag difference of the two receivers."""
 
-    later: ArrayLike  #: Time tags of the rear receiver less those of the front one, shape (P,).
-    range_rate_mps: ArrayLike  #: ``-lambda D``, NaN where unknown: then left out; shape (P, C).
+    later: ArrayLike  #: Rear less front time tags as timedelta64, shape (P,).
+    range_rate_mps: ArrayLike  #: Range rate ``-lambda D``, shape (P, C); NaN, where unknown, counts as 0.
 
 
 def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacing:
-    """Return the heading, gradient and length of the line from the rear to the front antenna.
+    """Return the heading [deg], gradient [permille] and length [m] of the line from the rear to the front antenna.
 
     Parameters
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
-        Antenna positions on their trajectories at the same instant. Only their difference is used, so that a common
-        error along a straight line has no effect.
+        Antenna positions on their trajectories at the same instant. Only the difference of the two positions is used,
+        so that a common error along a straight line has no effect.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
@@ -121,14 +124,14 @@ def expected_difference_m(
     gradient_permille: ArrayLike,
     spacing_m: ArrayLike,
 ) -> Floats:
-    """Return the rear antenna's pseudorange less the front antenna's, with equal clocks, shape (P, C) [m].
+    """Return the rear antenna's pseudorange less the front antenna's for equal receiver clocks, shape (P, C) [m].
 
     Parameters
     ----------
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     heading_deg, gradient_permille, spacing_m : array_like, shape (P,) or scalar
-        Line from the rear to the front antenna. For a train that faces falling chainage the line's heading is turned by
-        180 deg, and the gradient changes sign.
+        Line from the rear to the front antenna. For a train that faces falling chainage, the heading is opposite to the
+        heading of the track, and the gradient has the opposite sign.
     """
     elevation, azimuth = np.radians(elevation_deg), np.radians(azimuth_deg)
     heading, spacing = (np.asarray(value, dtype=np.float64)[..., None] for value in (heading_deg, spacing_m))
@@ -145,15 +148,14 @@ def ambiguity_m(
     elevation_error_deg: float = 3.0,
     azimuth_error_deg: float = 3.5,
 ) -> Floats:
-    """Return the largest change of the expected difference that the errors of the angles explain [m].
+    """Return the largest change of the expected difference that angle errors can cause [m].
 
-    It is computed for the worst direction within the errors: at most 1.1 m at 18.2 m spacing (P1 2.3(3)), for a low
-    satellite abeam.
+    For 18.2 m spacing and the default errors it is at most 1.1 m (P1 2.3(3)), for a low satellite abeam.
 
     Parameters
     ----------
     elevation_deg, relative_azimuth_deg : array_like, shapes that broadcast [deg]
-        Azimuth less heading.
+        The relative azimuth is the azimuth of the satellite less the heading.
     spacing_m : array_like [m]
     elevation_error_deg, azimuth_error_deg : float [deg]
     """
@@ -167,14 +169,14 @@ def ambiguity_m(
 
 
 def largest_changes(elevation: Floats, azimuth: Floats, elevation_error: float, azimuth_error: float) -> Floats:
-    """Largest change of ``cos(elevation) cos(azimuth)`` within the errors of both, shape (T, M); all in radians."""
-    # the product of two cosines is extremal where each cosine is
+    """Return the largest change of ``cos(elevation) cos(azimuth)`` within the angle errors [rad], shape (T, M)."""
+    # the product of two cosines is extremal where both cosines are extremal
     (up, *ups), (aside, *asides) = _cosines(elevation, elevation_error), _cosines(azimuth, azimuth_error)
     return np.asarray(np.max([np.abs(a * b - up * aside) for a, b in product(ups, asides)], axis=0))
 
 
 def _cosines(angle: Floats, error: float) -> tuple[Floats, Floats, Floats]:
-    """Return the cosines of angles, and the smallest and largest cosine within the angle error; NaN for NaN."""
+    """Return the cosine of the angle, and the smallest and largest cosine within the error; all angles in radians."""
     cosine, least = np.cos(angle), math.cos(error)
     middle, half = cosine * least, np.abs(np.sin(angle)) * math.sin(error)
     low = np.where(cosine <= -least, -1.0, middle - half)
@@ -192,25 +194,25 @@ def antenna_pair_screen(
     tags: TagDifference | None = None,
     limits: AntennaPairLimits | None = None,
 ) -> AntennaPairScreened:
-    """Reject satellites whose two pseudoranges do not differ as the spacing requires (P1 2.3(3); table 6: 5 m).
+    """Reject satellites whose pseudorange difference is inconsistent with the antenna spacing (P1 2.3(3), table 6).
 
     Parameters
     ----------
     code_front_m, code_rear_m : array_like, shape (P, C) [m]
-        Pseudoranges of pairs of epochs (`pairs.pair_epochs`) and channels (`pairs.pair_channels`), raw or
-        corrected alike; NaN where absent.
+        Pseudoranges at paired epochs (`pairs.pair_epochs`) and channels (`pairs.pair_channels`), both raw or both
+        corrected; NaN where absent.
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     satellite : ndarray of str, shape (C,)
     spacing : Spacing
         Returned by `spacing_direction`.
     tags : TagDifference, optional
-        Without it the receivers are treated as simultaneous.
+        Without it the observations of both receivers are assumed simultaneous.
 
     Returns
     -------
     AntennaPairScreened
-        NaN metric, and no rejection, where a pseudorange is missing at either antenna; with clocks "median" where
-        fewer than `least_satellites` of the clock are there, with "common" where the clocks are separate.
+        The metric is NaN, and nothing is rejected, where a pseudorange or the spacing is missing; with clocks "median"
+        where a constellation has fewer than `least_satellites` satellites; with "common" where clocks are separate.
     """
     limits = limits or AntennaPairLimits()
     front, rear = np.asarray(code_front_m, dtype=np.float64), np.asarray(code_rear_m, dtype=np.float64)
@@ -219,7 +221,7 @@ def antenna_pair_screen(
     later = np.zeros(len(front)) if tags is None else seconds(tags.later)
     raw = rear - front - expected - rate * later[:, None]
     if limits.clocks == "median":
-        # shifts of the instants by the clocks are included
+        # the receiver clocks also shift the instants of observation
         timed = raw + rate * clock_medians(raw, satellite) / SPEED_OF_LIGHT
         clock = clock_medians(timed, satellite, least=limits.least_satellites)
         raw = raw + rate * clock / SPEED_OF_LIGHT
@@ -245,7 +247,7 @@ def antenna_pair_screen(
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):
-    """Pseudorange difference of two antennas against their spacing; an inconsistent satellite is rejected on both."""
+    """Screen of the pseudorange difference of two antennas; its verdict applies to both antennas."""
 
     name = "antenna_pair"
     limits = AntennaPairLimits()
@@ -256,7 +258,7 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
     columns = (
         ScreenColumn(
             name="metric_antenna_pair_m",
-            meaning="screen `antenna_pair`: pseudorange rear less front, against what their spacing explains",
+            meaning="screen `antenna_pair`: rear less front pseudorange, less the difference expected from the spacing",
             verdict="antenna_pair",
         ),
     )
@@ -270,7 +272,7 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
     def judge(
         self, front: AntennaRanges, rear: AntennaRanges, pair: PairedEpochs, limits: AntennaPairLimits
     ) -> Mapping[str, tuple[Verdict, ...]]:
-        """Return the verdict on a chunk, the same for both antennas."""
+        """Return the verdict on a chunk for "front" and "rear"; both antennas have the same verdict."""
         at_front, at_rear = pair.front_epoch, pair.rear_epoch
         ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
         here = at_front[:, None], ours

@@ -1,4 +1,4 @@
-"""Positions of the two antennas against their spacing along the track (P1 2.3(5), table 6: 5 m)."""
+"""Comparison of the distance between two antennas' positions with the antenna spacing (P1 2.3(5), table 6: 5 m)."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from railfix.screens.pairs import FilteredMotion, PairedEpochs, PositionScreen
 
 
 class AntennaSpacingLimits(Settings):
-    """Limits of the check of two positions."""
+    """Limits of the antenna-spacing screen."""
 
-    #: Largest difference from the spacing; P1 table 6: 5.
+    #: Largest difference between the distance of the two positions and the antenna spacing; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Filter positions, and speeds, must also differ by this many of their standard deviations, as both may be
-    #: predicted.
+    #: Smallest rejected difference of filter positions or speeds, in standard deviations. It applies in addition to the
+    #: limits in m and m/s, because the filter may predict over gaps.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
-    #: Largest difference of the two speeds by the filter. Antennas of one vehicle have equal speeds, up to a few cm/s
-    #: where the track curves or its cant changes; a smaller difference of single epochs moves no position by a metre.
+    #: Largest difference of the two antennas' filter speeds. Antennas on one vehicle differ in speed by a few cm/s at
+    #: most, where the track curves or its cant changes. A smaller difference at single epochs moves no position by 1 m.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
-    #: Time for which neither position is used: a wrong speed results in a wrong position, which codes correct within
-    #: some 20 s.
+    #: Time after a rejection for which neither filter position is used. A wrong speed causes a wrong position, which
+    #: pseudoranges correct within about 20 s.
     filter_held_s: float = Field(default=20.0, ge=0.0, allow_inf_nan=False)
 
 
@@ -39,24 +39,29 @@ def antenna_spacing_screen(
     facing: ArrayLike = 1,
     limits: AntennaSpacingLimits | None = None,
 ) -> Screened:
-    """Reject pairs of positions that are not as far apart along the track as the antennas (P1 2.3(5); table 6: 5 m).
+    """Reject pairs of positions whose distance along the track differs from the antenna spacing (P1 2.3(5), table 6).
 
     Parameters
     ----------
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
-        Chainages at the same instants along one line; NaN without a position, which is not tested.
+        Chainages at the same instants along one line; a pair with NaN is not rejected.
     spacing_m : array_like, shape (P,) or scalar [m]
         Expected front less rear chainage, not negative: the antenna distance if each chainage refers to its antenna, 0
         if both refer to one reference point.
     facing : array_like of int, shape (P,) or scalar
-        1 if the vehicle's front points to rising chainage, -1 to falling, 0 if unknown; the order of the two is then
-        not tested.
+        1 if the vehicle's front points to rising chainage, -1 if to falling chainage, 0 if unknown. With 0 the order of
+        the two positions is not tested.
 
     Returns
     -------
     Screened
-        Shapes (P,). The metric is ``facing (front - rear) - spacing`` [m], positive if the positions are too far apart;
-        ``|front - rear| - spacing`` where facing is 0. Both positions are rejected.
+        Shapes (P,). The metric is ``facing (front - rear) - spacing`` [m], positive if the positions are too far apart,
+        or ``|front - rear| - spacing`` where facing is 0. A rejection applies to both positions.
+
+    Raises
+    ------
+    ValueError
+        A facing other than -1, 0 and 1, or a negative spacing.
     """
     limits = limits or AntennaSpacingLimits()
     apart = np.asarray(chainage_front_m, dtype=np.float64) - np.asarray(chainage_rear_m, dtype=np.float64)
@@ -64,13 +69,13 @@ def antenna_spacing_screen(
     if not (sign * sign == np.abs(sign)).all():
         raise ValueError("facing must be 1 (rising chainage), -1 (falling) or 0 (unknown)")
     if (spacing < 0.0).any():
-        raise ValueError("spacing_m must not be negative; facing gives the order of the two")
+        raise ValueError("spacing_m must not be negative; facing gives the order of the two antennas")
     metric = np.where(sign == 0, np.abs(apart), sign * apart) - spacing
     return Screened(metric=metric, reject=np.abs(metric) > limits.limit_m, limit=limits.limit_m)
 
 
 class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
-    """Distance of the two positions against the antenna spacing."""
+    """Screen of the distance between two antennas' positions."""
 
     name = "antenna_spacing"
     limits = AntennaSpacingLimits()
@@ -87,7 +92,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge(
         self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict of the position pairs; their order is not tested if the spacing is unknown."""
+        """Return metric and verdict for pairs of positions; an unknown spacing (NaN) counts as 0."""
         along = np.where(np.isnan(pair.along_m), 0.0, pair.along_m)
         return antenna_spacing_screen(
             front_chainage_m, rear_chainage_m, np.abs(along), facing=np.sign(along).astype(int), limits=limits
@@ -96,7 +101,11 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict of filtered pairs: positions or speeds beyond limit and noise."""
+        """Return metric and verdict for pairs of filtered positions.
+
+        A pair is rejected where the positions or the speeds differ by more than their limit and by more than
+        `filter_sigmas` standard deviations.
+        """
         found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
         apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)
         difference = np.abs(front.speed_mps - rear.speed_mps)
@@ -105,7 +114,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         return Screened(metric=found.metric, reject=reject, limit=limits.limit_m)
 
     def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the differences from the spacing against the limit."""
+        """Yield the picture of the differences from the spacing, and their limit."""
         spacing = tables.epochs("metric_antenna_spacing_m")
         yield (
             "antenna_spacing",

@@ -21,17 +21,17 @@ from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import AntennaRanges as AntennaRanges
 
 Limits = TypeVar("Limits", bound=Settings)
-#: Least number of sigmas added to the sigma of a suspected range: at most a fifth of its weight remains.
+#: Minimum error of a suspected range, in sigmas; added in quadrature, it leaves at most a fifth of the range's weight.
 LEAST_SUSPICION: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Screened(NotebookTable):
-    """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
+    """Metric and verdict of one screen, shape (T, M) for observations and (P,) for pairs of positions."""
 
-    metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot be run.
-    reject: Masks  #: True = rejected. Where the metric is NaN the screen does not reject.
-    #: Limit that the metric is compared with, in its unit; broadcasts to it; NaN where nothing is compared.
+    metric: Floats  #: Measured quantity, in the unit of the screen; NaN where the test is impossible.
+    reject: Masks  #: True where rejected; always False where the metric is NaN.
+    #: Limit of the metric, in the same unit; broadcasts to the shape of the metric; NaN where no test is made.
     limit: Floats | float = float("nan")
 
 
@@ -39,18 +39,18 @@ class Screened(NotebookTable):
 class Verdict:
     """A screen's result on the channels of one antenna."""
 
-    name: str  #: Key in `AntennaResult.screens`: the screen's name, or one name per verdict if it has several.
+    name: str  #: Key in `AntennaResult.screens`: the screen's name, or a name per verdict if the screen has several.
     reason: Reason  #: Reason given to the rejected observations.
-    screened: Screened  #: Shapes (T, K).
-    #: Size of the measured error, by which the weight of suspected ranges is lowered; None for rejection; shape (T, K).
+    screened: Screened  #: Metric and verdict, shape (T, M).
+    #: Measured error that is added to the sigma of a suspected range; None if such ranges are rejected; shape (T, M).
     error_m: Floats | None = None
 
 
 def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats:
-    """Return the standard deviation of ranges of which some are suspected, shape (T, M) [m].
+    """Return the standard deviations of ranges, increased for suspected ranges, shape (T, M) [m].
 
-    The error of a suspected range (`reject`), as measured by the screen (`error_m`) and at least two sigmas, is added
-    to `sigma_m` as another standard deviation.
+    For a suspected range (`reject`) the result is ``hypot(sigma_m, max(|error_m|, 2 sigma_m))``; `error_m` is the error
+    that the screen measured, and NaN counts as zero.
     """
     if not reject.any():
         return sigma_m
@@ -66,7 +66,7 @@ class ScreenSetup:
 
     antennas: int = 1  #: Number of antennas.
     spacing_known: bool = False  #: Whether a vehicle file places both antennas on one vehicle.
-    cn0_curve: Cn0Curve | None = None  #: Mean C/N0 over elevation of antenna and receiver.
+    cn0_curve: Cn0Curve | None = None  #: Mean C/N0 of the antenna and receiver as a function of elevation.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ class ScreenColumn:
     name: str  #: Name with its unit: ``metric_doppler_m``.
     meaning: str
     verdict: str  #: Key in `AntennaResult.screens`.
-    field: str = "metric"  #: Array of that verdict: "metric", or another one of a subclass of `Screened`.
+    field: str = "metric"  #: Name of the array in `Verdict.screened` that fills the column.
     table: Literal["observations", "positions"] = "observations"
 
 
@@ -89,19 +89,19 @@ class ScreenPicture:
     metric: Floats  #: Shape (T, M).
     reject: Masks  #: Shape (T, M).
     limit: Floats | float  #: Broadcasts to (T, M).
-    #: Side on which the screen rejects: beyond the limit on both sides, above it, or below it.
+    #: Rejected values: those whose size exceeds the limit ("both"), those above it, or those below it.
     sides: Literal["both", "above", "below"] = "both"
 
 
 class ObservationPicture(NamedTuple):
-    """Picture of an observation column against its limit."""
+    """Definition of a picture that shows an observation column and its limit."""
 
     name: str
     title: str
     label: str
     metric: str  #: Column of the observations.
     reason: Reason  #: Reason of the rejected observations.
-    limit: str  #: Field of the screen's limits (no picture where it is None), or column of the observations.
+    limit: str  #: Field of the screen's limits (if it is None, there is no picture), or column of the observations.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -109,34 +109,34 @@ class RunTables(Protocol):
     """Result tables of one antenna as arrays, for the charts."""
 
     def channels(self, column: str) -> Floats:
-        """Return the column of the observations, shape (T, M); NaN where not observed."""
+        """Return a column of the observations, shape (T, M); NaN where not observed."""
 
     def rejected(self, reason: Reason) -> Masks:
-        """Return observations that carry a reason, shape (T, M)."""
+        """Return the mask of the observations rejected for a reason, shape (T, M)."""
 
     def epochs(self, column: str) -> Floats:
-        """Return the column of the positions, shape (T, 1)."""
+        """Return a column of the positions, shape (T, 1)."""
 
 
 class Screen(ABC, Generic[Limits]):
-    """Base class of a screen; derive from the subclass for its kind of verdict."""
+    """Base class of `ObservationScreen`, `PairScreen` and `PositionScreen`, from which a new screen is derived."""
 
     name: ClassVar[str]  #: Name in `Config.screens` and of its settings group.
     limits: Limits  #: Default limits, whose type defines the settings group.
-    needs: ClassVar[str]  #: Required data, for the note on a missing screen.
+    needs: ClassVar[str]  #: Required data, as quoted in the note that the screen was not run.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
-        """Return whether the screen cannot be run in this run at all."""
+        """Return whether the data required by the screen are missing in the whole run."""
         return False
 
     def notes(self, limits: Limits, setup: ScreenSetup) -> tuple[str, ...]:
-        """Return sentences on a requested screen that cannot be run, or only in part."""
+        """Return notes to the user on a requested screen that cannot be run, or can be run only in part."""
         return (f"screen {self.name} was not run: it needs {self.needs}",) if self.unable(limits, setup) else ()
 
     def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield name and data of each picture of the screen: `observation_pictures`, or an override of it."""
+        """Yield the name and data of each picture of the screen; by default those of `observation_pictures`."""
         for name, title, label, metric, reason, where, sides in self.observation_pictures:
             limit = getattr(limits, where) if hasattr(limits, where) else tables.channels(where)
             if limit is not None:
@@ -144,16 +144,16 @@ class Screen(ABC, Generic[Limits]):
 
 
 class ObservationScreen(Screen[Limits]):
-    """A screen of the observations of one antenna."""
+    """Screen of one antenna's observations."""
 
     @abstractmethod
     def judge(
         self, antenna: AntennaRanges, limits: Limits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdicts on a chunk, and the state for the next one.
+        """Return the verdicts on a chunk of epochs, and the state for the next chunk.
 
         Parameters
         ----------
         state : object
-            State returned with the previous chunk; None at the start. Screens without memory return None.
+            State returned for the previous chunk; None at the start. A screen without memory returns it unchanged.
         """

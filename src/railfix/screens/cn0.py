@@ -1,7 +1,7 @@
-"""C/N0 against its open-sky mean at the elevation, and an absolute floor (P1 2.3(1)).
+"""Comparison of C/N0 with its open-sky mean at the same elevation, and with an absolute floor (P1 2.3(1)).
 
-P1 measures the mean over elevation for antenna and receiver on a day with open sky (`railfix.ranges.cn0_curve`), and
-rejects observations 10 dB-Hz below this mean, and all observations below 30 dB-Hz (table 6).
+P1 measures the mean C/N0 over elevation for each antenna and receiver on a day with open sky
+(`railfix.ranges.cn0_curve`), and rejects observations that are more than 10 dB below this mean, or below 30 dB-Hz.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from railfix.screens.base import (
 
 
 class Cn0Limits(Settings):
-    """Limits of the signal-strength screen."""
+    """Limits of the C/N0 screen."""
 
-    #: Largest deficit against the mean at the elevation; P1 table 6: 10. With None the curve is not used.
+    #: Largest deficit of C/N0 from the mean at the same elevation; P1 table 6: 10. With None the curve is not used.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
     #: Minimum C/N0; with None, the default, there is no floor. P1 table 6 uses 30 for its receivers. Receivers measure
     #: C/N0 differently: 30 rejects over half of an M8T's signals in a city, where 20 to 25 is suitable.
@@ -40,10 +40,10 @@ class Cn0Limits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Screened(Screened):
-    """Verdict on signal strength: the metric is C/N0, the limit is the higher of floor and curve [dB-Hz]."""
+    """Verdict of the C/N0 screen; the metric is C/N0, and the limit is the higher of floor and curve [dB-Hz]."""
 
     floor: Screened  #: Verdict of the floor; the metric is C/N0 [dB-Hz].
-    #: Verdict of the curve; the metric is the mean at the elevation less C/N0 [dB]; NaN without a curve.
+    #: Verdict of the curve; the metric is the mean C/N0 at the elevation less C/N0 [dB], NaN without a curve.
     curve: Screened
 
 
@@ -56,21 +56,21 @@ def cn0_screen(
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
 ) -> Cn0Screened:
-    """Reject signals weaker than under open sky (P1 2.3(1); table 6: mean - 10 dB-Hz, 30 dB-Hz).
+    """Reject observations whose C/N0 is too far below the open-sky mean, or below the floor (P1 2.3(1), table 6).
 
     Parameters
     ----------
     cn0_dbhz : array_like, shape (T, M) [dB-Hz]
-        C/N0; NaN where absent, which is not tested.
+        An observation without C/N0 (NaN) is not rejected.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
     curve : Cn0Curve, optional
-        Mean C/N0 over elevation; without it only the floor is applied.
+        Mean C/N0 as a function of elevation; without it only the floor is applied.
 
     Returns
     -------
     Cn0Screened
-        A signal exactly at the limit is used.
+        Verdicts, shape (T, M). An observation exactly at a limit is not rejected.
     """
     limits = limits or Cn0Limits()
     cn0 = np.asarray(cn0_dbhz, dtype=np.float64)
@@ -93,14 +93,16 @@ def cn0_screen(
 
 
 class Cn0Screen(ObservationScreen[Cn0Limits]):
-    """Signal strength: a floor, and a curve over elevation."""
+    """C/N0 screen with a floor, and a curve over elevation."""
 
     name = "cn0"
     limits = Cn0Limits()
     needs = "a curve over elevation (cn0_curve) or a floor"
     columns = (
         ScreenColumn(
-            name="metric_cn0_deficit_dbhz", meaning="screen `cn0`: mean at the elevation less C/N0", verdict="cn0_curve"
+            name="metric_cn0_deficit_dbhz",
+            meaning="screen `cn0`: mean C/N0 at the satellite's elevation less measured C/N0",
+            verdict="cn0_curve",
         ),
     )
     observation_pictures = (
@@ -114,11 +116,11 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
     )  # fmt: skip
 
     def unable(self, limits: Cn0Limits, setup: ScreenSetup) -> bool:
-        """Return whether there is neither a curve nor a floor."""
+        """Return whether both the curve and the floor are missing."""
         return setup.cn0_curve is None and limits.floor_dbhz is None
 
     def notes(self, limits: Cn0Limits, setup: ScreenSetup) -> tuple[str, ...]:
-        """Return a note where the curve is missing."""
+        """Return a note if the curve is missing; it reports whether the floor is applied."""
         if setup.cn0_curve is not None or limits.floor_dbhz is None:
             return super().notes(limits, setup)
         return (f"screen cn0: no curve over elevation (cn0_curve), only the floor of {limits.floor_dbhz:g} dB-Hz used",)
@@ -126,7 +128,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
     def judge(
         self, antenna: AntennaRanges, limits: Cn0Limits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdicts of floor and curve on a chunk; the screen has no memory."""
+        """Return the verdicts of floor and curve on a chunk, and the state unchanged: the screen has no memory."""
         result = cn0_screen(
             antenna.cn0_dbhz,
             antenna.elevation_deg,

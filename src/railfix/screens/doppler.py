@@ -1,15 +1,15 @@
-"""Change of the pseudorange against the Doppler (P1 2.3(2), figure 4, table 6: 1.5 m).
+"""Comparison of the pseudorange change between epochs with the Doppler (P1 2.3(2), figure 4, table 6: 1.5 m).
 
-A pseudorange that changes by more than the mean of two Dopplers times interval and wavelength has jumped; a constant
-multipath error is not detected. A step of the receiver clock moves all pseudoranges alike: the median over a
-constellation removes it, and the interval is corrected by it beforehand (4 ms times 800 m/s are 3.2 m).
+A pseudorange has jumped if its change differs from the change computed from the Dopplers at both epochs. A constant
+multipath error is not detected. A step of the receiver clock changes all pseudoranges equally, and is removed with the
+median over a constellation. The interval is first corrected for the clock step (4 ms times 800 m/s are 3.2 m).
 
-P1 ran at 0.1 s. Over longer intervals the limit grows with the noise that two codes do not share, ``sqrt(1 - exp(-dt /
-correlation_s))``, the change of acceleration, ``jerk dt^3 / 12``, and the noise of the Doppler, ``sigma dt``. The mode
-of the limit is "fixed" (P1's limit), "receiver" (`factor` times the scale of the receiver's own changes, the median
-over the satellites averaged over the epochs), or "sigma" (`factor` times the sigma of each code, widest for weak
-satellites; in urban recordings at 1 Hz it finds a quarter of the bad codes at the same loss). No mode is below P1's
-limit.
+P1 uses epochs 0.1 s apart. Over longer intervals the limit grows with the uncorrelated part of the pseudorange noise,
+``sqrt(1 - exp(-dt / correlation_s))``, and the change of acceleration, ``jerk dt^3 / 12``. The limit has three modes,
+none of which goes below P1's limit: "fixed" is P1's limit; "receiver" is `factor` times the noise scale of the
+receiver, estimated from its pseudorange changes; "sigma" is `factor` times the standard deviation of each pseudorange
+change, with the Doppler noise ``sigma dt`` included. In urban recordings at 1 Hz the mode "sigma" detects a quarter of
+the faulty pseudoranges, at an equal loss of good ones.
 """
 
 from __future__ import annotations
@@ -32,46 +32,46 @@ from railfix.screens.base import ObservationPicture, ObservationScreen, ScreenCo
 from railfix.screens.medians import clock_medians
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
-_FINEST_M: Final = 1e-3  #: Smallest change used for the receiver's scale [m].
-_LEAST_CHANGES: Final = 5  #: Minimum number of changes for the scale of an epoch.
+_FINEST_M: Final = 1e-3  #: Lower bound of the noise scale of one epoch [m], of which the logarithm is taken.
+_LEAST_CHANGES: Final = 5  #: Minimum number of pseudorange changes for the noise scale of one epoch.
 
 
 class DopplerLimits(Settings):
     """Limits of the Doppler screen."""
 
-    #: Limit scaled by the receiver's noise, fixed as in P1, or scaled by the code sigmas; see the module.
+    #: Limit that is fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
-    #: Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
+    #: Largest difference of pseudorange and Doppler changes up to `short_interval_s`; P1 table 6: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
-    #: Twice P1's interval of 0.1 s, so that one lost epoch has no effect.
+    #: Interval up to which the limit is constant. It is twice P1's 0.1 s, so that one lost epoch has no effect.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
-    #: Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
+    #: Time over which the receiver smooths its pseudoranges. With 1 s the limit is 2.9 m at an interval of 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
     #: Largest jerk of the vehicle; trains stay below 1 [m/s^3].
     jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    #: Modes "receiver" and "sigma": standard deviations.
+    #: Limit in standard deviations, for modes "receiver" and "sigma".
     factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Mode "sigma": standard deviation of a range rate from the Doppler.
+    #: Standard deviation of a range rate from the Doppler, for mode "sigma".
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
-    #: Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
+    #: Weight of the fixed limit in the estimate of the noise scale, in epochs, for mode "receiver".
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Longest interval over which the screen is run.
+    #: Longest interval between two epochs that are compared.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
     #: Time for which a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back,
     #: which is exactly P1's test.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
-    least_satellites: int = Field(default=3, ge=3)  #: Number of satellites of one clock required to eliminate its step.
-    #: Treatment of a suspected satellite: its sigma is increased by the size of the jump
-    #: (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. With few satellites, a rejection can weaken
-    #: the geometry so much that an error of a few metres becomes a hundred; a lower weight does not.
+    least_satellites: int = Field(default=3, ge=3)  #: Minimum number of satellites to eliminate the step of a clock.
+    #: Whether the sigma of a suspected satellite is increased ("weigh"), or the satellite is rejected ("reject"), as in
+    #: P1. The increase follows from the size of the jump (`railfix.screens.suspicion_sigma_m`). With few satellites, a
+    #: rejection can weaken the geometry so much that a position error of a few metres becomes one of a hundred metres.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
 def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = None) -> Floats:
     """Return the limit of mode "fixed" at an interval [m]: 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
 
-    ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``, with dt at least
-    `short_interval_s` in the first term; the second term applies only above it.
+    The limit is ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``. In the
+    first term dt is at least `short_interval_s`; the second term is 0 up to `short_interval_s`.
     """
     limits = limits or DopplerLimits()
     interval = np.asarray(interval_s, dtype=np.float64)
@@ -79,7 +79,7 @@ def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = Non
 
 
 def _growth(interval: Floats, limits: DopplerLimits) -> Floats:
-    """Return the noise of a change relative to the short interval."""
+    """Return the ratio of the noise of a pseudorange change to the noise at `short_interval_s`."""
     long = np.expm1(-np.maximum(interval, limits.short_interval_s) / limits.correlation_s)
     return np.asarray(np.sqrt(long / np.expm1(-limits.short_interval_s / limits.correlation_s)))
 
@@ -89,22 +89,26 @@ def _jerk_m(interval: Floats, limits: DopplerLimits) -> Floats:
 
 
 def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimits) -> Floats:
-    """Limit of mode "sigma", shape (T, M) [m], from sigmas of the codes with the previous epoch, shape (T + 1, M)."""
+    """Return the limit of mode "sigma", shape (T, M) [m].
+
+    `interval_s` has shape (T,). `sigma_m` are the pseudorange sigmas of T + 1 epochs, the first of which precedes the
+    chunk. The limit is NaN where either sigma is NaN.
+    """
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
     noise = (sigma_m[1:] ** 2 + sigma_m[:-1] ** 2) * fresh + (limits.doppler_sigma_mps * interval) ** 2
-    # NaN is preserved: a satellite without a sigma is not tested
+    # np.maximum keeps NaN, so that a satellite without a sigma is not tested
     return np.asarray(np.maximum(limits.step_m, limits.factor * np.sqrt(noise)) + _jerk_m(interval, limits))
 
 
 def receiver_limit_m(
     interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit of mode "receiver", shape (T,) [m], and sum and number of the log scales so far.
+    """Return the limit of mode "receiver", shape (T,) [m], and the sum and number of the log noise scales so far.
 
-    The scale refers to the short interval: the changes of an epoch are divided by the growth of the noise. For a dozen
-    satellites it is a tenth to a seventh too small (their own median is subtracted; logarithms are averaged, so that an
-    epoch full of multipath does not dominate).
+    The noise scale of an epoch is the median absolute change over the satellites, reduced to `short_interval_s`. The
+    logarithms are averaged over the epochs, so that an epoch with much multipath does not dominate. With a dozen
+    satellites the scale is a tenth to a seventh too small, because the median of the same changes has been subtracted.
     """
     growth = _growth(interval_s, limits)
     shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
@@ -124,28 +128,28 @@ _NS: Final = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerScreened(Screened):
-    """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m]; limits have shape (T, M)."""
+    """Verdict of the Doppler screen; the metric is P1's change between successive epochs [m]; shapes (T, M)."""
 
-    #: Code offset of a suspected satellite since before the jump, otherwise 0, NaN as the metric; shape (T, M).
+    #: Offset of a suspected pseudorange from its value before the jump; 0 if not suspected; NaN without a metric.
     level_m: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerState:
-    """Last epoch, and the satellites under suspicion at that epoch; shapes (M,)."""
+    """Observations of the last epoch, and the suspicions at that epoch; shapes (M,)."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
-    #: Channels; the next chunk may have different ones.
+    #: Satellite and signal of each channel; the next chunk may have different channels.
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     signal: Strings = field(default_factory=lambda: np.empty(0, dtype="<U2"))
-    #: NaN where absent.
+    #: Observations, NaN where absent.
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
     code_sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    level_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code offset, as in `DopplerScreened`.
-    #: Time of the jump, NaT where not suspected.
+    level_m: Floats = field(default_factory=lambda: np.empty(0))  #: Pseudorange offset, as in `DopplerScreened`.
+    #: Time of the jump; NaT where the satellite is not suspected.
     since: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Sum of the receiver's log scales, and number of epochs in the sum (mode "receiver").
+    #: Sum of the logarithms of the noise scale, and number of epochs in the sum (mode "receiver").
     scale_sum: float = 0.0
     scale_epochs: float = 0.0
 
@@ -154,7 +158,7 @@ class DopplerState:
 
 
 class DopplerChannels(NamedTuple):
-    """Channels, shape (M,) each; the carrier [Hz] is NaN where unknown: not tested."""
+    """Satellites, signals and carrier frequencies, shape (M,); a channel of unknown frequency (NaN) is not tested."""
 
     satellite: Strings
     signal: Strings
@@ -172,42 +176,42 @@ def doppler_screen(
     limits: DopplerLimits | None = None,
     state: DopplerState | None = None,
 ) -> tuple[DopplerScreened, DopplerState]:
-    """Reject pseudoranges whose change differs from that of their Doppler (P1 2.3(2); table 6: 1.5 m).
+    """Reject pseudoranges whose change between epochs disagrees with the Doppler (P1 2.3(2), table 6: 1.5 m).
 
-    The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the
-    channels of one receiver clock (GPS and QZSS share one).
+    The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the channels of one
+    receiver clock (GPS and QZSS share a clock).
 
-    A single difference does not show which of its two epochs is faulty. A satellite that jumps beyond the limit is
-    suspected and rejected, and its jumps are summed to an offset. When the offset is back within the limit, the
-    satellite is used again at once (its jump back is beyond the limit, and not rejected). If this does not happen
-    within `hold_s`, the new offset is accepted. A passing reflection thus costs its own epochs, and the end of a
-    reflection present from the first epoch on costs `hold_s` of good epochs.
+    A single difference does not show which of its two epochs is faulty. A satellite whose metric exceeds the limit is
+    suspected and rejected, and the metric is summed to an offset. As soon as the offset is within the limit, the
+    satellite is used again, although its jump back exceeds the limit. If the offset does not return within `hold_s`,
+    the new pseudorange is accepted. A temporary reflection therefore removes only its own epochs. The end of a
+    reflection that was present from the first epoch on removes `hold_s` of good epochs.
 
     Parameters
     ----------
     time : array_like of datetime64[ns], shape (T,)
     code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
-        NaN where absent. Implausible codes (0, 1e9) must be left out by the caller.
+        NaN where absent. The caller must replace implausible pseudoranges (0, 1e9) by NaN.
     break_before : array_like of bool, shape (T,), optional
-        Epochs before which no difference is formed.
+        True at epochs that are not compared with the previous epoch.
     code_sigma_m : array_like, shape (T, M) [m], optional
-        Noise of the codes, required by mode "sigma", in which a code with NaN is not tested.
+        Standard deviation of the pseudoranges, required by mode "sigma". Where it is NaN, no test is made.
     state : DopplerState, optional
         State after the previous chunk.
 
     Returns
     -------
     DopplerScreened
-        NaN metric, and no rejection, where there is no previous epoch within `longest_interval_s`, where the satellite
-        lacks code or Doppler at either epoch, and where its clock has fewer than `least_satellites` satellites. A
-        suspicion ends at such an epoch, because the offset is lost.
+        The metric is NaN, and nothing is rejected, where there is no previous epoch within `longest_interval_s`, where
+        the satellite lacks pseudorange or Doppler at either epoch, or where its clock has fewer than `least_satellites`
+        satellites. A suspicion ends at such an epoch, because the offset is no longer known.
     DopplerState
         State for the next chunk.
 
     Raises
     ------
     ValueError
-        Mode "sigma" without `code_sigma_m`.
+        The mode is "sigma", and `code_sigma_m` is missing.
     """
     limits, (satellite, signal, frequency_hz) = limits or DopplerLimits(), channels
     when = np.asarray(time, dtype="datetime64[ns]")
@@ -243,7 +247,7 @@ def doppler_screen(
 
 
 def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
-    """Return the state on the channels of this chunk; other channels have no observation in it."""
+    """Return the state on the channels of this chunk; a channel that is new in the chunk has NaN and NaT."""
     if state.satellite.tobytes() == satellite.tobytes() and state.signal.tobytes() == signal.tobytes():
         return state
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
@@ -255,7 +259,7 @@ def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerS
 
 
 def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | None, limits: DopplerLimits) -> Floats:
-    """Return the interval before each epoch by the time tags, shape (T,) [s]; NaN where no difference may be formed."""
+    """Return the time since the previous epoch, shape (T,) [s]; NaN where the two epochs must not be compared."""
     every = np.concatenate([np.array([last], dtype="datetime64[ns]"), time])
     interval = seconds(every[1:] - every[:-1])
     possible = (interval > 0.0) & (interval <= limits.longest_interval_s)
@@ -265,7 +269,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Return the change of the codes against the Dopplers, the clock eliminated, shape (T, M) [m]."""
+    """Return pseudorange changes less the changes by Doppler and the receiver clock step, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
     # a step of the receiver clock is not elapsed time
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT
@@ -276,7 +280,7 @@ def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *
 def _limit_m(
     interval: Floats, metric: Floats, sigmas: Floats, before: DopplerState, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit of each change, shape (T, M) or (T, 1) [m], and the sums of the receiver's scale."""
+    """Return the limit, shape (T, M) or (T, 1) [m], and the sum and number of the receiver's log noise scales."""
     total, epochs = before.scale_sum, before.scale_epochs
     if limits.mode == "sigma":
         return expected_limit_m(interval, sigmas, limits=limits), total, epochs
@@ -288,7 +292,7 @@ def _limit_m(
 
 
 class DopplerScreen(ObservationScreen[DopplerLimits]):
-    """Change of the pseudorange against the Doppler."""
+    """Screen of the pseudorange change between epochs, by comparison with the Doppler."""
 
     name = "doppler"
     limits = DopplerLimits()
@@ -296,12 +300,12 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     columns = (
         ScreenColumn(
             name="metric_doppler_m",
-            meaning="screen `doppler`: pseudorange change against its Doppler since the previous epoch",
+            meaning="screen `doppler`: pseudorange change since the previous epoch less the change by Doppler",
             verdict="doppler",
         ),
         ScreenColumn(
             name="limit_doppler_m",
-            meaning="screen `doppler`: limit of that change",
+            meaning="screen `doppler`: limit of `metric_doppler_m`",
             verdict="doppler",
             field="limit",
         ),
@@ -316,7 +320,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     def judge(
         self, antenna: AntennaRanges, limits: DopplerLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdict on a chunk, and the state with the satellites under suspicion."""
+        """Return the verdict on a chunk, and the state with its last observations and suspicions."""
         screened, after = doppler_screen(
             antenna.time, np.where((antenna.reason & int(Reason.IMPLAUSIBLE_CODE)) == 0, antenna.code_m, np.nan),
             antenna.doppler_hz, channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),

@@ -28,9 +28,9 @@ class ElevationLimits(Settings):
 
 
 def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None = None) -> Screened:
-    """Reject satellites below the mask, 20 degrees in P1 table 6.
+    """Reject satellites below the elevation mask.
 
-    The metric is the elevation [deg]; NaN where unknown, which is not tested.
+    The metric is the elevation [deg]. A satellite whose elevation is unknown (NaN) is not rejected.
     """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)
@@ -53,7 +53,7 @@ class ElevationScreen(ObservationScreen[ElevationLimits]):
     def judge(
         self, antenna: AntennaRanges, limits: ElevationLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdict on a chunk; the screen has no memory."""
+        """Return the verdict on a chunk, and the state unchanged: the screen has no memory."""
         screened = elevation_screen(antenna.elevation_deg, limits=limits)
         return (Verdict(name="elevation", reason=Reason.ELEVATION_MASK, screened=screened),), state
 

@@ -12,7 +12,10 @@ from railfix.core.constants import CLOCK_GROUP
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
-    """Return the median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
+    """Return the median of `values` over the channels that share a receiver clock, at each channel, shape (T, M).
+
+    The median is NaN where fewer than `least` satellites of the clock have a value.
+    """
     return kernels.screens.clock_medians(
         kernel_array(values), *_clocks(satellite.dtype.str, satellite.tobytes()), least
     )
@@ -20,7 +23,7 @@ def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floa
 
 @lru_cache(maxsize=256)
 def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices]:
-    """Return the clock and satellite indices of M channels."""
+    """Return the indices of clock and satellite of each channel, shape (M,) each."""
     names = np.frombuffer(satellites, dtype=kind).tolist()
     clock, number = (np.unique(of, return_inverse=True)[1] for of in ([CLOCK_GROUP[n[0]] for n in names], names))
     return clock.astype(np.intp), number.astype(np.intp)

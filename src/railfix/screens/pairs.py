@@ -1,4 +1,4 @@
-"""Common epochs and channels of two antennas of one vehicle, and base classes of the screens that compare them."""
+"""Common epochs and channels of two antennas on one vehicle, and base classes of screens that compare two antennas."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from railfix.track.trajectory import Trajectory
 
 
 def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
-    """Return matching epochs of two receivers, whose ascending time tags differ by at most `tolerance_s`.
+    """Return the indices of matching epochs of two receivers, whose time tags differ by at most `tolerance_s`.
 
-    Each epoch is in at most one pair: two epochs are paired if each is the nearest to the other.
+    The time tags must ascend. Two epochs are a pair if each is the nearest to the other, so that no epoch is in two
+    pairs.
     """
     within_ns = round(tolerance_s * 1e9)
     to_rear = nearest_rows(time_rear, time_front, within_ns=within_ns)
@@ -34,7 +35,7 @@ def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: flo
 def pair_channels(
     satellite_front: Strings, signal_front: Strings, satellite_rear: Strings, signal_rear: Strings
 ) -> tuple[Indices, Indices]:
-    """Return the channels of the same satellite and signal at both receivers, in the order of the front receiver."""
+    """Return the front and rear indices of channels with equal satellite and signal, in the front receiver's order."""
     # both receivers' epochs are rows of the same arrays
     if satellite_front is satellite_rear and signal_front is signal_rear:
         every = np.arange(len(satellite_front))
@@ -47,7 +48,7 @@ def pair_channels(
 
 
 def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channels: Indices) -> Screened:
-    """Map a verdict on pairs of epochs and channels to one antenna's epochs and channels, of shape `shape`."""
+    """Expand a verdict on pairs to one antenna's epochs and channels, shape `shape`; NaN metric outside the pairs."""
     metric, reject = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     where = (epochs[:, None], channels) if len(shape) > 1 else epochs
     metric[where], reject[where] = screened.metric, screened.reject
@@ -67,9 +68,10 @@ def pair_antennas(
     *,
     tolerance_s: float,
 ) -> PairedEpochs:
-    """Match the epochs of two antennas by their time tags, with both positions on the line.
+    """Match the epochs of two antennas by their time tags, and compute the positions of both antennas on the line.
 
-    `front_arc_m` has approximate arc lengths of the front antenna, shape (T,).
+    `front_arc_m` is the approximate arc length of the front antenna, shape (T,) [m]. The position of the rear antenna
+    follows from the geometry of the vehicle.
     """
     at_front, at_rear = pair_epochs(front_time, rear_time, tolerance_s=tolerance_s)
     front_arc = front_arc_m[at_front]
@@ -91,7 +93,7 @@ class PairedEpochs:
     #: Approximate positions of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
-    #: Front less rear antenna chainage: negative if facing falling chainage; shape (P,).
+    #: Chainage of the front less the rear antenna; negative if the vehicle faces falling chainage; shape (P,).
     along_m: Floats
 
 
@@ -116,7 +118,7 @@ class PairScreen(_OfTwoAntennas[Limits]):
 
 
 class FilteredMotion(NamedTuple):
-    """Filtered positions [m] and speeds [m/s] of one antenna, NaN where missing, shape (T,)."""
+    """Filtered chainages [m], speeds [m/s] and their sigmas of one antenna, shape (T,); NaN where missing."""
 
     chainage_m: Floats
     sigma_m: Floats
@@ -135,10 +137,10 @@ class PositionScreen(_OfTwoAntennas[Limits]):
 
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:
-        """Return metric and verdict of the P pairs of positions, chainages of shape (P,) [m]."""
+        """Return metric and verdict for P pairs of positions, given as chainages of shape (P,) [m]."""
 
     @abstractmethod
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: Limits
     ) -> Screened:
-        """Return the verdict for the P pairs of filtered positions and speeds."""
+        """Return metric and verdict for P pairs of filtered positions and speeds."""

@@ -1,4 +1,4 @@
-"""RAIM as a screen: its settings and its picture. The pipeline runs it on the solved positions."""
+"""Settings and picture of RAIM, which the pipeline runs on the solved positions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class RaimScreen(Screen[RaimLimits]):
     needs = "more satellites than unknowns"
 
     def pictures(self, tables: RunTables, limits: RaimLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the test statistic against its threshold."""
+        """Yield the picture of the test statistic before any exclusion, and its threshold."""
         statistic, threshold = tables.epochs("raim_statistic"), tables.epochs("raim_threshold")
         unit = "m^2" if limits.mode == "fixed" else "noise variances"
         yield (

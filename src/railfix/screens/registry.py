@@ -1,4 +1,4 @@
-"""Registry of the screens of railfix, and of screens that packages register as entry points of ``railfix.screens``."""
+"""Registry of the screens of railfix, and of screens that other packages provide as entry points."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from railfix.core.errors import SettingsError
 from railfix.screens.base import ObservationScreen, Screen
 from railfix.screens.pairs import PairScreen, PositionScreen
 
-#: Entry-point group.
+#: Entry-point group of the screens in other packages.
 GROUP: Final = "railfix.screens"
 _NAMES: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
 
 
 def in_order(screens: Iterable[Screen[Any]]) -> tuple[Screen[Any], ...]:
-    """Return screens in their order of execution: of one antenna, of two antennas, RAIM, of positions."""
+    """Return screens in order of execution: single-antenna screens, antenna-pair screens, RAIM, position screens."""
     return tuple(sorted(screens, key=_rank))
 
 
@@ -27,7 +27,7 @@ def _rank(screen: Screen[Any]) -> int:
 
 
 def _find_installed() -> list[Screen[Any]]:
-    """Load the screens of installed packages; SettingsError if one is not a screen, or its name is taken."""
+    """Load the screens of installed packages; raise SettingsError for an object that is no screen, or a name in use."""
     found: list[Screen[Any]] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         package = entry.dist.name if entry.dist else "?"
@@ -39,7 +39,8 @@ def _find_installed() -> list[Screen[Any]]:
             )
         if screen.name in (*_NAMES, *(other.name for other in found)):
             raise SettingsError(
-                f"the package {package} has a screen {screen.name}, a name that is taken; rename it or uninstall it"
+                f"the package {package} has a screen {screen.name}, a name that is taken; "
+                "rename the screen or uninstall the package"
             )
         found.append(screen)
     return found
