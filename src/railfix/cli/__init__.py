@@ -1,6 +1,6 @@
 """The command line: the program ``railfix`` and its commands.
 
-Each command is imported when it is called, so that ``railfix --help`` answers at once.
+The module of a command is imported only when the command is called, so that ``railfix --help`` starts quickly.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from railfix import __version__
 from railfix.cli.command import LazyCommands, command_group
 from railfix.core.files import source_commit
 
-# Threads of linear algebra spin while they wait for the next product. It must be set before numpy is imported.
+# OpenBLAS threads occupy their cores while they wait for work. The variable must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
@@ -24,15 +24,15 @@ class _Program(LazyCommands):
 
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
-        "doctor": "Examine files: identify each, check that they fit together, print the command to run.",
+        "doctor": "Identify files, check that they fit together, and print the command to run.",
         "explain": "Explain one epoch of a run: its satellites, sigma, level and status.",
-        "export": "Write positions of a run for maps: KML, GPX, GeoJSON, GeoPackage, GeoParquet.",
+        "export": "Write the positions of a run as KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP.",
         "campaign": "Position many logs in parallel; an interrupted campaign is continued.",
-        "benchmark": "Run a folder of cases, and evaluate railfix and other programs by the same code.",
+        "benchmark": "Run a folder of cases, and evaluate railfix and other programs with the same code.",
         "demo": "Position the demonstration log and compare it with its ground truth.",
-        "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
+        "ablate": "Compare the screens on a log: all together, none, each screen alone, and all but one.",
         "evaluate": "Compute errors of runs against references.",
-        "reference": "Build a reference trajectory from fixed positions, with gaps bridged.",
+        "reference": "Build a reference trajectory from RTK fixed positions, and bridge its gaps.",
         "live": "Position a train from its receivers' streams as they arrive.",
         "locate": "Compute 3-D positions from a log, without a track map.",
         "which-track": "Decide on which track a train at rest is.",
@@ -43,7 +43,7 @@ class _Program(LazyCommands):
         "simulate": "Simulate runs with ground truth.",
         "report": "Write an HTML report on runs.",
         "ground": "Monitor satellites with a reference triangle; supervise trains from the ground.",
-        "map": "Check a track map, make one, or put positions on a network.",
+        "map": "Check or make a track map, or match positions to a network of tracks.",
     }
     modules: ClassVar[Mapping[str, str]] = {
         "convert": "logs",
@@ -66,7 +66,7 @@ app = command_group("railfix", cls=_Program, context_settings={"help_option_name
 
 
 def version_text() -> str:
-    """Return version and commit in one line."""
+    """Return the version of railfix and the source commit in one line."""
     return f"railfix {__version__} (commit {source_commit()})"
 
 
@@ -89,13 +89,13 @@ def railfix(
         ),
     ] = False,
 ) -> None:
-    """Positions of a train along its line, from satellite receiver logs and a 3-D track map.
+    """Compute the positions of a train along its line from satellite receiver logs and a 3-D track map.
 
-    A train runs on a known line, so its antenna lies on a known curve and its position is one
-    number along it. railfix reads RINEX logs, navigation files and a track map, and writes that
-    number for every epoch, with its standard deviation and the reason for every rejected observation.
+    A train runs on a known line, so its antenna lies on a known curve and its position is one number, the chainage.
+    railfix reads receiver logs, navigation files and a track map, and writes the chainage of every epoch, its
+    standard deviation and the reason for every rejected observation.
 
-    To begin: `railfix demo`, then `railfix run --help`.
+    Begin with `railfix demo`, then read `railfix run --help`.
 
     Exit codes:
 
@@ -110,9 +110,9 @@ def railfix(
     - 8: the output cannot be written
     - 9: two channels of a live session computed different outputs from the same input
 
-    128 plus the number of a signal: the program was ended by that signal (143: SIGTERM; 141: the reader of its output
-    ended first).
+    A signal ends the program with exit code 128 plus the number of the signal: 143 for SIGTERM, 141 where the reader of
+    the output ended first (SIGPIPE).
 
-    An error is one sentence on the standard error output; it leaves no results behind. Files that exist are
-    replaced only with `--overwrite`, and an input is never replaced.
+    An error is reported in one sentence on standard error, and no results are written. Existing files are replaced only
+    with `--overwrite`; an input is never replaced.
     """

@@ -1,4 +1,4 @@
-"""Commands on many runs: campaign, benchmark, ablation."""
+"""Commands that process many runs: ``railfix campaign``, ``benchmark`` and ``ablate``."""
 
 from __future__ import annotations
 
@@ -40,25 +40,25 @@ from railfix.run.inputs import ColumnNames, LogReading
 
 @from_models
 def campaign(
-    path: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="Patterns of logs and navigation, track.")],
+    path: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="Patterns of the input files (see above).")],
     reading: LogReading,
     *,
     out: OutOption,
-    workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Processes side by side.")] = 2,
+    workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Number of parallel processes.")] = 2,
     scheduler: Annotated[
         str | None,
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
-            help="Use the workers of a Dask scheduler, tcp://HOST:PORT, that see the same files (extra `cluster`).",
+            help="Dask scheduler, tcp://HOST:PORT, whose workers have access to the same files (extra `cluster`).",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    r"""Position all logs of a campaign, each into its own folder; a killed campaign is continued.
+    r"""Position all logs of a campaign, each run into its own folder; an interrupted campaign is continued.
 
-    CAMPAIGN.toml has patterns with fields in braces, relative to the file. Logs with the same fields are one run;
-    navigation files are matched by the fields that they share with the logs:
+    CAMPAIGN.toml has path patterns with fields in braces, relative to its own folder. Logs with equal field values form
+    one run. Navigation files are assigned to runs by the fields that their pattern shares with the logs' patterns:
 
         front = "logs/{train}/{day}/front.obs*"
         rear = "logs/{train}/{day}/rear.obs*"
@@ -70,15 +70,14 @@ def campaign(
 
     `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too.
 
-    DIR receives `runs/train=A/day=2024-03-05/` with the files of `railfix run` for each run (together one
-    hive-partitioned data set), `campaign.csv` with one row per run, and `campaign.html`, a page on all of them: lines,
-    errors (with `reference`) and levels by run, and the worst ten epochs with their explanations. A run that fails is
-    a row with its error.
-    Runs whose results for the same inputs and settings exist are not repeated.
+    The files of `railfix run` are written into a folder per run, such as `DIR/runs/train=A/day=2024-03-05/`; together
+    these folders are one hive-partitioned data set. `campaign.csv` has one row per run; a run that fails has its error
+    there. The page `campaign.html` shows the lines, the errors (with `reference`) and levels of each run, and the ten
+    worst epochs with their explanations. A run is not repeated if its results for the same inputs and settings exist.
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
-    Exit codes are listed in `railfix --help`; 5 where some runs have failed, 7 where all have failed.
+    Exit codes are listed in `railfix --help`; the code is 5 where some runs have failed, 7 where all have failed.
     """
     with open_executor(workers, scheduler) as (executor, lost):
         prepare_kernels()
@@ -103,21 +102,22 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print the number of finished runs, earlier calls included, and the remaining time."""
+    """Print on standard error the number of finished runs and the remaining time; `kept` runs are of earlier calls."""
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} from before)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
     sys.stderr.flush()
 
 
-#: Signals that end a worker process: Ctrl-C, and the signal of the pool when another worker has ended.
+#: Signals that end a worker process: SIGINT by Ctrl-C, and SIGTERM, sent by the pool when another worker has ended.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 def _prepare_worker() -> None:
-    """Let the signals that were blocked while a worker process began end it.
+    """Install the signal handlers of a worker process, then unblock its signals.
 
-    polars, once imported, replaces the default handlers and ignores Ctrl-C.
+    A signal that is already pending ends the process at once. The handlers are required because polars replaces the
+    default handlers when it is imported and ignores Ctrl-C.
     """
     for each in _ENDING:
         signal.signal(each, _end)
@@ -127,7 +127,7 @@ def _prepare_worker() -> None:
 
 
 def _end(number_of_signal: int, _frame: object) -> None:
-    """End by an exception, which a second signal does not interrupt."""
+    """Raise SystemExit, and ignore further signals so that they do not interrupt it."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number_of_signal)
@@ -135,14 +135,14 @@ def _end(number_of_signal: int, _frame: object) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Yield the executor, and the types of errors that report a lost worker process.
+    """Yield the executor, and the exception types that report a lost worker process.
 
-    SettingsError: the scheduler does not exist, or `distributed` is not installed.
+    Raise SettingsError where no scheduler answers at its address, or `distributed` is not installed.
     """
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
             try:
-                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # of the worker processes, until they are prepared
+                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # inherited by the workers until their initializer
                 for _ in range(workers):
                     pool.submit(int)
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
@@ -168,12 +168,12 @@ def benchmark(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of cases, each a folder with `case.toml`.")],
     choices: Choices,
     out: OutOption,
-    workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Processes side by side.")] = 2,
+    workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Number of parallel processes.")] = 2,
 ) -> None:
     r"""Run the cases of a folder with one configuration, and compare them with other programs.
 
-    `case.toml` of a case names its files, relative to its folder, each with its SHA-256; a file with a different
-    SHA-256 is rejected. `files` has the names of the options of `railfix run`, and the ground truth:
+    `case.toml` names the files of a case, relative to its folder, and their SHA-256; a file with a different SHA-256 is
+    rejected. The keys of `files` are the options of `railfix run`, and `truth` for the ground truth:
 
         licence = "CC BY 4.0"
         fetch = "https://example.org/town.zip"
@@ -191,31 +191,34 @@ def benchmark(
         [sha256]
         "rover.rnx" = "2c26b46b..."
 
-    `positions` are positions of other programs (RTKLIB, NMEA, CSV). They are moved to the nearest point of the line and
-    evaluated by the same code, as are RTKLIB's single-point positions where `rnx2rtkp` is installed. `scenario`
-    describes the recording as EN 16803-2 requires for record and replay; `options` and `evaluation` are options of
-    `railfix run` and `railfix evaluate`. A case with `held_out` is for the benchmark alone: settings derived from its
-    files are rejected.
+    `positions` are logs of positions that other programs computed (RTKLIB, NMEA, CSV). The positions are moved to the
+    nearest point of the line and evaluated with the same code, as are RTKLIB's single-point positions where `rnx2rtkp`
+    is installed. `scenario` describes the recording as EN 16803-2 requires for record and replay; `options` and
+    `evaluation` are options of `railfix run` and `railfix evaluate`. A case with `held_out` is reserved for the
+    benchmark: settings derived from its files are rejected.
 
-    DIR receives `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that exists
-    for the same inputs and settings is not repeated.
+    `benchmark.csv`, `benchmark.json`, `benchmark.md` and the folders of the runs are written into DIR. A run is not
+    repeated if its results for the same inputs and settings exist.
 
     Example: `railfix benchmark cases --out benchmark`
 
-    Exit codes are listed in `railfix --help`; 5 where some cases have failed, 7 where all have failed.
+    Exit codes are listed in `railfix --help`; the code is 5 where some cases have failed, 7 where all have failed.
     """
     config, _ = resolve_settings(choices)
     show_benchmark(folder, config, out=out, workers=workers)
 
 
 def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> None:
-    """Run the cases of a folder, and print the table, notes and files; errors as for `benchmark`."""
+    """Run the cases of a folder, and print the table, the notes and the files.
+
+    Raise NoPositionError where every case has failed, and MismatchError where some cases have failed.
+    """
     with open_executor(workers, None) as (executor, lost):
         prepare_kernels()
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
     console = TableConsole()
     head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
-    caption = "Errors in metres along the line and straight; second line: performance feature of EN 16803-1"
+    caption = "Errors in metres, along the line and straight (3-D); second line: performance feature of EN 16803-1"
     show_table(console, plain_table(head, shown_rows(table), caption, texts=2))
     show_notes(console, notes)
     show_files(console, [out / f"benchmark.{kind}" for kind in ("csv", "json", "md")])
@@ -235,20 +238,20 @@ def ablate(
     *,
     out: OutOption,
 ) -> None:
-    r"""Compare choices of screens on a log: all screens, none, each alone, all but each.
+    r"""Compare the screens on a log: all screens, none, each screen alone, and all but one.
 
     The logs are read once. Screens that are off in the settings stay off, and screens that cannot be run (no second
-    antenna, no C/N0 curve) are left out and reported. Validity and health of the satellites are checked in every case;
-    `none` is these checks alone, without an elevation mask.
+    antenna, no C/N0 curve) are left out and reported. Satellite validity and health are checked in every case; `none`
+    applies these checks only, without an elevation mask.
 
-    With `--filter track` there are rows for the filter along the track too, with all screens on: with every available
-    source (codes, phases, Dopplers, and the sensors given), and without each source except codes.
+    With `--filter track` the table also has rows of the filter along the track, with all screens on: a row with every
+    available source (codes, phases, Dopplers, and the sensors given), and a row without each source except codes.
 
-    For each choice the table shows the fractions of epochs with coordinates and of epochs of status ok, the satellites
-    used, and the median standard deviation along the line. With `--truth` it also shows the errors along the line (an
-    error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs without satellites,
-    and the 95th percentile of the error over its stated sigma. `ablation.csv` in DIR has all figures, with the
-    conventional position; `ablation.json` has the record.
+    For each choice the table shows the fractions of epochs with coordinates and of epochs of status ok, the number of
+    satellites used, and the median standard deviation along the line. With `--truth` it also shows the errors along the
+    line (an error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs without
+    satellites, and the 95th percentile of the ratio of error to stated sigma. `ablation.csv` in DIR has all figures,
+    those of the conventional position included; `ablation.json` has the versions, inputs and settings.
 
     Example:
 

@@ -1,4 +1,4 @@
-"""Commands that are loaded when they are called, and report an error by one sentence and a documented exit code."""
+"""Base classes of the commands: loading on demand, one sentence per error, and a documented exit code."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from railfix.core.errors import InputFileError, OutputError, RailfixError, RailfixWarning, SettingsError, needs_extra
 
-#: Words that users mistakenly give to switches.
+#: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: A signal ends the program with this exit code plus its number, as in a shell.
+#: Exit code of a program that a signal ended, less the number of the signal, as in a shell.
 SIGNALLED: Final = 128
-#: Message of `pathlib` for a link that leads to itself.
+#: Message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
-#: Message of the system for a standard output that accepts no more.
+#: Error numbers of a write to a standard output that accepts no more data.
 _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 
 class Command(TyperCommand):
-    """A command that reports options given twice, switches given a value, and all options that are missing at once."""
+    """Command that rejects repeated options and switches with a value, and reports all missing options together."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, after these checks."""
+        """Check for repeated options and switches with a value, then parse the arguments."""
         options = {name: param for param in self.params for name in getattr(param, "opts", ())}
         given: Counter[str] = Counter()
         words = iter(args[: args.index("--")] if "--" in args else args)
@@ -73,10 +73,10 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """A group whose commands report an error by one sentence and the exit code of the error's class."""
+    """Group of commands that report an error in one sentence and end with the exit code of the error's class."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; an error that the user can fix is reported in one sentence."""
+        """Run the command; a RailfixError is reported in one sentence, and other errors with their traceback."""
         try:
             _check_surroundings()
             with needs_extra(), warnings.catch_warnings():
@@ -86,7 +86,7 @@ class Commands(TyperGroup):
             _end(error)
         except MemoryError:
             _end(
-                SettingsError("this needs more memory than is available; give a shorter time or fewer epochs at a time")
+                SettingsError("this needs more memory than is available; give a shorter time or fewer epochs per chunk")
             )
         except RuntimeError as error:
             loop = _LOOP.match(str(error))
@@ -95,22 +95,22 @@ class Commands(TyperGroup):
             _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; link to the file"))
 
 
-#: For all programs: rich formats only the help.
+#: Options of every typer program: rich formats the help, but not the tracebacks.
 _TYPER: Final[dict[str, Any]] = {
     "add_completion": False, "pretty_exceptions_enable": False, "rich_markup_mode": "markdown"
 }  # fmt: skip
 
 
 def command_group(name: str, *, cls: type[Commands] = Commands, **options: Any) -> typer.Typer:
-    """Return a group of commands; without one of them it shows its help."""
+    """Return a group of commands that shows its help when it is called without a command."""
     return typer.Typer(name=name, cls=cls, no_args_is_help=True, **_TYPER, **options)
 
 
 class LazyCommands(Commands):
-    """The commands of the program, each imported from its module when it is called; `summaries` are for their list."""
+    """Group that imports the module of a command when the command is called; `summaries` are shown in its help."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Modules of commands that share one module.
+    #: Modules of the commands whose module has another name than the command.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -118,13 +118,13 @@ class LazyCommands(Commands):
         return [*super().list_commands(ctx), *self.summaries]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command for the list of commands: name and summary alone."""
+        """Return a placeholder with the name and summary of a command, for the list of commands in the help."""
         if cmd_name in self.summaries:
             return Command(cmd_name, help=self.summaries[cmd_name])
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that is called, imported; for an unknown command the nearest name is suggested."""
+        """Return the name, the imported command and its arguments; an unknown name fails with the nearest name."""
         known = self.list_commands(ctx)
         word = args[0] if args else ""
         near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
@@ -135,7 +135,7 @@ class LazyCommands(Commands):
 
 
 def load_command(name: str, module_name: str | None = None) -> Any:
-    """Return a command, imported from its module in `railfix.cli`, by default the module of the same name."""
+    """Import and return a command from a module in `railfix.cli`, by default the module of the same name."""
     word = name.replace("-", "_")
     module = import_module(f"railfix.cli.{module_name or word}")
     app = getattr(module, "app", None)
@@ -148,7 +148,7 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program; it is no error if a reader of its output stops reading."""
+    """Run the program and exit with its code; standard output closed by its reader is not reported as an error."""
     if number := getattr(signal, "SIGPIPE", None):
         signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -169,7 +169,7 @@ def run_program(app: typer.Typer) -> NoReturn:
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:
-    """End where the reader of the standard output has closed it; other pipes report their own errors."""
+    """Exit if the reader of standard output has closed it; otherwise return, as another pipe reports its own error."""
     poll = select.poll()
     poll.register(1, 0)
     if any(event & select.POLLERR for _, event in poll.poll(0)):
@@ -184,7 +184,7 @@ def _end(error: RailfixError) -> NoReturn:
 
 
 def _check_surroundings() -> None:
-    """Raise an error where no command can work: no working directory, or names that are not text."""
+    """Raise InputFileError where the working directory does not exist, or an argument is not valid UTF-8."""
     try:
         os.getcwd()  # noqa: PTH109
     except OSError:

@@ -32,23 +32,26 @@ if TYPE_CHECKING:
     from railfix.run.driver import Progress as ProgressCall
 
 
-#: Most lines of the verdict of an evaluation.
+#: Maximum number of lines in the verdict of an evaluation.
 _MOST: Final = 5
-#: Most lines that a run prints without ``--verbose``.
+#: Maximum number of lines that a run prints without ``--verbose``.
 _MOST_LINES: Final = 12
 _ANTENNAS: Final = ("front", "rear")
-#: If the 95th percentile of the errors exceeds this many stated standard deviations (2.0 for normal errors), the stated
-#: standard deviation is too small.
+#: Limit on the 95th percentile of |error| / stated sigma, which is 2.0 for normal errors; above this limit the stated
+#: standard deviation is reported as too small.
 _OVERCONFIDENT: Final = 3.0
 
 
 def print_json(values: Mapping[str, Any]) -> None:
-    """Print plain values as one line of JSON; NaN, infinities and paths are written as texts."""
+    """Print values as one line of JSON; NaN, infinities and paths become strings."""
     echo(json.dumps(finite_values(values), default=str, allow_nan=False))
 
 
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """Return the figures of each run and antenna over its own epochs on the map, the worst first."""
+    """Return the error statistics of the positions on the map per run and antenna, over all epochs of the run.
+
+    The largest 95th percentile is first; rows without errors are last.
+    """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
         pl.col("run") != "all", pl.col("antenna") != "all",
@@ -57,7 +60,10 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Return each run's and antenna's accuracy, and whether its stated sigma fits the errors; the worst first."""
+    """Return at most `_MOST` sentences: accuracy per run and antenna, largest errors first, and the next command.
+
+    Each accuracy sentence also states whether the stated sigma fits the errors.
+    """
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
@@ -70,8 +76,10 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
 
 
 def describe_errors(evaluation: Evaluation) -> str:
-    """Return the accuracy of a run's positions against its ground truth, in one sentence: the filter's positions
-    where there are any, errors above their protection level, and the conventional positions.
+    """Return one sentence on the errors of a run's positions against its ground truth.
+
+    It has the errors of the filter's positions if the run has them, otherwise of the single epochs; the number of
+    errors above the protection level; and the errors of the conventional positions.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("run") != "all", pl.col("antenna") == "all"
@@ -94,7 +102,7 @@ def describe_errors(evaluation: Evaluation) -> str:
 
 
 def _judge(row: Mapping[str, Any]) -> str:
-    """Return a sentence on the errors of one run and antenna."""
+    """Return a sentence on the errors of one run and antenna, from a row of `list_antenna_errors`."""
     from railfix.evaluate.accuracy import WRONG_PLACE_M
 
     run, train, _ = str(row["run"]).partition(" (train)")
@@ -116,21 +124,24 @@ def _judge(row: Mapping[str, Any]) -> str:
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels without compiled code on this machine, before a command needs them."""
+    """Compile the kernels that have no compiled code on this machine yet."""
     if not kernels.is_compiled():
         import_module("railfix.live.warm_up").prepare_kernels()
 
 
-#: Width of tables where the output is not a terminal, so that no cell is cut or folded.
+#: Width of tables in characters where the output is not a terminal, wide enough that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
 #: Number of map findings printed; further findings are only counted.
 MOST_FINDINGS: Final = 40
-#: Characters of a page replaced by characters of every terminal.
+#: Replacements for characters that some terminals cannot show.
 _PLAIN: Final = str.maketrans("−–", "--")
 
 
 class TableConsole(Console):
-    """The standard output: text unchanged; a wider table is printed in parts, and no number is cut or folded."""
+    """Console for standard output that prints text unchanged, and a table wider than the console in parts.
+
+    Numbers are never cut or folded.
+    """
 
     def __init__(self) -> None:
         super().__init__(highlight=False, markup=False)
@@ -138,7 +149,7 @@ class TableConsole(Console):
             self.width = max(self.width, _FILE_WIDTH)
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print as `rich` does, tables in parts that fit."""
+        """Print objects as `rich.console.Console.print` does, but split wide tables into parts that fit."""
         for item in objects or ("",):
             if isinstance(item, RichTable):
                 for part in split_table(item, self):
@@ -148,9 +159,10 @@ class TableConsole(Console):
 
 
 def split_table(table: RichTable, console: Console) -> list[RichTable]:
-    """Split a table by its columns into tables that fit the console; each begins with the columns of text.
+    """Split a table by its columns into tables that fit the console; each part repeats the leading text columns.
 
-    Text may fold, numbers do not: a part with a single number may be wider than the console.
+    Text cells may be folded, but numbers are not, so a part with a single column of numbers may be wider than the
+    console.
     """
     options = console.options.update(width=_FILE_WIDTH)
     if console.measure(table, options=options).maximum <= console.width:
@@ -171,7 +183,7 @@ def split_table(table: RichTable, console: Console) -> list[RichTable]:
 
 
 def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable:
-    """Return a table of some columns, with the same rows and frame."""
+    """Return a copy of a table that has only the given columns."""
     part = RichTable(*(column.copy() for column in columns), box=table.box, show_edge=table.show_edge)
     part.padding, part.pad_edge = table.padding, table.pad_edge
     for cells in zip(*(column.cells for column in columns), strict=True):
@@ -180,7 +192,7 @@ def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable
 
 
 def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
-    """Print a table of results under its caption, limited to a number of rows."""
+    """Print a table of results under its caption; at most `most` rows, then the number of the rows left out."""
     if table.caption:
         console.print(table.caption)
     if not table.rows:
@@ -218,7 +230,10 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """Yield a progress bar on the standard error output, with rate and time left; silent without a terminal."""
+    """Yield the function that updates a progress bar on standard error; nothing is printed without a terminal.
+
+    The bar shows the number of epochs, the rate in epochs/s and the remaining time.
+    """
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -232,7 +247,7 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
     def show(*, epochs: int, fraction: float) -> None:
-        bar.start()  # its thread starts with the first epochs: a run forks before it starts threads
+        bar.start()  # only now, as it starts a thread, and a run must fork before it has threads
         elapsed = bar.tasks[task].elapsed or 0.0
         bar.update(task, completed=fraction, epochs=epochs, rate=epochs / elapsed if elapsed > 0 else 0.0)
 
@@ -243,10 +258,9 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
 
 
 def show_summary(summary: RunSummary, *, verbose: bool) -> None:
-    """Print the verdict on a run, its notes, the location of the results and the next command, in at most `_MOST_LINES`
-    lines.
+    """Print the verdict on a run, its notes, the location of the results and the next command.
 
-    With `verbose` all notes, and the tables of statuses and reasons.
+    At most `_MOST_LINES` lines are printed; with `verbose` all notes, and the tables of statuses and reasons.
     """
     console = TableConsole()
     lines = summary.verdict.lines()
@@ -273,13 +287,13 @@ def show_summary(summary: RunSummary, *, verbose: bool) -> None:
 
 
 def show_budget(console: Console, summary: RunSummary) -> None:
-    """Print epochs by status and pseudoranges by reason."""
+    """Print the tables of the numbers of epochs by status and of pseudoranges by reason."""
     for table in budget_tables(summary.record["antennas"], level_basis(summary.record)):
         show_table(console, table)
 
 
 def join_antennas(notes: Iterable[str]) -> list[str]:
-    """Return notes in their order; notes that are equal for two antennas are merged."""
+    """Return the notes in order; equal notes "front: TEXT" and "rear: TEXT" become "front and rear: TEXT"."""
     texts: dict[str, list[str]] = {}
     for note in notes:
         antenna, colon, text = note.partition(": ")

@@ -1,4 +1,4 @@
-"""``railfix demo``: the demonstration run positioned and compared with its ground truth."""
+"""``railfix demo``: position the demonstration run and compare it with its ground truth."""
 
 from __future__ import annotations
 
@@ -41,23 +41,24 @@ def demo(
 ) -> None:
     """Position the log that comes with railfix, and compare it with its ground truth.
 
-    The log is simulated: a train with two antennas on a line with curves and cant; the README beside the
-    log describes it. railfix positions it as `railfix run` does. The report compares the positions on the
-    map, and the conventional ones (3-D single point of unscreened ranges, moved to the nearest point of the
-    line), with the ground truth, as `railfix report` does.
+    The log is a simulated run of a train with two antennas on a line with curves and cant; the README in the folder
+    of the log describes the run. The log is positioned as by `railfix run`. The report compares the positions on the
+    map and the conventional positions (3-D single point of unscreened ranges, moved to the nearest point of the
+    line) with the ground truth, as `railfix report` does.
 
-    DIR receives `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet`,
-    `run.json`, the folder `unscreened` of the run for the conventional positions, and `report.html`, the page
-    to open in a browser.
+    DIR receives `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet` and
+    `run.json` of the run, the folder `unscreened` with the run for the conventional positions, and the page
+    `report.html`, to open in a browser.
 
     With `--real` the log is a car's drive of 20 minutes through a town. It is part of the wheel `gnss-benchmark` (MIT)
     of the package index, which pip downloads and which is kept unpacked in the user's cache. The map is made from the
-    drive's ground truth, which RTKLIB computes where it is installed. `railfix benchmark` compares the positions with
-    the ground truth, and with RTKLIB's positions; the case is in the folder `drive` of DIR, the result in `benchmark`.
+    drive's ground truth, which RTKLIB computes where it is installed. `railfix benchmark` evaluates the positions of
+    railfix and of RTKLIB against the ground truth; the case is written into `DIR/drive`, the results into
+    `DIR/benchmark`.
 
     Example: `railfix demo --out first-look`
 
-    Exit codes are listed in `railfix --help`; with `--real`, 3 also where the drive cannot be downloaded.
+    Exit codes are listed in `railfix --help`; with `--real` the code is also 3 where the drive cannot be downloaded.
     """
     if real:
         from railfix.cli.campaign import show_benchmark
@@ -72,7 +73,7 @@ def demo(
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
         summary = run_files(inputs, Config(), out=out, options=options, progress=progress)
-    # the conventional positions of P1 use ranges that are not screened
+    # P1 computes conventional positions from ranges that are not screened
     unscreened = Config(filter="off", screens=("elevation",), protection="off")
     run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
     runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])

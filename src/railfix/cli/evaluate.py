@@ -1,4 +1,4 @@
-"""Commands about references: errors against them, how they are built, and models fitted with them."""
+"""Commands ``railfix evaluate``, ``reference``, ``error-model`` and ``cn0-curve``."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Largest numbers of sections, and of epochs with an error beyond the level, that are shown; the files have all rows.
+#: Maximum numbers of printed rows by section, and of printed epochs with an error beyond the level; files have all.
 _MOST_SECTIONS: Final = 20
 _MOST_BEYOND: Final = 5
 
 
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
-    """Print the figures of each run, then by groups, then the location of the files."""
+    """Print the verdict, the references of each run, the tables of errors and levels, and the files written."""
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
     for run in evaluation.runs:
@@ -93,19 +93,20 @@ def evaluate(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    r"""Compute errors of runs along the line against references, and statistics of them.
+    r"""Compute the errors of runs along the line against references, and their statistics.
 
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
-    either direction of travel. There are tables of the positions on the map, of the positions with status ok, and of
-    conventional positions (3-D single point, moved to the nearest point of the line), each over its own epochs and over
-    the common epochs; by antenna, section, environment, speed, satellites used, with and without satellites, and
-    status; for several runs also by configuration and line.
+    either direction of travel. Tables are made of the positions on the map, of the positions with status ok, and of
+    conventional positions (3-D single point, moved to the nearest point of the line), over the epochs of each kind of
+    position and over their common epochs. Errors are grouped by antenna, section, environment, speed, number of
+    satellites used, presence of satellites, and status; with several runs also by configuration and line.
 
-    `evaluation.json` in DIR has all figures, options and hashes of the inputs, `errors.parquet` one row per epoch and
-    antenna; further files are `tables.csv`, `intervals.csv` and, where a run has protection levels, `levels.csv`,
-    `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and `beyond_KIND.csv` (every epoch whose
-    error exceeds its level), with KIND `sbas`, `separation` or `train`; for the filter along the track `outages.csv`
-    (stretches without satellites) and `branches.csv` (stated probability of a branch against its correctness).
+    `evaluation.json` in DIR has all figures, the options and the hashes of the inputs; `errors.parquet` has one row per
+    epoch and antenna. Further files are `tables.csv` and `intervals.csv`. A run with protection levels also has
+    `levels.csv`, `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and `beyond_KIND.csv` (every
+    epoch whose error exceeds its level), with KIND `sbas`, `separation` or `train`. The filter along the track has
+    `outages.csv` (stretches without satellites) and `branches.csv` (stated probability of a branch, and how often it
+    was correct).
 
     Example:
 
@@ -139,7 +140,10 @@ def evaluate(
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
-    """Return each run with its reference and label."""
+    """Return each run with its reference, or None for `auto`, and its label.
+
+    Raise SettingsError where the number of references or labels does not match the number of runs.
+    """
     references = reference * len(runs) if len(reference) == 1 else reference
     if len(references) != len(runs):
         raise SettingsError(
@@ -161,33 +165,34 @@ def reference(
     *,
     out: OutOption,
 ) -> None:
-    r"""Build the antennas' reference trajectory from fixed positions on the track, and bridge the gaps between them.
+    r"""Build the reference trajectory of each antenna from RTK fixed positions on the track, and bridge its gaps.
 
-    Positions are rejected if they are not fixed, have a low ratio, lie off the antenna's trajectory, disagree with the
-    distance travelled, or if the two antennas are not as far apart as on the vehicle. The others are matched to the
-    trajectory. Between them Doppler speeds, pulses and acceleration, whichever are given, are weighted by their
-    variances, and the closing error of each gap is distributed over it. Written into DIR:
+    A position is rejected if it is not an RTK fix, has a low ambiguity ratio, lies off the antenna's trajectory,
+    disagrees with the distance travelled, or if the two antennas are not as far apart as on the vehicle. The remaining
+    positions are matched to the trajectory. The gaps between them are bridged by Doppler speeds, tachometer pulses and
+    accelerations, as far as they are given, weighted by their variances; the closing error of a gap is distributed over
+    it. The following files are written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
     - `fixes.csv`: every position with its test result and measurements
     - `reference.json`: versions, hashes of the inputs, settings given and used, counts by reason, gaps
 
-    Gaps that are too long and instants of too large a standard deviation are left out, counted and reported. All times
-    are GPS time.
+    Gaps that are too long, and instants whose standard deviation is too large, are left out, counted and reported. All
+    times are GPS time.
 
     Example:
 
         railfix reference --rtk rtk.pos --track line.csv --vehicle car.toml \
             --front front.obs --nav brdc.nav --pulses tacho.csv --out reference
 
-    Exit codes are listed in `railfix --help`; 7 where there are fewer than two good fixes.
+    Exit codes are listed in `railfix --help`; the code is 7 where there are fewer than two good fixes.
     """
     asked = settings.model_dump(mode="json", exclude_unset=True)
     show_reference(reference_files(inputs, settings, out=out, options=options, asked=asked))
 
 
 def show_reference(summary: ReferenceSummary) -> None:
-    """Print counts by antenna, the notes, and the location of the results."""
+    """Print the numbers of fixes, instants and rejections per antenna, the notes, and the files written."""
     for name, part in summary.built.items():
         source = part.reference.source
         counts = part.fixes.counts()
@@ -215,20 +220,20 @@ def error_model(
     fit: ErrorModelFit,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Model the errors of corrected pseudoranges: multipath of the line and receiver noise.
+    """Model the errors of corrected pseudoranges, which are multipath on the line and receiver noise.
 
-    Each RUN is positioned again with its own settings. The error of a pseudorange is its residual after the
-    distance from the reference and the receiver clock are subtracted, and with `--base` also the residual of a
-    nearby reference station to the same satellite. Without `--base` the model includes the orbit, clock and atmospheric
-    errors of the days recorded: it is wider, and valid for such days.
+    Each RUN is positioned again with its own settings. The error of a pseudorange is its residual after subtraction of
+    the distance from the reference position and of the receiver clock; with `--base` the residual of a nearby reference
+    station to the same satellite is subtracted too. Without `--base` the model includes the orbit, clock and
+    atmospheric errors of the days recorded, so that it is wider and valid only for days with similar errors.
 
-    The file has bias, standard deviation and a Gaussian overbound for every bin of elevation, azimuth from the
-    car's front and C/N0, before the screens and after. `railfix run --error-model MODEL.toml` derives
-    the protection level from it.
+    The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, azimuth relative
+    to the front of the car and C/N0, before and after the screens. `railfix run --error-model MODEL.toml` derives the
+    protection level from the model.
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
-    Exit codes are listed in `railfix --help`; 5 where run, reference and station do not match.
+    Exit codes are listed in `railfix --help`; the code is 5 where run, reference and station do not match.
     """
     reference = beside.reference
     if len(reference) != len(runs):
@@ -237,7 +242,7 @@ def error_model(
     read = [path for run in runs if (run / "run.json").is_file() for path in read_record(run).inputs.paths]
     check_outputs((out, "any"), overwrite=overwrite, inputs=[*reference, *beside.base, *in_runs, *read])
     if own := [file for file in beside.base if file.resolve() in [path.resolve() for path in read]]:
-        raise SettingsError(f"--base {own[0]}: is a log of the run itself; give the log of a reference station")
+        raise SettingsError(f"--base {own[0]}: this is a log of the run itself; give the log of a reference station")
     position = beside.base_position
     place = None if position is None else parse_position(position, "--base-position")
     inputs = [
@@ -251,7 +256,7 @@ def error_model(
 
 
 def priors_text(rate: FaultRate) -> str:
-    """Return a sentence on the priors that a run with this model assumes."""
+    """Return a sentence on the fault priors that a run with this model assumes."""
     if not rate.bounds_priors:
         return (
             f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: the levels of runs with this model stay "
@@ -293,22 +298,22 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
 def cn0_curve(
     observations: Annotated[
         list[Path],
-        typer.Argument(metavar="OBS...", help="RINEX observation files of one receiver, about a day."),
+        typer.Argument(metavar="OBS...", help="RINEX observation files of one receiver over about a day."),
     ],
     *,
     nav: Annotated[
         list[Path],
-        typer.Option("--nav", metavar="FILE", help="RINEX navigation file of that day; repeat it for several."),
+        typer.Option("--nav", metavar="FILE", help="RINEX navigation file of that day; may be repeated."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="CURVE.toml", help="Curve to write.")],
     plot: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Picture of the samples, the mean and the threshold.")
+        Path | None, typer.Option(metavar="PNG", help="Picture of the samples, the mean C/N0 and the threshold.")
     ] = None,
     position: Annotated[
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Position of the antenna to some kilometres, in degrees and metres; by default the header's.",
+            help="Antenna position to within a few kilometres, in degrees and metres; by default from the file header.",
         ),
     ] = None,
     bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
@@ -317,14 +322,15 @@ def cn0_curve(
 ) -> None:
     """Fit the mean C/N0 over elevation of one antenna and receiver.
 
-    Record about a day under open sky with the antenna and the receiver of the train: the curve is valid for this
-    antenna and receiver only. One curve is fitted per constellation and signal; the file names its inputs. Positioning
-    then rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor
-    applies.
+    Record about a day under open sky with the antenna and the receiver of the train: the curve is valid only for this
+    antenna and receiver. One curve is fitted per constellation and signal; the file names its inputs. With the curve,
+    positioning rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor
+    on the C/N0 can be applied.
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 
-    Exit codes are listed in `railfix --help`; 5 where the position or the navigation files do not match the log.
+    Exit codes are listed in `railfix --help`; the code is 5 where the position or the navigation files do not match the
+    log.
     """
     fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else parse_position(position, "--position")

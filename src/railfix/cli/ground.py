@@ -1,4 +1,4 @@
-"""``railfix ground``: the ground side."""
+"""``railfix ground``: satellite monitoring with a reference triangle, and train supervision by a control centre."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ app = command_group("ground")
 
 @app.callback()
 def ground() -> None:
-    """Monitor satellite positioning from the ground, and demonstrate the ground side.
+    """Monitor satellite positioning from the ground, and supervise trains.
 
-    A reference triangle of three receivers finds satellite faults, disturbances and failed receivers; a control centre
-    supervises trains over two encrypted links, gives each train the distance that it may run, and sets points.
+    A reference triangle of three receivers detects satellite faults, disturbances and failed receivers. A control
+    centre supervises trains over two encrypted links, sends a movement authority to each train, and sets points.
     """
 
 
@@ -42,13 +42,13 @@ class MonitorChoices(Settings):
     """Logs of `railfix ground monitor` and the folder of its results."""
 
     nav: tuple[Path, ...] = option(
-        "RINEX navigation file; repeat it for several. Streams may contain their own navigation records.",
+        "RINEX navigation file; may be repeated. Streams may contain their own navigation records.",
         (),
         metavar="FILE",
     )
     out: Path = option("Folder for monitor.csv and triangle.png.", metavar="DIR")
     point: tuple[str, ...] = option(
-        "Known point of a receiver, in the order of the logs; by default from the headers of the logs.",
+        "Known coordinates of a receiver, in the order of the logs; by default from the headers of the logs.",
         (),
         metavar="LAT,LON,HEIGHT",
     )
@@ -76,20 +76,22 @@ def monitor(
 ) -> None:
     """Monitor satellite positioning with three receivers at known points.
 
-    Single-point fixes from the same satellites are compared with the points by circles, and the vectors between the
-    fixes with the vectors between the points. The first cause that stops the trains is latched and printed.
+    The single-point fixes of the receivers are computed from the same satellites. Each fix must lie within a circle
+    around its known point, and the vectors between the fixes must agree with the vectors between the points. The first
+    cause that stops the trains is latched and printed.
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
 
-    With --fixes the logs are positions that another program or service has computed, such as CLAS.
+    With --fixes the logs contain positions that another program or service has computed, such as CLAS.
 
     Example: `railfix ground monitor --fixes a.pos b.pos c.pos --point ... --point ... --point ... --out monitor`
 
-    With --live the logs are streams, evaluated as they arrive until they end; monitor.csv grows with them.
+    With --live the logs are streams, which are evaluated as they arrive until they end; rows are appended to
+    monitor.csv.
 
     Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
-    Exit codes are listed in `railfix --help`; 5 where the logs have no satellite or no epoch in common.
+    Exit codes are listed in `railfix --help`; the code is 5 where the logs have no satellite or no epoch in common.
     """
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
@@ -111,7 +113,7 @@ def monitor(
 
 
 def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits, times: MonitorLimits) -> None:
-    """Monitor logs, or streams until they end or for a time; write rows to a file and print orders as they occur."""
+    """Monitor logs, or streams until they end or `for_s` is over; append rows to monitor.csv and print each order."""
     import asyncio
     import time
 
@@ -130,7 +132,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
     async def work() -> None:
         async for fixes in _fixes(logs, choices):
-            # recorded streams use the clock of their time tags
+            # without a clock reading, as for recorded streams, the time tags are the clock
             judged = monitor.judge(fixes, None if recorded else time.monotonic())
             choices.out.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if counts else "wb") as file:
@@ -166,7 +168,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
 
 async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[StationFixes]:
-    """Yield the receivers' fixes: from logs all epochs in one object, from streams one epoch at a time."""
+    """Yield the fixes of the receivers; logs yield all epochs in one object, streams one object per epoch."""
     from railfix.ground.fixes_at_stations import read_fixes, stream_fixes
     from railfix.io import read_navigation
     from railfix.live.sources import check_source
@@ -184,9 +186,9 @@ async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[Stat
 
 
 class KeyChoices(Settings):
-    """Trains for which keys are made."""
+    """Trains for which keys are made, and validity of the certificates."""
 
-    train: tuple[int, ...] = option("Trains, from 1.", metavar="N")
+    train: tuple[int, ...] = option("Number of a train, from 1; may be repeated.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
     renew: Literal["add", "renew"] = option(
         "Make new keys and certificates for the centre and these trains; the previous certificates stay "
@@ -205,16 +207,16 @@ def keys(
         Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; it is created if it does not exist.")
     ],
 ) -> None:
-    """Make keys and certificates of a centre and its trains; add trains, and renew certificates.
+    """Make keys and certificates of a centre and its trains, add trains, and renew certificates.
 
-    A certificate authority signs the certificates. Its key (authority.key) stays in DIR; the centre gets authority.pem
-    and its own two files, each train authority.pem and its own two files. If DIR has a certificate authority already,
-    trains are added. The serial number of each certificate is printed: written into revoked.txt of the centre's folder,
-    it revokes that certificate. Only their owner can read the keys.
+    A certificate authority signs the certificates. Its key (authority.key) must stay in DIR. Copy authority.pem and the
+    centre's two files to the centre, and authority.pem and a train's two files to each train. If DIR already has a
+    certificate authority, trains are added. The serial number of each certificate is printed; to revoke a certificate,
+    write its serial number into revoked.txt in the centre's folder. Key files can be read only by their owner.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
-    Exit codes are listed in `railfix --help`; 8 where all certificates exist already.
+    Exit codes are listed in `railfix --help`; the code is 8 where all certificates exist already.
     """
     from cryptography.x509 import load_pem_x509_certificate
 
@@ -234,14 +236,16 @@ def keys(
 
 
 class DemoChoices(Settings):
-    """Demonstration."""
+    """Options of the demonstration of the ground side."""
 
-    seed: int = option("Seed of losses and noise.", 1, metavar="N", ge=0)
-    speed: float = option("Simulated seconds a second.", 6.0, metavar="X", ge=1, le=50)
+    seed: int = option("Seed of the random losses and noise.", 1, metavar="N", ge=0)
+    speed: float = option("Simulated time per real time.", 6.0, metavar="X", ge=1, le=50)
     port: int = option("Port of the page; 0 for any free port.", 0, metavar="PORT", ge=0, le=65535)
-    hold: float = option("Keep the page after the end for this time.", 0.0, metavar="S", ge=0, le=3600)
+    hold: float = option("Time for which the page is kept after the end.", 0.0, metavar="S", ge=0, le=3600)
     coverage: Path | None = option(
-        "Picture of the links: response rates along the line, round trips over time and position.", None, metavar="PNG"
+        "Picture of the links: response rates along the line, and round-trip times over time and chainage.",
+        None,
+        metavar="PNG",
     )
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
 
@@ -249,11 +253,11 @@ class DemoChoices(Settings):
 @app.command("demo", cls=Command)
 @from_models
 def demo(choices: DemoChoices) -> None:
-    """Show two trains, two lossy links each, a centre with its page, and a satellite fault.
+    """Demonstrate two trains with two lossy links each, a centre with its page, and a satellite fault.
 
     The trains meet in a passing loop; one bearer fails, then both bearers of one train. At the end a satellite clock
-    drifts, the reference triangle detects it, satellite positioning is suspended and the trains stop. All traffic stays
-    on loopback addresses; the program ends after about half a minute with a table of events.
+    drifts. The reference triangle detects the drift, satellite positioning is suspended and the trains stop. All
+    traffic stays on loopback addresses. The program ends after about half a minute with a table of events.
 
     Example: `railfix ground demo --hold 60`
 
@@ -292,19 +296,19 @@ def demo(choices: DemoChoices) -> None:
 
 
 class CentreChoices(Settings):
-    """Options of a centre's page, and duration of the session."""
+    """Options of the centre's page, and the duration of the session."""
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
-        "File with the password for orders in its first line, and NAME PASSWORD of a person in each "
-        "further line; without it a password is made and printed.",
+        "File with the password for orders in its first line, and the NAME and PASSWORD of a person in each "
+        "further line; without the file a password is generated and printed.",
         None,
         metavar="FILE",
     )
     orders: str | None = option(
-        "Accept orders at a separate address, and none at the address of the page.", None, metavar="HOST:PORT"
+        "Separate address that accepts orders; the address of --page then accepts none.", None, metavar="HOST:PORT"
     )
-    for_s: float | None = option("End after this time; by default at a signal.", None, name="--for", metavar="S", ge=0)
+    for_s: float | None = option("End after this time; by default on a signal.", None, name="--for", metavar="S", ge=0)
 
 
 @app.command("centre", cls=Command)
@@ -314,12 +318,12 @@ def centre(
     *,
     path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="Line, trains, keys and addresses.")],
 ) -> None:
-    r"""Supervise the trains of a line with a page: receive reports, send authorities, set points and routes.
+    r"""Supervise the trains of a line: receive reports, send movement authorities, set points and routes, show a page.
 
-    Trains connect over two QUIC links with certificates of `railfix ground keys`. Every report that is acknowledged
-    and every authority is in the database before it is sent, so the centre may be killed and started again at any
-    time. The page can be read without a log-in; the release of a stop and routes by hand need one. Points are
-    simulated.
+    Trains connect over two QUIC links with the certificates of `railfix ground keys`. Reports are written into a
+    database before they are acknowledged, and authorities before they are sent, so the centre may be killed and
+    restarted at any time. The page can be read without a log-in; releasing a stop and setting a route by hand require a
+    log-in. Points are simulated.
 
         keys = "keys"
         listen = { A = "127.0.1.1:4433", B = "127.0.2.1:4433" }
@@ -333,7 +337,7 @@ def centre(
 
     Example: `railfix ground centre line.toml --password secret.txt`
 
-    Exit codes are listed in `railfix --help`; 143 after SIGTERM.
+    Exit codes are listed in `railfix --help`; the code is 143 after SIGTERM.
     """
     import asyncio
     import secrets
@@ -364,9 +368,9 @@ def centre(
 
 
 class TrainChoices(Settings):
-    """Options of a train's end of the links."""
+    """Options of the on-board end of the links."""
 
-    keys: Path = option("authority.pem and the train's own two files.", metavar="DIR")
+    keys: Path = option("Folder with authority.pem and the train's own two files.", metavar="DIR")
     centre: tuple[str, ...] = option(
         "Address of the centre on bearer A, then its address on bearer B.", metavar="HOST:PORT"
     )
@@ -374,7 +378,7 @@ class TrainChoices(Settings):
         "Local address on bearer A, then on bearer B; by default the system chooses.", (), metavar="HOST"
     )
     integrity: Path | None = option(
-        'The train\'s integrity device writes "complete" here at least every 2 s.', None, metavar="FILE"
+        'File into which the train integrity device writes "complete" at least every 2 s.', None, metavar="FILE"
     )
     for_s: float | None = option("End after this time.", None, name="--for", metavar="S", ge=0)
 
@@ -387,16 +391,17 @@ def train(
     *,
     number: Annotated[int, typer.Argument(metavar="N", min=1, help="Number of the train.")],
 ) -> None:
-    """Carry the positions of a train to the centre over two links, and its authorities back.
+    """Send the positions of a train to the centre over two links, and receive its movement authorities.
 
-    Reads position messages as JSON lines from standard input (`railfix live ... --send json@-`) and reports the newest
-    every second. Writes a JSON line for each authority, for each beginning and end of braking, and for each line that
-    is not a position message. Ends with its input, once the last report is answered or after 5 s.
+    The command reads position messages as JSON lines from standard input (`railfix live ... --send json@-`) and reports
+    the newest message every second. It writes a JSON line for each authority, for each beginning and end of braking,
+    and for each input line that is not a position message. At the end of its input it waits for the answer to the last
+    report, at most 5 s, and ends.
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes are listed in `railfix --help`; also 0 where no authority was received, which is reported on standard
-    error.
+    Exit codes are listed in `railfix --help`; the code is also 0 where no authority was received, which is reported on
+    standard error.
     """
     import asyncio
 

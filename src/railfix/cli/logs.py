@@ -1,4 +1,4 @@
-"""Commands on logs and files: 3-D positions, the track of a train at rest; convert, export, examine."""
+"""Commands ``railfix locate``, ``which-track``, ``convert``, ``export`` and ``doctor`` on logs and other files."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ def locate(
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
     reading: LogReading,
     *,
-    out: Annotated[Path, typer.Option(metavar="FILE.pos", help="Positions to write, RTKLIB's solution format.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.pos", help="Positions to write, in RTKLIB's solution format.")],
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute conventional 3-D positions with standard deviations from a log alone, without a track map.
+    """Compute conventional 3-D positions with standard deviations from a log, without a track map.
 
-    Ranges that disagree with the others are left out. The file has quality 5 (single); `railfix map match`
-    puts it on the tracks of a network. `railfix map survey` makes a map from logs, which is better than a map from such
-    positions.
+    Pseudoranges that are inconsistent with the others are excluded. The positions have quality 5 (single);
+    `railfix map match` matches them to the tracks of a network. To make a map, use `railfix map survey` on the logs:
+    its map is better than a map made from these positions.
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 
-    Exit codes are listed in `railfix --help`; 7 where no epoch has a position.
+    Exit codes are listed in `railfix --help`; the code is 7 where no epoch has a position.
     """
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -79,20 +79,22 @@ def which_track(
     ] = None,
     save_last: Annotated[
         Path | None,
-        typer.Option("--save-last", metavar="FILE.json", help="Probabilities of tracks, for --last at the next start."),
+        typer.Option(
+            "--save-last", metavar="FILE.json", help="Track probabilities to write, for --last at the next start."
+        ),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Decide on which track a train at rest is, or report that it is undecided.
+    """Decide on which track a train at rest is, or report `undecided`.
 
-    Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
-    codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with a
-    base station carrier phases are used, too. The decision is taken when the probability of all other hypotheses
-    together is below `--risk`; otherwise all probabilities are printed.
+    Each track of the map within 60 m is a hypothesis; a further hypothesis is a track missing from the map (`none`).
+    The code errors of a satellite are nearly constant at rest, so longer observation helps less than independent
+    samples would. With a base station carrier phases are used, too. A track is decided when the probability of all
+    other hypotheses together is below `--risk`; all probabilities are printed in any case.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
-    Exit codes are listed in `railfix --help`; 5 where the train moves or no track is near.
+    Exit codes are listed in `railfix --help`; the code is 5 where the train moves or no track is near.
     """
     check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -149,14 +151,14 @@ def convert(
 ) -> None:
     """Write the observations and the ephemerides of receiver logs as RINEX files.
 
-    The kind of a log is detected from its content. UBX needs RXM-RAWX for observations and RXM-SFRBX for
-    ephemerides; SBF MeasEpoch and raw navigation pages; RTCM 3 MSM4 to MSM7 and 1019, 1020, 1042,
-    1044 to 1046. Skipped items (damaged bytes, unknown signals, messages of other kinds) are
-    counted and printed.
+    The format of a log is detected from its content. Observations are read from the UBX messages RXM-RAWX, the SBF
+    blocks MeasEpoch, and the RTCM 3 messages MSM4 to MSM7. Ephemerides are read from the UBX messages RXM-SFRBX, the
+    raw navigation pages of SBF, and the RTCM 3 messages 1019, 1020, 1042 and 1044 to 1046. Skipped data (damaged bytes,
+    unknown signals, other messages) are counted and reported.
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
 
-    Exit codes are listed in `railfix --help`; 3 where a log contains nothing that was requested.
+    Exit codes are listed in `railfix --help`; the code is 3 where a log contains nothing that was requested.
     """
     if out is None and nav_out is None:
         raise SettingsError("nothing to write: give --out for observations, --nav-out for ephemerides, or both")
@@ -180,24 +182,25 @@ def export(
         bool | None,
         typer.Option(
             "--filter/--single",
-            help="Positions of the filter along the track, or of single epochs; by default the filter's positions "
-            "if the run has them.",
+            help="Write the positions of the filter along the track, or of single epochs; by default the filter's "
+            "positions if the run has them.",
         ),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write the positions of a run for maps and ROS 2: KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP.
 
-    The ending of FILE chooses the format. Each position has its time, antenna, status, chainage, standard deviation,
+    The extension of FILE selects the format. Each position has its time, antenna, status, chainage, standard deviation,
     protection level, speed and track, as far as the run has them; an infinite level is left empty. Epochs without a
-    position are left out. Coordinates are WGS 84, heights above the ellipsoid.
+    position are left out. Coordinates are WGS 84 with ellipsoidal heights.
 
-    GeoJSON, GeoPackage and GeoParquet files get a style of the same name (`.qml`) that colours the positions by status
-    in QGIS. MCAP has every column of the run.
+    For GeoJSON, GeoPackage and GeoParquet files a style file of the same name (`.qml`) is written, which colours the
+    positions by status in QGIS. MCAP files have every column of the run.
 
     Example: `railfix export results --out positions.gpkg`
 
-    Exit codes are listed in `railfix --help`; 4 where a package is not installed, 7 where no epoch has a position.
+    Exit codes are listed in `railfix --help`; the code is 4 where a package is not installed, 7 where no epoch has a
+    position.
     """
     tables = list_position_tables(run)
     if filtered and tables and "train" not in tables:
@@ -233,14 +236,15 @@ def doctor(
 ) -> None:
     """Identify files before a run, check whether they fit together, and print the command to run.
 
-    The kind of a file is found by its content: a log of observations, navigation, a track map, positions, a vehicle or
-    settings. Mismatches and missing files come first, then the command, ready to copy, then the facts of each file
-    (span in GPS time, rate, gaps, satellites, signals, position, frame, heights). Nothing is written.
+    The content of a file determines its kind: observation log, navigation file, track map, log of positions, vehicle
+    file or settings. Mismatches and missing files are printed first, then the command, ready to copy, then the
+    properties of each file (span in GPS time, rate, gaps, satellites, signals, position, frame, heights). No file is
+    written.
 
     Example: `railfix doctor front.obs brdc.nav line.csv car.toml`
 
-    Exit codes: 0 all files fit together; 3 a given file does not exist; 5 files do not match, a needed file is missing,
-    or the kind of a file is unknown.
+    The exit code is 0 where all files fit together, 3 where a given file does not exist, and 5 where files do not
+    match, a required file is missing, or the kind of a file is unknown.
     """
     from railfix.run.doctor import examine_files
 

@@ -1,4 +1,4 @@
-"""``railfix map``: check a track map, make one, and networks of tracks."""
+"""``railfix map``: check and make track maps, and work with networks of tracks."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from railfix.track import (
 from railfix.track.quality import error_note, needed_spacing_m
 
 app = command_group(
-    "map", help="Check a track map, make one from positions or from a network, and put positions on a network."
+    "map", help="Check track maps, make them from runs or from a network, and match positions to a network of tracks."
 )
 
 TracksArgument = Annotated[
     list[Path],
-    typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."),
+    typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track maps, joined in this order to one route."),
 ]
 
-#: Options for reading a map, for commands whose output does not depend on its accuracy.
+#: Options for reading a map, for commands whose output does not depend on the frame and accuracy of the map.
 PointsReading = Annotated[
     TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma", "plan_sigma")
 ]
@@ -60,19 +60,19 @@ def check(
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
     mid_chord: Annotated[
-        float, typer.Option(metavar="M", help="Largest deviation of a chord from the arc at its middle.")
+        float, typer.Option(metavar="M", help="Largest mid-chord deviation from the arc that is not an error.")
     ] = 0.30,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Check a track map and print its faults.
 
-    It checks spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
-    where given, otherwise from the circle through neighbouring points), kinks, jumps and reversals of the
-    kilometrage, gradients and height spikes, cant, and curve attributes against the points.
+    The command checks the spacing of points and duplicate points; mid-chord deviation from the arc (from `radius_m`
+    where given, otherwise from the circle through neighbouring points); kinks; jumps and reversals of the kilometrage;
+    gradients and height spikes; cant; and curve attributes, which it compares with the points.
 
     Example: `railfix map check line.csv --out report`
 
-    Exit codes are listed in `railfix --help`; 6 where the track map has errors.
+    Exit codes are listed in `railfix --help`; the code is 6 where the track map has errors.
     """
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
@@ -113,22 +113,22 @@ def features(
         list[Path] | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of `railfix run` with --tachometer and --inertial: lists the features that the train "
-            "measured next to the features of the map; may be repeated.",
+            help="Folder of `railfix run` with --tachometer and --inertial; the features that the train measured are "
+            "listed next to those of the map; may be repeated.",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="File for the features; without it they are only printed.")
+        Path | None, typer.Option(metavar="CSV", help="File for the features; by default they are only printed.")
     ] = None,
     reading: PointsReading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """List the features of a line: the positions where its gradient or curvature changes.
+    """List the features of a line, which are the positions where its gradient or curvature changes.
 
     A train that measures the same change can determine its position (`railfix.motion.features`). Changes are computed
     over 15 m, about the distance between two bogies. With `--run` the features are the changes that several runs
-    measured consistently: their positions by run, the spread (as in P2's table 1), and the distance from the map's
-    feature.
+    measured consistently. Each feature then has the number of runs that measured it, the standard deviation of their
+    positions (as in P2's table 1), and the distance from the feature of the map.
 
     Example:
 
@@ -136,7 +136,7 @@ def features(
 
         railfix map features line.csv --run results-1 --run results-2
 
-    Exit codes are listed in `railfix --help`; 3 also where a run has no measurements.
+    Exit codes are listed in `railfix --help`; the code is also 3 where a run has no measurements.
     """
     import polars as pl
 
@@ -202,7 +202,7 @@ def from_positions_command(
         str | None,
         typer.Option(
             metavar="Q,Q...",
-            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); by default 1 where the log has them.",
+            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); by default 1 if the log has any.",
         ),
     ] = None,
     max_sigma: Annotated[
@@ -216,13 +216,13 @@ def from_positions_command(
 ) -> None:
     """Make a track map from the positions of one run.
 
-    Positions of other quality and at standstill are left out, and the rest is thinned to the spacing; deviations
-    between two points stay within 0.30 m. The map is the path of that antenna: use it without a vehicle file. A run
-    over several laps gives several laps.
+    Positions of another quality or at standstill are left out, and the rest is thinned to the spacing such that
+    the path deviates by at most 0.30 m from the line between two points. The map is the path of the antenna: use it
+    without a vehicle file. A run over several laps gives a map with several laps.
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 
-    Exit codes are listed in `railfix --help`; 3 also where the positions form no line.
+    Exit codes are listed in `railfix --help`; the code is also 3 where the positions form no line.
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
@@ -268,8 +268,8 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
     needed = needed_spacing_m(quality)
     if needed < spacing.max():
         console.print(
-            f"chords of the sharpest curve stay within 1 cm with points every {needed:.1f} m; between points the "
-            "antenna's path follows the arc"
+            f"points every {needed:.1f} m would keep the chords of the sharpest curve within 1 cm of the arc; between "
+            "points the antenna's path follows the arc"
         )
     show_notes(console, track.provenance.notes)
     rows = []
@@ -292,7 +292,7 @@ def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None
     if quality.errors:
         show_notes(console, error_note(quality))
         console.print(
-            "a larger --spacing smooths noisy positions; a road turns more sharply than the checks allow a line"
+            "a larger --spacing smooths noisy positions; on a road, curves may be sharper than the checks allow"
         )
     else:
         console.print(f"map check: 0 errors, {plural(quality.warnings, 'warning')}")

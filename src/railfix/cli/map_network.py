@@ -1,4 +1,4 @@
-"""``railfix map network``, ``map route`` and ``map match``: networks of tracks."""
+"""``railfix map network``, ``map route`` and ``map match``: commands on networks of tracks."""
 
 from __future__ import annotations
 
@@ -29,24 +29,23 @@ from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 
-#: Settings for reading a track that only a run needs.
+#: Options for reading a track that only a run uses.
 RUN_ALONE = ("reference", "cache")
-#: Options for reading a map alone.
+#: Options for reading a map in a command without a run.
 MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]
 
 
 class RouteChoice(Settings):
-    """Selection of a route through a network."""
+    """Selection of a route through a network by its tracks, by points or by positions."""
 
     tracks: str | None = option(
-        "Tracks to pass, in order; tracks between them are found.", None, metavar="NAME,NAME..."
+        "Tracks of the route, in order; tracks between them are added.", None, metavar="NAME,NAME..."
     )
-    via: tuple[str, ...] = option("A point to pass; repeat it in the order of travel.", (), metavar="LAT,LON")
+    via: tuple[str, ...] = option("Point on the route; repeat it in the order of travel.", (), metavar="LAT,LON")
     positions: Path | None = option("Positions of a run on the route.", None, metavar="LOG", panel=INPUTS)
     heights: Path | None = option(
-        "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m "
-        "or kilometrage_m, or "
-        "positions of a run.",
+        "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), a CSV table over chainage_m "
+        "or kilometrage_m, or positions of a run.",
         None,
         metavar="FILE",
         panel=INPUTS,
@@ -60,10 +59,13 @@ class RouteChoice(Settings):
 
 
 class Connecting(Settings):
-    """Settings of track connections, and of matching positions to tracks."""
+    """Tolerance of track connections, and frame of the positions."""
 
     tolerance: float = option(
-        "Ends nearer than this are one point, where the file has no connections.", TOLERANCE_M, metavar="M", gt=0.0
+        "Distance within which ends of tracks are connected, if the file has no connections.",
+        TOLERANCE_M,
+        metavar="M",
+        gt=0.0,
     )
     same_frame: Literal["no", "yes"] = option(
         "The positions are in the frame of the map (RTK from its base stations), not in the frame of the satellites.",
@@ -73,11 +75,11 @@ class Connecting(Settings):
 
 
 class MatchOptions(Settings):
-    """Expected distances of positions from a track, and outputs."""
+    """Cross-track error of the positions, rows to fill, and files to write."""
 
     sigma: float | None = option(
         "Standard deviation of the distance from the track, including the map's error; by default as "
-        "stated in LOG, otherwise estimated from LOG, otherwise 4 m.",
+        "stated in LOG, or else estimated from LOG, or else 4 m.",
         None,
         metavar="M",
         gt=0.0,
@@ -89,17 +91,17 @@ class MatchOptions(Settings):
         gt=0.0,
     )
     fill: Rows = option(
-        "Rows to be placed on the shortest route: gaps for rows without a position between known "
-        "positions; off-map also for rows whose positions lie off the map, as in a tunnel, including "
-        "rows at the start and end of LOG.",
+        "Rows that are filled along the shortest route. gaps: rows without a position between known positions; "
+        "off-map: also rows whose positions lie off the map, as in a tunnel, including rows at the start and end "
+        "of LOG.",
         "gaps",
     )
     picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
-    page: Path | None = option("Page to look at: plan to zoom, switches, faults, tables.", None, metavar="FILE.html")
+    page: Path | None = option("Page to write: zoomable plan, switches, faults, tables.", None, metavar="FILE.html")
 
 
 Page = Annotated[
-    Path | None, typer.Option(metavar="FILE.html", help="Page to look at: plan to zoom, switches, faults, tables.")
+    Path | None, typer.Option(metavar="FILE.html", help="Page to write: zoomable plan, switches, faults, tables.")
 ]
 
 
@@ -119,12 +121,13 @@ def network(
 ) -> None:
     """Check a network of tracks and print its faults.
 
-    It checks gaps between ends, connections that do not meet, dead ends, kinks at switches, tracks nearer to each
-    other than vehicles need.
+    The command reports gaps between ends, connections whose ends do not meet, dead ends, kinks at switches, and tracks
+    whose distance is less than vehicles require.
 
     Example: `railfix map network tracks.gpkg --out network.png`
 
-    Exit codes are listed in `railfix --help`; 6 where the network has gaps, kinks, or connections that do not meet.
+    Exit codes are listed in `railfix --help`; the code is 6 where the network has gaps, kinks, or connections whose
+    ends do not meet.
     """
     check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
     tracks = _network(maps, reading, connecting)
@@ -168,11 +171,11 @@ def route(
 ) -> None:
     """Make the track map of one route from a network or another map file.
 
-    The route is named by its tracks, by points that it passes, or found from the positions of a run.
+    The route is given by its tracks or by points on it, or is found from the positions of a run.
 
     Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
 
-    Exit codes are listed in `railfix --help`; 5 where no route connects two positions.
+    Exit codes are listed in `railfix --help`; the code is 5 where no route connects two positions.
     """
     files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=files)
@@ -199,7 +202,10 @@ def route(
 def _route_tracks(
     net: Network, choice: RouteChoice, log: PlanLog | None, connecting: Connecting, reading: TrackReading
 ) -> tuple[list[int], list[str]]:
-    """Return the tracks of the requested route, and notes."""
+    """Return the indices of the tracks of the requested route in order, and notes.
+
+    Raise SettingsError where a network of several tracks is given without --tracks, --via or --positions.
+    """
     if choice.tracks:
         return net.shortest_route([net.find_index(name.strip()) for name in choice.tracks.split(",")]), []
     if choice.via:
@@ -216,7 +222,7 @@ def _route_tracks(
 def _in_frame_of(
     net: Network, log: PlanLog, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
-    """Return the positions of a log in the network's frame, and a note on their shift."""
+    """Return the positions of a log in the reference frame of the network, and notes on the log and on the shift."""
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)
@@ -246,10 +252,11 @@ def match_command(
     reading: Annotated[TrackReading, Without(*RUN_ALONE, "height_sigma")],
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.
+    """Match positions to the tracks of a network: track, chainage on the track, probability, and the next best track.
 
-    Rows without a position between known positions are filled along the shortest route; `filled_bound_m` bounds their
-    error. The map is moved to the frame of the positions at their time. Positions far from all tracks have none.
+    Rows without a position between known positions are filled along the shortest route; `filled_bound_m` bounds the
+    error of a filled row. The positions are transformed to the reference frame of the map at their epoch. The track of
+    a position far from all tracks is empty.
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
 

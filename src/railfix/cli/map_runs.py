@@ -1,4 +1,4 @@
-"""``railfix map service`` and ``railfix map survey``: satellite service by chainage, a map from several runs."""
+"""``railfix map service`` and ``railfix map survey``: satellite service by chainage, and a map from several runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from railfix.core.tables import Column, count, listing, number, percent, plain_t
 from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
-#: Fraction of the epochs of a stretch that must lie within the alarm limit for the stretch to be served.
+#: A stretch is served if the protection level is within the alarm limit at this fraction of its epochs or more.
 _SERVED: Final = 0.95
 _COLUMNS: Final[Sequence[Column]] = (
     ("chainage m", "from_m", count),
@@ -48,15 +48,14 @@ def service(
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit of the level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Report by chainage where satellites serve a line: satellites in view, reflections, fraction of ok epochs,
-    protection levels.
+    """Report the satellite service of a line by chainage: satellites used, reflections, fraction of ok epochs, levels.
 
-    Reflections are visible in the distance from the line to the 3-D position, which is computed without the map.
-    Several runs at different times of the day are more representative than one.
+    The distance of the 3-D position from the line indicates reflections, because this position is computed without the
+    map. Several runs at different times of the day are more representative than one run.
 
     Example: `railfix map service monday-results tuesday-results --out service.csv --page service.html`
 
-    Exit codes are listed in `railfix --help`; 5 where the runs are on different maps.
+    Exit codes are listed in `railfix --help`; the code is 5 where the runs are on different maps.
     """
     from railfix.core.staged_files import write_whole
     from railfix.evaluate.intervals import compute_service
@@ -98,10 +97,10 @@ def service(
 
 
 class SurveyFiles(Settings):
-    """Files given with the runs, and options for reading them."""
+    """Navigation files, picture and name of a survey."""
 
     nav: tuple[Path, ...] = option(
-        "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS
+        "Navigation file of the logs; may be repeated, for several days.", (), metavar="NAV", panel=INPUTS
     )
     picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
     name: str | None = option("Name of the track; by default the name of the file.", None, metavar="NAME")
@@ -125,15 +124,16 @@ def survey(
     columns: ColumnNames,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make one smoothed 3-D track map from several runs of ordinary receivers, with its standard deviation per point.
+    """Make one smoothed 3-D track map, with a standard deviation per point, from several runs of ordinary receivers.
 
-    Laps, both directions, standstill and runs over a part of the line are allowed; outliers get little weight. Logs of
-    observations make a better map than their positions: changes of the carrier phase and Dopplers give the shape. The
-    map is the path of the antenna. Runs on different days average errors that all positions of one day share.
+    Laps, runs in both directions, standstill and runs over a part of the line are allowed; outliers are down-weighted.
+    Logs of observations give a better map than logs of positions, because carrier-phase changes and Dopplers determine
+    the shape of the line. The map is the path of the antenna. Runs on several days average the errors that are common
+    to all positions of a day.
 
     Example: `railfix map survey monday.obs tuesday.obs --nav monday.nav --nav tuesday.nav --out line.csv`
 
-    Exit codes are listed in `railfix --help`; 5 where the runs lie apart.
+    Exit codes are listed in `railfix --help`; the code is 5 where the runs lie apart.
     """
     from railfix.run.locate import survey_files
     from railfix.track import write_track_csv

@@ -1,4 +1,4 @@
-"""Command-line options from `Settings` models, which declare each option once; settings from options."""
+"""Conversion of `Settings` models into command-line options, and of the options into settings."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ VerboseOption = Annotated[
     typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
 ]
 JsonOption = Annotated[
-    bool, typer.Option("--json", rich_help_panel="Choices", help="Print the verdict as one line of JSON.")
+    bool, typer.Option("--json", rich_help_panel="Choices", help="Print the result as one line of JSON.")
 ]
 
 
 def overwriting(asked: bool) -> Overwrite:
-    """Return the `Overwrite` that `OverwriteOption` requests."""
+    """Return "replace" if `--overwrite` is given, otherwise "refuse"."""
     return "replace" if asked else "refuse"
 
 
 def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, inputs: Iterable[Path | None]) -> list[Path]:
-    """Raise where a file cannot or must not be written (`check_output_file`); return the requested files."""
+    """Return the requested files; raise the errors of `check_output_file` where a file must not be written."""
     asked = [(path, kind) for path, kind in outputs if path is not None]
     read = [path for path in inputs if path is not None]
     for path, kind in asked:
@@ -59,7 +59,7 @@ def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, input
 
 
 class Without:
-    """Fields of a model that a command has no option for."""
+    """Annotation with the names of the fields of a model for which a command has no option."""
 
     def __init__(self, *names: str) -> None:
         self.names = names
@@ -67,7 +67,7 @@ class Without:
 
 @dataclass(frozen=True, kw_only=True)
 class _Option:
-    """One option: the field of a model (`path` leads to it) and the parameter of the command."""
+    """Option of a command: names of the fields that lead to its value in the model, and parameter of the command."""
 
     path: tuple[str, ...]
     parameter: inspect.Parameter
@@ -77,16 +77,16 @@ class _Option:
 
     @property
     def name(self) -> str:
-        """The option as written by the user."""
+        """Option as it is written on the command line, such as ``--out``."""
         info = get_args(self.parameter.annotation)[1]
         return str(info.default)
 
 
 def from_models(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command whose parameters that are `Settings` models are replaced by an option per field.
+    """Return a command in which each parameter that is a `Settings` model is replaced by one option per field.
 
-    Fields without `railfix.core.settings.option` get none, nor do those named by `Without`; fields that are
-    models are replaced in turn. Two models may share an option: each receives its value.
+    Fields that are not declared by `railfix.core.settings.option`, and fields named by `Without`, have no option.
+    Fields that are models are replaced in turn. An option that two models share sets the field in both models.
     """
     hints = get_type_hints(command, include_extras=True)
     parameters: dict[str, inspect.Parameter] = {}
@@ -107,7 +107,7 @@ def from_models(command: Callable[..., None]) -> Callable[..., None]:
         used = {option.parameter.name for _, options in models.values() for option in options}
         command(**{name: value for name, value in values.items() if name not in used}, **built)
 
-    # typer takes both the signature and the annotations
+    # typer reads both the signature and the annotations
     run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
     run.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
     del run.__wrapped__
@@ -157,14 +157,14 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
 
 
 def _gps_time(text: str) -> datetime:
-    """Read a time of the command line: GPS time, or with a time zone, which is converted to GPS time."""
+    """Return the GPS time of a text; a time with a time zone is converted. BadParameter: the text is not a time."""
     try:
         time = datetime.fromisoformat(text.strip().replace("/", "-"))
     except ValueError:
         raise typer.BadParameter(
             f"{text!r} is not a GPS time such as 2026-05-12, 2026-05-12T03:00 or 2026-05-12T03:00:00.5 (a "
             "time with a "
-            "zone, 2026-05-12T03:00Z, is converted)"
+            "zone, such as 2026-05-12T03:00Z, is converted)"
         ) from None
     if time.tzinfo is None:
         return time
@@ -174,7 +174,7 @@ def _gps_time(text: str) -> datetime:
 
 
 def _plain_type(annotation: Any) -> tuple[Any, bool]:
-    """Return the type of one value, and whether several are allowed."""
+    """Return the type of a single value of an annotation, and whether several values are allowed."""
     if get_origin(annotation) is Annotated:
         return _plain_type(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -185,7 +185,10 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 
 
 def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any]) -> Model:
-    """Return the model with the values of the command line; SettingsError names the option that is out of range."""
+    """Return the model with the values of the command line.
+
+    Raise SettingsError, with the name of the option, where a value is out of range.
+    """
     values: dict[str, Any] = {}
     for chosen in options:
         value = given[chosen.parameter.name]
@@ -214,17 +217,16 @@ def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any])
 
 
 class Choices(Settings):
-    """Settings of a run from the command line; later fields override earlier ones."""
+    """Settings of a run from the command line; later options override earlier options, in the order of the fields."""
 
     preset: str | None = option(
-        "Base preset, which other settings override: default; strict, with fewer positions of higher "
-        "integrity; p1, the limits of the paper from which the screens are taken, for geodetic receivers at "
-        "10 Hz.",
+        "Base preset, which other settings override. default; strict: fewer positions of higher integrity; p1: the "
+        "limits of the paper in which the screens are described, for geodetic receivers at 10 Hz.",
         None,
         metavar="NAME",
     )
     config: Path | None = option(
-        "Settings file; settings that it does not contain have their defaults.", None, metavar="TOML"
+        "Settings file; settings that are not in the file have their defaults.", None, metavar="TOML"
     )
     setting: tuple[str, ...] = option(
         "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
@@ -233,16 +235,16 @@ class Choices(Settings):
         metavar="KEY=VALUE",
     )
     screens: str | None = option(
-        "Screens to use: elevation, cn0, doppler, antenna_pair, raim, antenna_spacing; or none.",
+        "Screens to use: elevation, cn0, doppler, antenna_pair, raim, antenna_spacing, or none.",
         None,
         metavar="NAME,NAME",
     )
     without: tuple[str, ...] = option("Switch one screen off; may be repeated.", (), metavar="NAME")
     filter: Literal["track", "off"] | None = option(
-        "Filter along the track over all epochs, into train.csv and train.parquet: track (the default) or off.", None
+        "Filter along the track over all epochs, written to train.csv and train.parquet: track (default) or off.", None
     )
     cn0_curve: Path | None = option(
-        "Mean C/N0 over elevation of antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"
+        "Mean C/N0 over elevation of the antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"
     )
     error_model: Path | None = option(
         "Pseudorange errors of this line for weights and protection level, from railfix error-model.",
@@ -251,7 +253,7 @@ class Choices(Settings):
     )
     sbas: tuple[Path, ...] = option(
         "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word stream for the "
-        "messages in the receivers' own logs and streams. Their corrections replace the models, and "
+        "messages in the receivers' own logs and streams. Ranges are then corrected as DO-229D requires, and "
         "satellites without a valid correction are rejected.",
         (),
         metavar="FILE",
@@ -260,7 +262,11 @@ class Choices(Settings):
 
 
 def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the file's settings overridden by the command line's, and the settings that were given explicitly."""
+    """Return the settings in force, and the settings that were given explicitly.
+
+    Options of the command line override the settings file. Raise SettingsError where a setting is unknown, out of range
+    or given twice.
+    """
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:
@@ -291,7 +297,7 @@ def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
 
 
 def _screens(option: str, text: str) -> list[str]:
-    """Return the names of screens, with commas between them."""
+    """Return the names of screens in a text with commas; SettingsError where a name is unknown or repeated."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in SCREEN_NAMES:
@@ -309,7 +315,10 @@ def check_set_once(settings: tuple[str, ...]) -> None:
 
 
 def set_value(values: dict[str, Any], text: str) -> None:
-    """Insert one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
+    """Insert one KEY=VALUE into nested settings; the value is parsed as TOML, or else kept as text.
+
+    Raise SettingsError where the text has no key or no equals sign, or a group of the key is a single setting.
+    """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SettingsError(f"--set {text}: expected KEY=VALUE, for example elevation.mask_deg=15")

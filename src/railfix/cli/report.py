@@ -1,4 +1,4 @@
-"""Commands on finished runs: report, explanation of one epoch, pictures of screens."""
+"""Commands ``railfix report``, ``explain`` and ``plot-screens`` on finished runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SATELLITES: Final[Sequence[Column]] = (
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
+#: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: larger arrays are allocated in separate pages [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
@@ -50,14 +50,14 @@ def report(
         list[Path] | None,
         typer.Option(
             metavar="RUN",
-            help="Another run on the same log, whose conventional positions are shown: a run with `--screens "
+            help="Another run on the same log, whose conventional positions are shown. A run with `--screens "
             "elevation` gives unscreened positions, as in P1. Repeat the option with one for each run in "
             "order.",
         ),
     ] = None,
     background: Annotated[
         Path | None,
-        typer.Option(metavar="GEOJSON", help="Streets, buildings or the like to draw below the plan (WGS 84)."),
+        typer.Option(metavar="GEOJSON", help="Background of the plan, such as streets and buildings (WGS 84)."),
     ] = None,
     columns: ColumnNames,
     title: Annotated[str, typer.Option(metavar="TEXT", help="Heading of the page.")] = "",
@@ -65,18 +65,18 @@ def report(
 ) -> None:
     """Write one HTML page on one or several runs, to open in a browser.
 
-    It begins with one sentence, five key figures, the plan of the line coloured by error, and the error over chainage
-    compared with the conventional error. Below, folded: figures of merit, counts, protection levels, settings and
-    inputs, each table with a CSV download. Then the charts of each antenna: errors, protection levels, intervals and,
-    with `railfix run --observations`, sky, C/N0 and screens. The page lists omitted parts with the reasons. Errors need
-    `--reference`.
+    The page begins with one sentence, five key figures, the plan of the line coloured by error, and the error over
+    chainage compared with the conventional error. Folded sections follow with figures of merit, counts, protection
+    levels, settings and inputs; each table has a CSV download. The charts of each antenna show errors, protection
+    levels, intervals and, with `railfix run --observations`, sky, C/N0 and screens. Omitted parts are listed with the
+    reasons. Errors require `--reference`.
 
-    The page contains everything it shows: it opens without a network and can be sent and printed.
+    The page needs no other files and no network, and can be sent and printed.
 
     Example: `railfix report results --reference truth.csv --out report.html`
 
-    Exit codes are listed in `railfix --help`; 4 where the number of references does not match the runs, 5 where a
-    reference is of another time.
+    Exit codes are listed in `railfix --help`; the code is 4 where the number of references does not match the runs, 5
+    where a reference is of another time.
     """
     in_runs = [
         path
@@ -102,9 +102,9 @@ def report(
 
 
 def _free_arrays_at_once() -> None:
-    """Let the GNU C library return an array's memory as soon as it is freed; other libraries are unaffected.
+    """Set the GNU C library to return the memory of a freed array to the system at once; no effect elsewhere.
 
-    By default malloc keeps freed arrays of up to 32 MB for reuse, which costs 50 MB in a long run.
+    By default malloc keeps freed arrays of up to 32 MB for reuse, which costs 50 MB of memory in a long run.
     """
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         library.mallopt(*_THRESHOLD)
@@ -115,20 +115,20 @@ def explain(
     *,
     at: Annotated[str, typer.Option(metavar="TIME", help="GPS time: hh:mm:ss, or 'yyyy-mm-dd hh:mm:ss'.")],
     antenna: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Antenna; by default the run's first antenna.")
+        str | None, typer.Option(metavar="NAME", help="Antenna, front or rear; by default the run's first antenna.")
     ] = None,
-    html: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page with the sky as well.")] = None,
+    html: Annotated[Path | None, typer.Option(metavar="HTML", help="Page to write, with a sky plot as well.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Explain one epoch: its position, every satellite with its outcome, and the causes of sigma, level and status.
 
-    For each used satellite it prints how far the single-epoch position would move along the line without this
-    satellite. The epoch nearest to the time is explained; it may be at most one minute away.
+    For each used satellite the table has the distance by which the single-epoch position would move along the line
+    without this satellite. The epoch nearest to TIME is explained; it may be at most one minute away.
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
-    Exit codes are listed in `railfix --help`; 4 where the time or the antenna does not exist, 5 where no epoch is near
-    the time.
+    Exit codes are listed in `railfix --help`; the code is 4 where the time or the antenna does not exist, 5 where no
+    epoch is near the time.
     """
     inputs = sorted(run.iterdir()) if run.is_dir() else []
     check_outputs((html, "page"), overwrite=overwrite, inputs=[path for path in inputs if path.suffix != ".html"])
@@ -152,8 +152,9 @@ def plot_screens(
 ) -> None:
     """Plot each screen's metric against its limit, over time and over chainage.
 
-    One PNG per screen and antenna: `front_doppler.png`, `rear_antenna_pair.png`, `front_raim.png`, ...;
-    none for screens that were off or inactive. Rejected observations have another colour; the title has their fraction.
+    One PNG file is written per screen and antenna, such as `front_doppler.png`, `rear_antenna_pair.png` and
+    `front_raim.png`; none is written for screens that were off or inactive. Rejected observations have another colour;
+    the title has their fraction.
 
     Example: `railfix plot-screens results --out results/screens`
 

@@ -1,4 +1,4 @@
-"""``railfix run`` and ``railfix live``: positions of logs into a folder, and of streams as they arrive."""
+"""``railfix run`` and ``railfix live``: position logs into a folder, and streams as they arrive."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
 
-#: Time for which a thread of a run keeps the interpreter while others wait [s]: switches cost more than waiting.
+#: Interval after which a thread releases the interpreter to a waiting thread [s], longer than the default of Python
+#: because frequent switches cost more time than waiting.
 _TURN_S: Final = 0.05
 
 
@@ -39,26 +40,24 @@ def run(
     verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    r"""Positions along the line from receiver logs, navigation files and a track map.
+    r"""Compute positions along the line from receiver logs, navigation files and a track map.
 
-    It reads RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), the log in pieces, and writes into DIR:
+    Logs are RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), UBX, SBF or RTCM 3. The following files are written into DIR:
 
-    - `positions.csv` and `positions.parquet`: one row per epoch and antenna, also without a
-      position: chainage, its standard deviation, coordinates, and the conventional position for
-      comparison
-    - `train.csv` and `train.parquet`: positions of the filter along the track over all epochs so far,
-      with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also by later
-      measurements
-    - `tracks.csv` and `tracks.parquet` (TRACK a network of tracks in one file): every track near each position with
-      its probability; the route is found from the log, and alternatives are named
-    - `track.csv`: the track as used, where it differs from its file (route of a network, other heights or
-      frame)
+    - `positions.csv` and `positions.parquet`: one row per epoch and antenna, with or without a position: chainage and
+      its standard deviation, coordinates, and the conventional position for comparison
+    - `train.csv` and `train.parquet`: positions of the filter along the track, each from all measurements up to its
+      epoch, with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also
+      positions from earlier and later measurements
+    - `tracks.csv` and `tracks.parquet` (if TRACK is a network of tracks in one file): every track near each position,
+      with its probability; the route is found from the log, and alternative routes are reported
+    - `track.csv`: the track that was used, if it differs from the file (route of a network, other heights or frame)
     - `observations.parquet` (with `--observations`): one row per epoch, satellite and signal
-    - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and
-      reason, positioning rate
+    - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and reason, and
+      positioning rate
 
-    Times are GPS time, as the receiver tagged them. The results appear in DIR when the run is complete; an
-    error leaves nothing there.
+    Times are the receiver's time tags in GPS time. The results appear in DIR when the run is complete; after an error
+    nothing is written.
 
     Example:
 
@@ -90,24 +89,25 @@ def live(
             "--live",
             metavar="KEY=VALUE",
             rich_help_panel="Choices",
-            help="One setting of live operation: period_s=0.1, pair_wait_s, reconnect, train, line, facing, "
-            "front_offset_m, length_m and others; may be repeated.",
+            help="One setting of live operation, such as period_s=0.1, pair_wait_s, reconnect, train, line, facing, "
+            "front_offset_m or length_m; may be repeated.",
         ),
     ] = None,
 ) -> None:
-    r"""Position a train from its receivers' streams, with one message per period.
+    r"""Position a train from the streams of its receivers, and send one message per period.
 
-    Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
-    the moment they are complete, SBAS messages with `--sbas stream`. The positions equal those of `railfix run` on the
-    same epochs, with sensors on board too. A message is sent for a period without input, too. Connections that break
-    are opened again. The program ends when its files end, or on SIGINT or SIGTERM; SIGHUP has no effect but a message.
+    Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages. Ephemerides are used as soon as
+    they are complete, SBAS messages only with `--sbas stream`. The positions are equal to the positions of
+    `railfix run` on the same epochs, also with on-board sensors. A message is sent even for a period without input.
+    Broken connections are reopened. The program ends when its input files end, or on SIGINT or SIGTERM; on SIGHUP it
+    only prints a message.
 
     Example:
 
         railfix live --front tcp://127.0.0.1:3001 --rear tcp://127.0.0.1:3002 --track line.csv \
             --vehicle car.toml --send json@- --send cbor@udp://127.0.0.1:4000
 
-    Exit codes are listed in `railfix --help`; 9 where two channels disagree, 143 after SIGTERM.
+    Exit codes are listed in `railfix --help`; the code is 9 where two channels disagree, 143 after SIGTERM.
     """
     import asyncio
 

@@ -21,25 +21,25 @@ class SimulateOptions(Settings):
     """Folder of the runs, and settings that override the scenario."""
 
     out: Path | None = option(
-        "Folder for the files; each run of a recipe has its own folder in it.", None, metavar="DIR", panel="Options"
+        "Folder for the files; each run of a recipe has a subfolder.", None, metavar="DIR", panel="Options"
     )
-    seconds: float | None = option("Duration, overriding the scenario's.", None, metavar="S", gt=0.0)
-    seed: int | None = option("Seed, overriding the scenario's.", None)
+    seconds: float | None = option("Duration, instead of the scenario's.", None, metavar="S", gt=0.0)
+    seed: int | None = option("Seed of the random numbers, instead of the scenario's.", None)
     setting: tuple[str, ...] = option(
-        "One setting, overriding the scenario's: --set receiver.code_sigma_m=0; may be repeated.",
+        "One setting that overrides the scenario's, such as --set receiver.code_sigma_m=0; may be repeated.",
         (),
         name="--set",
         metavar="KEY=VALUE",
     )
     only: tuple[str, ...] = option(
-        "Only this run of a recipe, by its number from 1 or its name; may be repeated.", (), metavar="RUN"
+        "Simulate only this run of a recipe, by its number from 1 or its name; may be repeated.", (), metavar="RUN"
     )
     packing: Literal["packed", "plain"] = option("Write uncompressed files: .rnx, .csv.", "packed", name="--plain")
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Settings that override the scenario's."""
+        """Settings that override the scenario's; SettingsError where a key is given twice."""
         check_set_once(self.setting)
         changes: dict[str, Any] = {}
         for text in self.setting:
@@ -49,7 +49,7 @@ class SimulateOptions(Settings):
 
     @property
     def words(self) -> list[str]:
-        """Options that reproduce the run."""
+        """Words of the command line that reproduce the run, without SCENARIO and --only."""
         sets = [("--set", text) for text in self.setting]
         given = [("--out", self.out), ("--seconds", self.seconds), ("--seed", self.seed), *sets]
         words = [word for name, value in given if value is not None for word in (name, str(value))]
@@ -70,12 +70,13 @@ def simulate(
 
     SCENARIO defines the line (elements, a generated line, or a track file), the motion of the train, the
     satellites (a simulated constellation, or a navigation file), receivers, errors, obstacles along the line and
-    sensors on board. A recipe lists many runs, each written to its own folder. The same scenario gives the same
-    files.
+    on-board sensors. A recipe is a scenario file with several runs, each of which is written to its own folder. The
+    same scenario gives the same files.
 
     Example: `railfix simulate demo --out simulated`
 
-    Exit codes are listed in `railfix --help`; 5 where the navigation file does not cover the scenario's time.
+    Exit codes are listed in `railfix --help`; the code is 5 where the navigation file does not cover the time of the
+    scenario.
     """
     if list_shipped:
         for name in list_scenarios():
@@ -133,7 +134,7 @@ def _simulate(
 
 
 def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
-    """Return the numbers of the runs to make, from 0."""
+    """Return the indices of the runs to simulate, from 0, in rising order; SettingsError where a run does not exist."""
     if not only:
         return list(range(len(recipe.names)))
     if not recipe.names[0]:
