@@ -84,7 +84,7 @@ def test_gpx_points_have_times_and_geoid_heights(tmp_path: Path) -> None:
     assert log.time[0] == np.datetime64("2024-01-01T10:00:18")  # 18 leap seconds
     assert log.notes == ()
     path.write_text("<gpx></gpx>")
-    with pytest.raises(InputFileError, match="no track point"):
+    with pytest.raises(InputFileError, match="has no point of a track"):
         read_positions(path)
 
 

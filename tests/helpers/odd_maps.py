@@ -293,7 +293,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("cut.fgb", _cut("FlatGeobuf", 300), "refused", "GDAL cannot read this file"),
     Odd("heights_and_measures.shp", measured(13), "right"),
     Odd("measures.shp", measured(23), "refused", "the coordinates have no height"),
-    Odd("above_ground.kml", kml("relativeToGround"), "refused", "relativeToGround, no height of the track"),
+    Odd("above_ground.kml", kml("relativeToGround"), "refused", "relativeToGround, which gives no track height"),
     Odd("decimal_commas.gpx", gpx(","), "refused", '11,00000000 has a comma in a number'),
     Odd("decimal_commas.osm", osm().replace('lat="48.', 'lat="48,'), "refused", "has a comma in a number"),
     Odd("nodes_not_sorted.osm", osm().replace('id="5"', 'id="555"'), "refused", "have no height; give heights"),

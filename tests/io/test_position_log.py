@@ -141,7 +141,7 @@ def test_csv_with_weeks_seconds_and_sigmas(tmp_path: Path) -> None:
     with pytest.raises(NoPositionError, match="no position has quality 1; the log has 1 of quality 2, 1 of"):
         usable_rows(log)
     path.write_text(header + first.replace("282600", "700000"), encoding="utf-8")
-    with pytest.raises(InputFileError, match="line 2: week 2176 and tow_s 700000 are no GPS week and seconds of it"):
+    with pytest.raises(InputFileError, match="line 2: week 2176 and tow_s 700000 are not a GPS week"):
         read_positions(path)
 
 

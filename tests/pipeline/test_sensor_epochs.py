@@ -180,7 +180,7 @@ def test_tables_are_read_and_bad_ones_named(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="row 3: pulse is None, a number was expected"):
         read_sensors(tachometer=beating)
     beating.write_text("time_gpst,pulse\n2024-03-05T03:10:00.1,\n")
-    with pytest.raises(InputFileError, match="has no row of the tachometer but its time"):
+    with pytest.raises(InputFileError, match="has times but no values of the tachometer"):
         read_sensors(tachometer=beating)
     bad = tmp_path / "bad.csv"
     bad.write_text("time_gpst,count\n2024-03-05T03:10:00.1,1\n")

@@ -168,7 +168,7 @@ def test_heights_are_never_guessed(
         (b"\x1f\x8b\0\0binary", "the packed data are damaged"),
         (bytes(range(256)), "binary"),
         ("緯度,経度\n".encode("shift_jis"), "not UTF-8"),
-        ("35.0,139.0,50\n35.1,139,50\n", "line 1: numbers where a header"),
+        ("35.0,139.0,50\n35.1,139,50\n", "line 1: has numbers where a header"),
         (HEADER + "\n", "0 points"),
         (HEADER + "\n" + ROWS[0], "1 point"),
         (GOOD.replace("latitude_deg", "lattitude_deg"), "is 'latitude_deg' meant"),

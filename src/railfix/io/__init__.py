@@ -1,4 +1,4 @@
-"""Readers and writers: files and bytes to arrays, and back."""
+"""Readers and writers of files and byte streams."""
 
 import lazy_loader
 

@@ -1,4 +1,6 @@
-"""Epochs of one receiver in rising order of time: sorted where a few are late, equal ones merged, others rejected."""
+"""Sort the epochs of one receiver by time: slightly late epochs are sorted in, epochs with equal time tags merged, and
+epochs with wrong time tags rejected.
+"""
 
 from __future__ import annotations
 
@@ -16,26 +18,26 @@ from railfix.gnss.observations import Observations, first_problems, stack_parts
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"
-#: An epoch that comes after at most this many later epochs is sorted in; an epoch that comes after more of them has a
-#: wrong time tag.
+#: Largest number of later epochs that may precede an epoch in the file. With more, the time tag of the epoch is taken
+#: as wrong.
 MOST_PASSED: Final = 20
 _HELD: Final = 2 * MOST_PASSED  #: Number of epochs that wait for later epochs.
-#: A single tag farther than this from both neighbours, which are consecutive, is wrong.
+#: A time tag that is earlier or later than both neighbours by more than this is taken as wrong.
 _LONE: Final = np.timedelta64(3600, "s")
 _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Consecutive epochs of a file in file order, and the line of each (0: no text)."""
+    """Consecutive epochs of a file in file order."""
 
     path: str
     epochs: Observations
-    line: Integers
+    line: Integers  #: Line number of each epoch, 0 in binary files.
 
 
 class EpochOrder:
-    """Sorts the epochs of one log, run by run; the result does not depend on how the input is cut."""
+    """Sorter of the epochs of one log; the result does not depend on the division of the log into runs."""
 
     def __init__(self, broken_lines: BrokenLines) -> None:
         self._broken_lines = broken_lines
@@ -48,7 +50,10 @@ class EpochOrder:
         self._break = False
 
     def ordered(self, runs: Iterable[Run]) -> Iterator[Observations]:
-        """Yield the epochs in rising order; the last part has the notes. InputFileError: a wrong time tag ("stop")."""
+        """Yield the epochs in rising order of time; the last part has no epochs but the notes.
+
+        InputFileError: a time tag is wrong, and `broken_lines` is "stop".
+        """
         for run in runs:
             self._held.append(run)
             if _rise([*(time[-1:] for time in self._times[-1:]), *(held.epochs.time for held in self._held)]):
@@ -116,7 +121,7 @@ class EpochOrder:
         return self._times[-1][-1] if self._times else np.datetime64(np.iinfo(np.int64).min + 1, "ns")
 
     def _handed_on(self, time: Datetimes) -> Masks:
-        """Return whether an epoch with the same tag was returned before."""
+        """Return which time tags occur among the epochs returned so far."""
         if not self._times:
             return np.zeros(len(time), dtype=np.bool_)
         self._times = [np.concatenate(self._times)]
@@ -141,14 +146,12 @@ class EpochOrder:
         self._break |= len(rows) > 0
 
     def _summary(self) -> Observations:
-        """Return no epochs, with the notes on all epochs."""
+        """Return observations without epochs, with the notes and counts of the whole log."""
         notes = []
         if number := self._counts["sorted"]:
             notes.append(f"{_where(*self._first['sorted'])}: {plural(number, 'epoch')} out of order, sorted by time")
         if number := self._counts[DUPLICATES]:
-            notes.append(
-                f"{_where(*self._first[DUPLICATES])}: {plural(number, 'epoch')} with a time tag that was there before"
-            )
+            notes.append(f"{_where(*self._first[DUPLICATES])}: {plural(number, 'epoch')} with a repeated time tag")
             notes[-1] += ", merged"
         counts = {DUPLICATES: self._counts[DUPLICATES], OUT_OF_ORDER: self._rejected}
         empty = np.zeros((0, 0))
@@ -162,7 +165,7 @@ class EpochOrder:
 
 
 def take_epochs(observations: Observations, rows: Indices) -> Observations:
-    """Return some epochs in a given order."""
+    """Return the epochs `rows` in this order, without problems and counts."""
     arrays = (*_ARRAYS, "time", "break_before", "receiver_alarm", "front_end_gain")
     values = {name: getattr(observations, name)[rows] for name in arrays}
     return replace(observations, **values, problems=(), problem_count=0, skipped={})
@@ -177,7 +180,7 @@ def _where(path: str, line: int) -> str:
 
 
 def _passed(time: Datetimes) -> tuple[Integers, Integers]:
-    """Return the numbers of preceding epochs with later tags and of following epochs with earlier tags."""
+    """Return for each epoch the numbers of preceding epochs with later tags and of following ones with earlier tags."""
     reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
     passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
     for step in range(1, reach + 1):
@@ -188,14 +191,14 @@ def _passed(time: Datetimes) -> tuple[Integers, Integers]:
 
 
 def _is_repeated(time: Datetimes) -> Masks:
-    """Return whether a tag occurs earlier in the array."""
+    """Return which time tags occur earlier in the array."""
     repeated = np.ones(len(time), dtype=np.bool_)
     repeated[np.unique(time, return_index=True)[1]] = False
     return repeated
 
 
 def _is_lone(time: Datetimes) -> Masks:
-    """Return whether a tag is far from both neighbours, between which the time rises without it."""
+    """Return which time tags are over `_LONE` later or earlier than both neighbours, while the neighbours rise."""
     lone = np.zeros(len(time), dtype=np.bool_)
     before, this, after = time[:-2], time[1:-1], time[2:]
     lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))
@@ -220,6 +223,6 @@ def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observation
 
 
 def _rise(times: Sequence[Datetimes]) -> bool:
-    """Return whether the epochs of one part follow the epochs of another."""
+    """Return whether the times of consecutive parts rise strictly."""
     time = np.concatenate([*times, np.empty(0, "datetime64[ns]")])
     return bool((np.diff(time) > np.timedelta64(0, "ns")).all())

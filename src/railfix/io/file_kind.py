@@ -1,4 +1,4 @@
-"""Kind of a file by its content: one decision for every command."""
+"""Detect the kind of a file from its content."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ FileKind = Literal[
     "mate", "geojson", "kml", "osm", "xml", "rdf", "ifc", "dxf", "gml", "gpkg", "shp", "fgb", "pbf", "toml", "android",
     "unknown",
 ]  # fmt: skip
-#: Kinds of logs of positions, and of track maps; a table may be either, and a GPX file, too.
+#: Kinds of position logs. A table or GPX file may also be a track map.
 POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", "gpx", "receiver")
-#: Maps that GDAL reads, by their kind.
+#: Kinds of track maps that are read by GDAL, and all kinds of track maps.
 GDAL: Final[tuple[FileKind, ...]] = ("gpkg", "shp", "fgb", "gml", "dxf", "pbf")
 MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "osm", "xml", "rdf", "ifc", *GDAL)
-#: Each kind in words, for messages, with the option that accepts it.
+#: Description of each kind for messages, with the option that accepts it.
 KIND_WORDS: Final[dict[FileKind, str]] = {
     "observations": "a RINEX observation file (--front, --rear)", "navigation": "a RINEX navigation file (--nav)",
-    "rinex": "a RINEX file of clocks or meteorology", "sp3": "a file of precise orbits, SP3 (--sp3)",
+    "rinex": "a RINEX file of clocks or meteorology", "sp3": "an SP3 file of precise orbits (--sp3)",
     "sbas": "a log of SBAS messages (--sbas)", "receiver": "a receiver's log", "nmea": "an NMEA log",
-    "novatel": "a NovAtel log", "rtklib": "a solution of RTKLIB (.pos)", "gpx": "a GPX file", "table": "a table",
-    "android": "a log of Android's GnssLogger, which also writes a RINEX file", "mate": "a table of EGNSS MATE",
-    "geojson": "a JSON file", "kml": "a KML file", "osm": "a file of OpenStreetMap", "xml": "an XML file",
+    "novatel": "a NovAtel log", "rtklib": "an RTKLIB solution (.pos)", "gpx": "a GPX file", "table": "a table",
+    "android": "a log of Android's GnssLogger, which also writes a RINEX file", "mate": "an EGNSS MATE table",
+    "geojson": "a JSON file", "kml": "a KML file", "osm": "an OpenStreetMap file", "xml": "an XML file",
     "rdf": "an RDF file", "ifc": "an IFC file", "dxf": "a DXF file", "gml": "a GML file", "gpkg": "a GeoPackage",
-    "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "a file of OpenStreetMap (.pbf)", "toml": "a TOML file",
+    "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "an OpenStreetMap file (.pbf)", "toml": "a TOML file",
     "unknown": "no log, table or map of a known form",
 }  # fmt: skip
 #: First bytes of binary files.
@@ -55,7 +55,7 @@ _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
     ),
 }
 _ROOT: Final = re.compile(rb"\s*(?:<[?!][^>]*>\s*|<!--.*?-->\s*)*<(?:[\w.-]+:)?(\w+)", re.DOTALL)
-#: Kinds of XML files by the name of the root.
+#: Kinds of XML files by the name of the root element in lower case.
 _ROOTS: Final[dict[str, FileKind]] = {
     "kml": "kml", "gpx": "gpx", "osm": "osm", "rdf": "rdf", "featurecollection": "gml",
 }  # fmt: skip
@@ -70,7 +70,10 @@ _ENDINGS: Final[dict[str, FileKind]] = {
 
 
 def find_kind(path: FilePath) -> FileKind:
-    """Return the kind of a file by its first bytes, unpacked; by its ending where these are ambiguous."""
+    """Return the kind of a file from its first bytes, unpacked, or from the ending of its name if they are ambiguous.
+
+    EGNSS MATE tables and TOML files are recognised by name.
+    """
     if mate_table(path):
         return "mate"
     if ending(path) == ".toml":
@@ -98,12 +101,12 @@ def find_kind(path: FilePath) -> FileKind:
     return _ENDINGS.get(ending(path), "unknown")
 
 
-#: Words in the header of a table of positions that a track map does not have.
+#: Words in the header of a position table that do not occur in a track map.
 _OF_POSITIONS: Final = ("time", "unix", "tow", "quality", "sigma_north", "antenna")
 
 
 def wrong_kind(path: FilePath, expected: str) -> InputFileError:
-    """Return the error of a file of another kind than expected."""
+    """Return the error for a file that is not of the expected kind."""
     return InputFileError(path, f"is {KIND_WORDS[find_kind(path)]}; {expected} was expected")
 
 
@@ -115,7 +118,7 @@ def has_times(path: FilePath) -> bool:
 
 
 def _header_line(head: bytes) -> str:
-    """Return the first line that is neither blank nor a comment; "" without any."""
+    """Return the first line that is neither blank nor a comment; "" if there is none."""
     coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     lines = head.decode(coding, "replace").splitlines()
     return next((line for line in lines if line.strip() and not line.startswith("#")), "")

@@ -1,4 +1,4 @@
-"""Observations in the xarray layout of georinex, in both directions."""
+"""Convert observations to and from the xarray layout of georinex."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        One variable over ``time`` and ``sv`` for each observation type; absent is NaN. Beyond georinex's
-        own: ``break_before`` over ``time``, ``glonass_channel`` over ``sv``. Attributes as georinex's.
+        One variable over ``time`` and ``sv`` for each observation type, NaN where absent. The variables
+        ``break_before`` over ``time`` and ``glonass_channel`` over ``sv`` do not exist in georinex. Attributes hold
+        the header.
     """
     import xarray as xr
 
@@ -76,14 +77,14 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
     Parameters
     ----------
     data : xarray.Dataset
-        As returned by ``georinex.load``, preferably with ``useindicators=True``: without indicators no loss of
-        lock is known.
+        As returned by ``georinex.load``, preferably with ``useindicators=True``; without indicators, no loss of lock
+        is reported.
 
     Returns
     -------
     Observations
-        Channels with at least one observation, sorted by satellite, then signal; RINEX 2 types are
-        mapped to signals as `read_observations` maps them. Time is GPS time; georinex cuts it to 1 us.
+        Channels with at least one observation, sorted by satellite, then signal. RINEX 2 types are mapped to signals
+        as in `read_observations`. Times are GPS time, which georinex truncates to 1 us.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
     check_type(data, xr.Dataset, "data")
     types = [str(name) for name in data.data_vars if _TYPE.fullmatch(str(name))]
     if not types:
-        raise ValueError("the dataset has no observation types such as C1C; georinex.load of an observation file has")
+        raise ValueError("the dataset has no observation types such as C1C; load an observation file by georinex.load")
     time = _gps_time(data)
     satellites = np.array([str(name) for name in data["sv"].values], dtype="<U3")
     version = float(data.attrs.get("version", 3.0 if any(len(name) == 3 for name in types) else 2.0))

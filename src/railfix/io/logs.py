@@ -1,4 +1,4 @@
-"""Receiver logs and navigation files of any kind, recognised by their content."""
+"""Readers of observations and navigation records of any kind, which is recognised by the content."""
 
 from __future__ import annotations
 
@@ -44,31 +44,33 @@ def read_observations(
     date: Time = None,
     reader: Reader = "railfix",
 ) -> Observations:
-    """Read the observations of one receiver from RINEX files or receiver logs.
+    """Read the observations of one receiver from RINEX files, receiver logs or EGNSS MATE tables.
 
     Parameters
     ----------
     path : path or sequence of path
-        RINEX observation files, or logs in UBX, SBF or RTCM 3 (other protocols in between are skipped), plain or
-        packed. Several files are put in order of time; they are all of one of these two kinds.
+        RINEX observation files, logs in UBX, SBF or RTCM 3 (other protocols in between are skipped), or EGNSS MATE
+        tables S_GNSS_SAT; plain or packed. Several files must be of one kind, and are read in order of time.
     broken_lines : {"stop", "count"}
-        A broken RINEX line is an error, or the part that it breaks is skipped and counted, as always in a receiver log.
+        With "stop" a broken RINEX line is an error; with "count" what it breaks is skipped and counted, which is always
+        done in a receiver log.
     systems : iterable of str, optional
-        Letters of constellations, all by default.
+        Letters of the constellations to read, all by default.
     start, end : datetime64 or str, optional
-        GPS time; the end is excluded.
+        Time span to read, GPS time; the end is excluded.
     date : datetime64 or str, optional
-        Some time within half a week of the log: needed for RTCM 3, whose observations carry no week.
+        Any time within half a week of the log; needed for RTCM 3 logs without ephemerides, which have no week number.
     reader : {"railfix", "georinex"}
-        "georinex" reads RINEX files by georinex, an independent reader, to compare with: slower, without events,
-        scale factors, counts of broken lines and indicators of bands other than 1 and 2.
+        "georinex" reads RINEX files with georinex, an independent reader, for comparison. It is slower, and does not
+        read events, scale factors, and indicators of bands other than 1 and 2, nor count broken lines.
 
     Raises
     ------
     InputFileError
-        A file cannot be read, or holds no observations that can be dated.
+        A file cannot be read, or has no observations that can be dated.
     MismatchError
-        No epoch lies between `start` and `end`; receiver logs and RINEX files are mixed, or are to be read by georinex.
+        No epoch lies between `start` and `end`; files are of different kinds; or a receiver log is to be read with
+        georinex.
     """
     pieces = scan_observations(
         path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62, reader=reader
@@ -79,7 +81,7 @@ def read_observations(
 def _by_georinex(
     paths: list[str], systems: list[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
 ) -> list[Observations]:
-    """Read RINEX files by georinex in order of time."""
+    """Read RINEX files with georinex, and return them in order of time without overlaps."""
     import georinex
 
     from railfix.io.georinex_layout import observations_from_xarray
@@ -87,7 +89,7 @@ def _by_georinex(
     parts: list[Observations] = []
     for name in paths:
         if find_kind(name) == "receiver":
-            raise MismatchError(f"{name} is a receiver's log, and georinex reads RINEX; leave out reader (--reader)")
+            raise MismatchError(f"{name} is a receiver log, but georinex reads RINEX only; leave out reader (--reader)")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # a default of xarray that georinex relies on
             try:
@@ -123,11 +125,11 @@ def scan_observations(
     reader: Reader = "railfix",
     **selection: Unpack[_Selection],
 ) -> Iterator[Observations]:
-    """Observations of one receiver in pieces of at most `epochs` epochs, the first piece short.
+    """Return an iterator over the observations of one receiver in pieces of at most `epochs` epochs.
 
-    `selection` are `broken_lines`, `systems`, `start`, `end` and `date` of `read_observations`; errors as there.
-    `progress` is called with the fraction of the files that has been read. georinex reads all files before the first
-    piece.
+    The first piece is shorter. `selection` are `broken_lines`, `systems`, `start`, `end` and `date`, which have the
+    meaning and errors of `read_observations`. `progress` is called with the fraction of the files that has been read.
+    georinex reads all files before the first piece.
     """
     if reader not in get_args(Reader):
         raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
@@ -158,9 +160,9 @@ def _mate_pieces(
     limits: tuple[np.datetime64 | None, np.datetime64 | None],
     epochs: int,
 ) -> Iterator[Observations]:
-    """Return the tables S_GNSS_SAT of EGNSS MATE in order of time, in pieces."""
+    """Return the observations of EGNSS MATE tables S_GNSS_SAT in order of time, in pieces."""
     if others := [path for path in paths if mate_table(path) != "S_GNSS_SAT"]:
-        raise MismatchError(f"{others[0]} is no table S_GNSS_SAT as the others; give files of one kind for one antenna")
+        raise MismatchError(f"{others[0]} is not a table S_GNSS_SAT; give files of one kind for one antenna")
     tables = sorted((read_mate_observations(path) for path in paths), key=lambda part: part.time[0])
     pieces = list(in_pieces((_of_systems(part[slice(*limits)], systems) for part in tables), epochs))
     if not any(len(piece) for piece in pieces):
@@ -219,12 +221,14 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
 
 
 def _of_systems(run: Observations, letters: list[str] | None) -> Observations:
-    """Return the observations of some constellations, or of all for None."""
+    """Return the observations of the constellations `letters`, of all constellations if None."""
     return run if letters is None else without_empty_channels(of_channels(run, np.isin(run.system, letters)))
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
-    """Return the navigation records from RINEX navigation files and receiver logs, in any combination.
+    """Read the navigation records in RINEX navigation files and receiver logs, in any combination.
+
+    Records that describe no plausible orbit of their constellation are rejected, counted and described in the notes.
 
     Parameters
     ----------
@@ -232,14 +236,12 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     broken_lines : {"stop", "count"}
         A broken record is an error, or is counted in `Navigation.skipped` and described in its notes.
     date : datetime64 or str, optional
-        Some time within half a week of RTCM 3 logs.
+        Any time within half a week of RTCM 3 logs, whose records may have no full date.
 
     Raises
     ------
     InputFileError
-        A file cannot be read or holds no usable record.
-
-    Records that describe no orbit of their constellation are rejected, counted and described in the notes.
+        A file cannot be read, or there is no usable record.
     """
     names = path_names(paths)
     receiver = [find_kind(name) == "receiver" for name in names]
@@ -260,7 +262,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 
 def _join(parts: list[Navigation]) -> Navigation:
-    """Return the records of several sources; ionosphere and leap seconds of the first that has them."""
+    """Join the records of several sources; ionosphere and leap seconds are from the first source that has them."""
     return Navigation(
         kepler=join_rows([part.kepler for part in parts]),
         glonass=join_rows([part.glonass for part in parts]),

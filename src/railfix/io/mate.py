@@ -1,6 +1,6 @@
-"""Tables of EGNSS MATE (SBB, DLR, IABG): names, columns, and the observations of S_GNSS_SAT.
+"""Reader of EGNSS MATE tables (SBB, DLR, IABG): columns of all tables, and observations of S_GNSS_SAT.
 
-Columns are those of https://github.com/EGNSS-MATE/egnss-mate-schematics (MIT), commit 0dc83ee of 14 April 2026.
+The columns follow https://github.com/EGNSS-MATE/egnss-mate-schematics (MIT), commit 0dc83ee of 14 April 2026.
 """
 
 from __future__ import annotations
@@ -69,20 +69,21 @@ WRITTEN: Final[Mapping[str, tuple[str, ...]]] = {
         "SPEED_DOUBTUNDER", "CREATED_TIMESTAMP",
     ),
 }  # fmt: skip
-#: Columns that hold names.
+#: Text columns.
 _TEXTS: Final = ("SAT_ID", "SIGNAL_TYPE", "ANTENNA", "TRACK_EDGE_ID", "UTM_CELL", "TRACK_SEGMENT_TYPE")
 
 
 def mate_table(path: FilePath) -> str:
-    """Return the EGNSS MATE table of a file by its name, blank if it is none: ``s_imu.parquet`` is S_IMU."""
+    """Return the EGNSS MATE table of a file from the file name: S_IMU for ``s_imu.parquet``, "" for other names."""
     name, _, kind = Path(path).name.partition(".")
     return name.upper() if name.upper() in READ and kind.lower() in ("parquet", "csv", "csv.gz") else ""
 
 
 def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> pl.DataFrame:
-    """Read a table, CSV (also .gz) or Parquet, with upper-case names; columns not in the file are empty.
+    """Read a table, CSV (also .gz) or Parquet, with upper-case column names; columns not in the file are null.
 
-    Without `table_name` the name of the file determines the table.
+    Without `table_name` the file name determines the table. InputFileError: the file cannot be read, has an unknown
+    column or no rows, or lacks a `needed` column.
     """
     name, file = table_name or mate_table(path), Path(path)
     with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
@@ -107,14 +108,14 @@ def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> 
 
 
 def only_device(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
-    """Return the table; InputFileError where it has rows of several devices."""
+    """Return the table unchanged; InputFileError if it has rows of several devices."""
     devices = table["DEVICE_ID"].drop_nulls().unique().sort().to_list()
     if len(devices) > 1:
         raise InputFileError(path, f"has devices {', '.join(map(str, devices))}; keep the rows of one device")
     return table
 
 
-#: RINEX code of a signal by constellation, as Septentrio receivers name them (SBF reference guide, signal types).
+#: RINEX code by constellation and by signal name of Septentrio receivers (SBF reference guide, signal types).
 _CODES: Final[Mapping[str, Mapping[str, str]]] = {
     "G": {"L1CA": "1C", "L1P": "1W", "L1PY": "1W", "L2P": "2W", "L2PY": "2W", "L2C": "2L", "L5": "5Q", "L1C": "1L"},
     "R": {"L1CA": "1C", "G1CA": "1C", "L1P": "1P", "L2CA": "2C", "G2CA": "2C", "L2P": "2P", "L3": "3Q"},
@@ -133,7 +134,7 @@ _VALUES: Final = {
 
 
 def signal_code(satellite: str | None, signal: str) -> str:
-    """Return the RINEX code of a signal type such as ``GPS_L1CA``, ``E5a`` or ``1C``; blank where either is unknown."""
+    """Return the RINEX code of a signal type such as ``GPS_L1CA``, ``E5a`` or ``1C``; "" if unknown."""
     if satellite is None or len(satellite) != 3 or satellite[0] not in _CODES or not satellite[1:].isdigit():
         return ""
     name = signal.replace("-", "_").rsplit("_", 1)[-1]
@@ -143,7 +144,10 @@ def signal_code(satellite: str | None, signal: str) -> str:
 
 
 def read_mate_observations(path: str) -> Observations:
-    """Read the observations of one antenna: of several devices or antennas, the one with the most rows."""
+    """Read the observations in a table S_GNSS_SAT, of the antenna and device with the most rows.
+
+    InputFileError: the file is not such a table, or no row has a known satellite and signal.
+    """
     table = read_mate(path, _NEEDED).with_columns(
         pl.col("SAT_ID").cast(pl.String), pl.col("SIGNAL_TYPE").cast(pl.String)
     )
@@ -175,13 +179,13 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
         pl.col("DEVICE_ID").eq_missing(pl.lit(device)) & pl.col("ANTENNA").eq_missing(pl.lit(antenna))
     )
     which = f"device {device}, antenna {antenna}"
-    return chosen, (f"{path}: has {len(counts)} devices or antennas; {which}, with the most rows, is used",)
+    return chosen, (f"{path}: has {len(counts)} devices or antennas; only {which} is used, which has the most rows",)
 
 
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Return the arrays of epochs by channels; of two rows of one signal at one epoch the last is used."""
+    """Return the rows as epochs by channels; of several rows of one signal at one epoch the last is used."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)

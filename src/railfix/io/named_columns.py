@@ -1,4 +1,4 @@
-"""Tables of text with named columns; comments above the header line may carry ``# key: value``."""
+"""Text tables with named columns, and metadata in comments ``# key: value`` above the header line."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Number of rows read before they are compacted.
 _SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
-#: Usual names of columns of positions and maps, without case, blanks and underscores, by railfix name. A height
-#: without its unit is in metres.
+#: Usual column names of positions and maps in other files, as lower-case letters and digits, by railfix name. A height
+#: without a unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
     "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
     "longitude_deg": ("lon", "long", "lng", "longitude", "londeg", "longitudedegrees", "gpslongitude"),
@@ -26,7 +26,7 @@ _USUAL: Final[dict[str, tuple[str, ...]]] = {
         "elevation", "ellipsoidalheight", "ellipsoidalheightm", "hae",
     ),
 }  # fmt: skip
-#: Endings of names in a unit other than railfix's, and the unit.
+#: Endings of column names that give a unit other than railfix's, and this unit.
 _OTHER_UNITS: Final = {
     "ft": "feet", "feet": "feet", "foot": "feet", "usft": "feet", "mm": "millimetres", "cm": "centimetres",
     "km": "kilometres", "rad": "radians", "gon": "gon", "yd": "yards",
@@ -35,15 +35,15 @@ _OTHER_UNITS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class NamedColumns:
-    """A table as text, with the line number of each row, from 1."""
+    """Text table with named columns, n rows."""
 
     path: str
-    #: ``# key: value`` comments above the header; of a repeated key the values, joined by "; ".
+    #: ``# key: value`` comments above the header, keys in lower case; values of a repeated key are joined by "; ".
     metadata: dict[str, str]
 
-    header_line: int
-    line: Integers  #: Shape (n,).
-    cells: dict[str, pl.Series]  #: Cells of each column, stripped.
+    header_line: int  #: Line number of the header, from 1.
+    line: Integers  #: Line number of each row, from 1; shape (n,).
+    cells: dict[str, pl.Series]  #: Cells of each column without surrounding blanks.
     separator: str = ","  #: Column separator; if it is not a comma, numbers may have decimal commas.
     #: Original names of columns that were renamed to railfix's names (`with_usual_names`).
     usual: dict[str, str] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class NamedColumns:
         return name in self.cells
 
     def take(self, rows: Indices) -> NamedColumns:
-        """Return some rows in a given order."""
+        """Return the table of the rows `rows`, in this order."""
         return replace(self, line=self.line[rows], cells={name: cell[rows] for name, cell in self.cells.items()})
 
     def error(self, row: int, message: str) -> InputFileError:
@@ -67,11 +67,14 @@ class NamedColumns:
         return InputFileError(self.path, message, line=self.header_line)
 
     def texts(self, name: str, *, absent: str) -> Strings:
-        """Return one column as texts, `absent` in each row where the table lacks it."""
+        """Return a column as texts; `absent` in every row if the table has no such column."""
         return np.array(self.cells[name].to_list(), dtype=np.str_) if name in self else np.full(len(self), absent)
 
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
-        """Parse one column as finite numbers; `blank` is the value of empty cells, and allows ``nan``."""
+        """Parse a column as finite numbers; InputFileError for other cells.
+
+        Empty cells are an error without `blank`. With it, they get this value, and cells ``nan`` are accepted.
+        """
         given = self.cells[name].str.len_bytes().to_numpy() > 0
         cells = self.cells[name].to_list()
         if blank is not None:
@@ -102,9 +105,9 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
 
 
 def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
-    """Return the table with usual spellings of some columns ("Latitude", "lon", "alt") under the names of railfix.
+    """Return the table with columns of usual names ("Latitude", "lon", "alt") renamed to railfix's `names`.
 
-    InputFileError: a column of these is in another unit ("height_ft").
+    InputFileError: such a column is in another unit ("height_ft").
     """
     cells, usual = dict(table.cells), {}
     for name in names:
@@ -128,13 +131,13 @@ def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
 def read_named_columns(path: FilePath) -> NamedColumns:
     """Read a table with a header line of column names, separated by commas, semicolons, tabs or bars.
 
-    InputFileError: not a table of this kind.
+    InputFileError: there is no header line, a column name is repeated, or a row has another number of cells.
     """
     return parse_named_columns(read_text(path).splitlines(), path)
 
 
 def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
-    """Parse the lines of a file as `read_named_columns` does; `path` is for the messages."""
+    """Parse the lines of a file as `read_named_columns` does; `path` is used in messages."""
     metadata: dict[str, str] = {}
     header: list[str] = []
     header_line, separator = 0, ","
@@ -190,7 +193,7 @@ def _check_header(path: FilePath, header: list[str], line: int) -> None:
     if not header:
         raise InputFileError(path, "no header line with the names of the columns was found")
     if not any(fails(float, cell) for cell in header):
-        raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
+        raise InputFileError(path, "has numbers where a header line with column names was expected", line=line)
     repeated = sorted({name for name in header if header.count(name) > 1})
     if repeated:
         raise InputFileError(path, f"column {repeated[0]!r} occurs twice in the header", line=line)

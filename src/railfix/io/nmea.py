@@ -1,4 +1,4 @@
-"""Positions from NMEA 0183: GGA with RMC or ZDA."""
+"""Reader of NMEA 0183 logs: positions from GGA, dates from RMC or ZDA."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from railfix.core.timescale import SECONDS_PER_DAY, timedelta, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.position_log import PositionLog
 
-#: Counts of items that are read or skipped without being broken.
+#: Names of counted lines that are not errors.
 _OTHER_LINES, _UNCHECKED = (
-    "lines skipped that are no sentence of NMEA 0183",
+    "lines skipped that are not NMEA 0183 sentences",
     "sentences without checksum",
 )
-#: A separation of 0 is reported as doubtful where the geoid is farther than this from the ellipsoid [m].
+#: A geoid separation of 0 is reported as doubtful where the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 2.0
-#: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.PositionLog`); others are 0, no position.
+#: RTKLIB's quality (`position_log.PositionLog`) by GGA's quality (NMEA 0183 4.10, field 6); others become 0.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 
 
 @dataclass(frozen=True)
 class _Gga:
-    """One GGA sentence: line, seconds of the day, quality, latitude, longitude, ellipsoidal height, separation."""
+    """GGA sentence."""
 
     line: int
-    of_day_s: float
-    quality: int
-    geodetic: tuple[float, float, float]
-    separation_m: float
+    of_day_s: float  #: UTC time of day, NaN where blank.
+    quality: int  #: As in `QUALITY`.
+    geodetic: tuple[float, float, float]  #: Latitude, longitude [deg], ellipsoidal height [m]; NaN where unknown.
+    separation_m: float  #: Height of the geoid above the ellipsoid, NaN where blank.
 
 
 @dataclass(frozen=True)
 class _Date:
-    """One RMC or ZDA sentence: line, seconds of the day, day."""
+    """Date and time of an RMC or ZDA sentence."""
 
     line: int
-    of_day_s: float
-    day: np.datetime64
+    of_day_s: float  #: UTC time of day.
+    day: np.datetime64  #: UTC date.
 
 
 def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.datetime64 | None = None) -> PositionLog:
@@ -57,8 +57,8 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Parameters
     ----------
     path : path
-        Text, also packed. Sentences of other kinds, of AIS and other lines are skipped; text before the ``$`` of a
-        sentence is left out; a sentence may lack its checksum.
+        Text file, also packed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the ``$``
+        of a sentence is ignored; a sentence may lack its checksum.
     broken_lines : {"stop", "count"}
         A sentence with a wrong checksum or invalid fields is an error, or is skipped and noted. A cut last line is
         always skipped and noted.
@@ -68,13 +68,13 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Returns
     -------
     PositionLog
-        Times in GPS time; qualities as RTKLIB numbers them (`QUALITY`), 1 a fix. A fix without height or geoid
-        separation has no `ecef_m`, but a position in plan.
+        Times in GPS time; qualities as RTKLIB numbers them (`QUALITY`). A position without height or geoid separation
+        is NaN in `ecef_m`, and has latitude and longitude in `plan_deg`.
 
     Raises
     ------
     InputFileError
-        No GGA, a broken sentence, or no date.
+        The file has no GGA sentence or no date, or a sentence is broken.
     """
     problems: list[InputFileError] = []
     fixes: list[_Gga] = []
@@ -121,7 +121,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
 
 
 def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> list[str]:
-    """Return a note where the geoid separation is 0 in every fix, and the geoid is elsewhere."""
+    """Return a note if the geoid separation is 0 in every fix although the geoid is far from the ellipsoid."""
     placed = np.isfinite(geodetic[:, 0])
     if not placed.any() or any(fix.separation_m != 0.0 for fix in fixes if np.isfinite(fix.separation_m)):
         return []
@@ -137,14 +137,14 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
         there = f"{height:.0f} m (EGM96)"
     return [
         f"{path}: the geoid separation is 0 in every fix, but the geoid is {there} from the ellipsoid: the heights are "
-        "taken as ellipsoidal, and are wrong by that if the receiver wrote heights above sea level"
+        "taken as ellipsoidal, and are wrong by this distance if the receiver wrote heights above sea level"
     ]
 
 
 def _sentences(
     path: FilePath, lines: list[str], problems: list[InputFileError], counts: Counter[str]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and fields of every sentence whose checksum is correct or absent."""
+    """Yield line number and fields of every sentence whose checksum is correct or absent; append `problems`."""
     for number, line in enumerate(lines, start=1):
         _, dollar, text = line.partition("$")
         if not dollar:
@@ -208,7 +208,7 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix by the nearest date sentence; with a single date (`chained`) count midnights."""
+    """Compute the GPS time of each fix from the date sentence before it; if `chained`, from the first date onward."""
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])
     if chained:

@@ -1,4 +1,4 @@
-"""Positions of one antenna; RTKLIB ``.pos`` files and CSV with named columns."""
+"""Position logs; parsers of RTKLIB ``.pos`` files and of CSV files with named columns."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, gpst_to_utc, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 
-SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
-#: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
+SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations in a CSV log.
+#: Columns of a CSV log. Times are GPS time, UTC, Unix time, or GPS week and seconds; positions are geodetic or ECEF.
 CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
     "z_m", "quality", "ratio", *SIGMA_COLUMNS,
 )  # fmt: skip
-#: Further columns of a table of positions, which `PositionLog.table` keeps.
+#: Further columns of a position table, available in `PositionLog.table`.
 OTHER_COLUMNS: Final = ("antenna", "chainage_m", "speed_mps", "sigma_m", "source", "environment")
-#: Largest Unix time that is interpreted as seconds, in 2100.
+#: Largest accepted Unix time [s], at the end of 2099; larger values are probably milliseconds.
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
@@ -35,26 +35,26 @@ _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PositionLog(NotebookTable):
-    """Positions of one antenna in the order of the file, n rows."""
+    """Positions of a log, n rows in the order of the file."""
 
     path: str
     time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).
     ecef_m: Floats  #: NaN where a row has no position or no height, shape (n, 3).
-    #: Q of RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; or the number in the log; -1
-    #: where it has none; shape (n,).
+    #: Quality as numbered by RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP. A CSV log
+    #: may have other numbers. -1 where the log has none; shape (n,).
     quality: Integers
     sigma_m: Floats  #: Standard deviations north, east, up; NaN where the log has none; shape (n, 3).
     line: Integers  #: Line number of each row in the file, shape (n,).
     notes: tuple[str, ...] = ()
     ratio: Floats | None = None  #: Ratio of the ambiguity test, where the log has it; shape (n,).
-    #: Latitude and longitude of all rows, where some have no height; shape (n, 2).
+    #: Latitude and longitude of all rows if any row has no height, otherwise None; shape (n, 2).
     plan_deg: Floats | None = None
-    antennas: tuple[str, ...] = ()  #: Names of the antennas, where the table has them.
-    table: NamedColumns | None = None  #: All columns, where the log is a table with named columns.
+    antennas: tuple[str, ...] = ()  #: Names in the column ``antenna``; empty where the log has no such column.
+    table: NamedColumns | None = None  #: All columns of a CSV or RTKLIB log, None for other logs.
 
     @property
     def geodetic(self) -> tuple[Floats, Floats, Floats]:
-        """Latitude, longitude [deg] and ellipsoidal height [m], shape (n,) each; a row without height is NaN there."""
+        """Latitude, longitude [deg] and ellipsoidal height [m], shape (n,) each; NaN where the log has none."""
         latitude, longitude, height = geodetic_from_ecef(self.ecef_m)
         if self.plan_deg is None:
             return latitude, longitude, height
@@ -77,10 +77,10 @@ Parsed = TypeVar("Parsed")
 def skip_broken(
     path: FilePath, parse: Callable[[list[str]], Parsed], *, broken_lines: BrokenLines
 ) -> tuple[Parsed, tuple[str, ...]]:
-    """Parse the lines of a log; return the result, and a note on each line that was skipped.
+    """Parse the lines of a log; return the result, and a note on each skipped line.
 
-    With "count" every broken line below the first is skipped, otherwise only an incomplete last line, as after a power
-    cut. InputFileError: a line is broken, and the message names the option that skips it.
+    With "count" broken lines below the header are skipped; with "stop" only an incomplete last line, as left by a power
+    cut. InputFileError: any other line is broken, or more than `_MOST_BROKEN` lines are broken.
     """
     text = read_text(path)
     lines = text.splitlines()
@@ -102,13 +102,16 @@ def skip_broken(
 
 
 def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> PositionLog:
-    """Parse the positions in a table with named columns; columns of heights and sigmas may be absent."""
+    """Parse the positions in a table with named columns; `columns` as in `read_positions`, errors as below."""
     table = rename_columns(parse_named_columns(lines, path), columns, known=(*CSV_COLUMNS, *OTHER_COLUMNS))
     return positions_of_table(table)
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Return the positions in a table."""
+    """Return the positions in a table; columns of heights, sigmas, times and qualities may be absent.
+
+    InputFileError: the table has no position columns or no rows, or a value is not a number or out of range.
+    """
     path = table.path
     cartesian = all(name in table for name in _CARTESIAN)
     table = table if cartesian else with_usual_names(table, _GEODETIC)
@@ -121,7 +124,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not geodetic and not cartesian:
         raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)} (columns, --column latitude_deg=NAME, names others)"
+            f"{', '.join(table.cells)} (name the right one by columns, --column latitude_deg=NAME)"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
@@ -151,18 +154,18 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
 
 
 def numbers_or_nan(table: NamedColumns, name: str) -> Floats:
-    """Parse a column as numbers, NaN where it is blank or the table lacks it."""
+    """Parse a column as numbers; NaN in blank cells, and in all rows if the table has no such column."""
     return table.numbers(name, blank=np.nan) if name in table else np.full(len(table), np.nan)
 
 
 def qualities_in_words(log: PositionLog) -> str:
-    """Count the rows of each quality: "1155 of quality 2, 3 of quality 5"."""
+    """Return the number of rows of each quality as text: "1155 of quality 2, 3 of quality 5"."""
     numbers, counts = np.unique(log.quality, return_counts=True)
     return ", ".join(f"{count} of quality {number}" for number, count in zip(numbers, counts, strict=True))
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the names of columns in railfix and in the file from ``NAME=COLUMN`` texts; otherwise SettingsError."""
+    """Return a mapping of railfix's to the file's column names from ``NAME=COLUMN`` texts; SettingsError if invalid."""
     columns: dict[str, str] = {}
     for pair in pairs:
         ours, equals, theirs = pair.partition("=")
@@ -173,7 +176,10 @@ def column_names(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
-    """Rename the columns of a table to railfix's names; see `read_positions`."""
+    """Return the table with some columns also under railfix's names; `columns` as in `read_positions`.
+
+    SettingsError: a name is not in `known`. InputFileError: the table has no such column.
+    """
     if unknown := sorted(set(columns) - set(known)):
         raise SettingsError(f"{table.path}: column {unknown[0]!r} is unknown; expected one of {', '.join(known)}")
     cells = dict(table.cells)
@@ -186,7 +192,7 @@ def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Co
 
 
 def positions_times(table: NamedColumns) -> Datetimes:
-    """Parse times as GPS time, NaT if blank: ``time_gpst``, ``time_utc``, ``unix_s``, or ``week`` and ``tow_s``."""
+    """Return GPS time from ``time_gpst``, ``time_utc``, ``unix_s``, or ``week`` and ``tow_s``; NaT where missing."""
     if "time_gpst" in table:
         return _column_of_times(table, "time_gpst")
     if "time_utc" in table:
@@ -196,7 +202,9 @@ def positions_times(table: NamedColumns) -> Datetimes:
         wrong = np.isfinite(unix) & ((unix < 0.0) | (unix > _LAST_UNIX_S))
         if wrong.any():
             row = int(np.argmax(wrong))
-            raise table.error(row, f"unix_s {unix[row]:g} is no count of seconds since 1970; is it in milliseconds?")
+            raise table.error(
+                row, f"unix_s {unix[row]:g} is not a number of seconds since 1970; is it in milliseconds?"
+            )
         whole = np.floor(np.nan_to_num(unix))
         since = whole.astype("timedelta64[s]") + timedelta(np.nan_to_num(unix) - whole)
         return utc_to_gpst(np.where(np.isnan(unix), np.datetime64("NaT"), np.datetime64("1970-01-01", "ns") + since))
@@ -208,13 +216,13 @@ def positions_times(table: NamedColumns) -> Datetimes:
         if wrong.any():
             row = int(np.argmax(wrong))
             what = f"week {week[row]:g} and tow_s {seconds[row]:g}"
-            raise table.error(row, f"{what} are no GPS week and seconds of it (0 to {SECONDS_PER_WEEK})")
+            raise table.error(row, f"{what} are not a GPS week and a time of week (0 to {SECONDS_PER_WEEK} s)")
         time[known] = from_week(week[known].astype(np.int64), seconds[known])
     return time
 
 
 def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
-    """Parse a column of dates with times: ISO 8601, or the same with slashes; UTC may end in Z."""
+    """Parse a column of ISO 8601 times; dates may have slashes, and UTC may end in Z or +00:00."""
     cells = [cell.replace("/", "-") for cell in table.cells[name].to_list()]
     if table.separator != ",":
         cells = [cell.replace(",", ".") for cell in cells]
@@ -224,16 +232,16 @@ def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
         if cell.endswith("Z") or "+" in cell:
             expected = "UTC" if name == "time_utc" else "GPS time without one"
             hint = "" if name == "time_utc" else f"; for UTC name the column time_utc, or give --column time_utc={name}"
-            raise table.error(row, f"{name} '{cell}' carries a time zone; {expected} was expected{hint}")
+            raise table.error(row, f"{name} '{cell}' has a time zone; {expected} was expected{hint}")
     try:
         return _times([cell or "NaT" for cell in cells])
     except ValueError:
         row = next(i for i, cell in enumerate(cells) if fails(_times, [cell or "NaT"]))
-        raise table.error(row, f"{name} '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
+        raise table.error(row, f"{name} '{cells[row]}' is not an ISO 8601 time such as 2021-09-22T06:30:00.2") from None
 
 
 def _times(texts: list[str]) -> Datetimes:
-    """Parse ISO 8601 times; raise `ValueError` where one is not, or has a time zone."""
+    """Parse ISO 8601 times; raise `ValueError` for any other text and for a time with a time zone."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         try:
@@ -244,7 +252,7 @@ def _times(texts: list[str]) -> Datetimes:
 
 # --- RTKLIB ------------------------------------------------------------------
 
-#: Columns of a table by the columns of RTKLIB's solution.
+#: railfix's column names by the column names of RTKLIB's solutions.
 _OF_RTKLIB: Final = {
     "latitude": "latitude_deg", "longitude": "longitude_deg", "height": "height_m", "x-ecef": "x_m", "y-ecef": "y_m",
     "z-ecef": "z_m", "Q": "quality", "sdn": "sigma_north_m", "sde": "sigma_east_m", "sdu": "sigma_up_m",
@@ -252,7 +260,7 @@ _OF_RTKLIB: Final = {
 
 
 def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
-    """Parse RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
+    """Parse RTKLIB's solution format (manual 2.4.2, B.1); InputFileError for baselines and heights above the geoid."""
     scale, names = _rtklib_header(path, [line for line in lines if line.startswith("%")])
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]
     if not rows:
@@ -294,13 +302,13 @@ def _rtklib_header(path: FilePath, header: list[str]) -> tuple[str, list[str]]:
     """Read the time scale and the names of the columns after the time."""
     for line in header:
         if "lat/lon/height=" in line and "geodetic" in line.split("lat/lon/height=")[1].split(",")[0]:
-            raise InputFileError(path, "the heights are above the geoid; write it with out-height=ellipsoidal")
+            raise InputFileError(path, "the heights are above the geoid; write the file with out-height=ellipsoidal")
     for line in header:
         names = line[1:].replace(",", " ").replace(";", " ").split()
         if names[:1] and names[0] in ("GPST", "UTC", "JST"):
             if any("baseline" in name for name in names):
                 raise InputFileError(
-                    path, "these are baselines (e/n/u); write it with out-solformat=llh or out-solformat=xyz"
+                    path, "these are baselines (e/n/u); write the file with out-solformat=llh or out-solformat=xyz"
                 )
             if len(names) < 5 or not (names[1].startswith("latitude") or names[1].startswith("x-ecef")):
                 break

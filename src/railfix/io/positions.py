@@ -1,4 +1,4 @@
-"""Logs of positions of any kind: one reader, which detects the kind from the content."""
+"""Reader of position logs of any kind, which is detected from the content."""
 
 from __future__ import annotations
 
@@ -22,15 +22,18 @@ from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtkl
 from railfix.io.receiver.log import read_receiver_positions
 from railfix.io.xml_lines import read_gpx_lines
 
-#: Quality as RTKLIB numbers it, by the position type of NovAtel.
+#: RTKLIB's quality by words in NovAtel's position type.
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
 
 
 def _read_gpx(path: FilePath) -> PositionLog:
-    """Read the track points of GPX 1.0 or 1.1 (UTC); heights without ``geoidheight`` are kept, with a note."""
+    """Read the points of tracks and routes in GPX 1.0 or 1.1 (UTC).
+
+    Heights without ``geoidheight`` are used as ellipsoidal heights, with a note.
+    """
     lines = read_gpx_lines(path)
     if not lines:
-        raise InputFileError(path, "there is no track point (trkpt) in this GPX file")
+        raise InputFileError(path, "has no point of a track or route (trkpt, rtept)")
     points = np.concatenate([line.points for line in lines])
     geoid = np.concatenate([line.geoid_m for line in lines])
     try:
@@ -39,7 +42,9 @@ def _read_gpx(path: FilePath) -> PositionLog:
     except ValueError:
         raise InputFileError(path, "a time is not UTC such as 2024-01-01T10:00:00Z") from None
     known = np.isfinite(points[:, 2])
-    notes = [f"{path}: heights of GPX are above the geoid; kept as they are"] if (known & np.isnan(geoid)).any() else []
+    notes = (
+        [f"{path}: GPX heights are above the geoid, and are not corrected"] if (known & np.isnan(geoid)).any() else []
+    )
     if not known.all():
         notes.append(f"{path}: {int((~known).sum()):,} of {len(points):,} points have no height (ele)")
     return PositionLog(
@@ -92,7 +97,7 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
     )
 
 
-#: Rows that are out of order by at most this are sorted; others stay in place [s].
+#: Rows are sorted by time if no row is out of order by more than this [s]; otherwise all stay in the file's order.
 _SORTED_S: Final = 60.0
 
 
@@ -105,44 +110,44 @@ def read_positions(
     heights: Literal["needed", "optional"] = "needed",
     antennas: Literal["one", "several"] = "one",
 ) -> PositionLog:
-    """Read a log of positions of any kind, detected from its content.
-
-    RTKLIB's solutions, tables with named columns (CSV), NMEA, GPX, NovAtel ASCII, and receiver logs with positions
-    (UBX, SBF); plain or packed.
+    """Read a position log of any kind, detected from its content.
 
     Parameters
     ----------
     path : path
+        An RTKLIB solution, a table with named columns (CSV), NMEA, GPX, NovAtel ASCII, or a receiver log with positions
+        (UBX, SBF); plain or packed.
     broken_lines : {"stop", "count"}
-        A broken line is an error, or is skipped and noted; a last line that is cut is always skipped.
+        A broken line is an error, or is skipped and noted; an incomplete last line is always skipped.
     date : datetime64, optional
-        For NMEA (see `railfix.io.nmea.read_nmea`), and UBX logs whose positions have no date.
+        UTC date of the first position in an NMEA log without dates (see `railfix.io.nmea.read_nmea`); time within half
+        a week of a UBX log whose positions have no date.
     columns : mapping of str, optional
-        For tables with other column names: name in railfix to name in the file, such as ``{"latitude_deg": "Lat"}``.
+        Column names in the file by railfix's names, for tables with other names: ``{"latitude_deg": "Lat"}``.
     heights : {"needed", "optional"}
-        Whether a file without any height is an error.
+        With "needed" a file without any height is an error.
     antennas : {"one", "several"}
-        Whether a table with rows of several antennas is an error.
+        With "one" a table with positions of several antennas is an error.
 
     Returns
     -------
     PositionLog
-        All rows and columns of the file. Rows whose time is up to a minute too late in the file are sorted, with a
-        note; larger steps back are noted.
+        All rows and columns of the file. If times go back by at most one minute, the rows are sorted by time, with a
+        note; otherwise they stay in the file's order, with a note.
 
     Raises
     ------
     InputFileError
-        The file is not a log of positions, or a line of it is broken.
+        The file is not a position log, a line is broken, heights are missing, or there are several antennas.
     NoPositionError
         No row has a position.
     SettingsError
-        `columns` names a column unknown to railfix, or the file is not a table.
+        `columns` names a column unknown to railfix, or is given for a file that is not a table.
     """
     check_path(path)
     kind = find_kind(path)
     if columns and kind != "table":
-        raise SettingsError(f"{path}: columns can be renamed in a table with named columns only")
+        raise SettingsError(f"{path}: columns can only be renamed in a table with named columns; leave them out")
     parsers: dict[FileKind, Callable[[list[str]], PositionLog]] = {
         "table": lambda lines: parse_csv_positions(lines, path, columns or {}),
         "novatel": lambda lines: _parse_novatel(lines, path),
@@ -159,10 +164,10 @@ def read_positions(
         log = _read_gpx(path)
     else:
         raise wrong_kind(
-            path, "a log of positions: RTKLIB's solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV)"
+            path, "a position log: an RTKLIB solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV)"
         )
     if antennas == "one" and len(log.antennas) > 1:
-        raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give those of one antenna")
+        raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give the positions of one antenna")
     if np.isnan(log.geodetic[0]).all():
         raise NoPositionError(f"{path}: {plural(len(log), 'row')}, none with a position")
     if heights == "needed" and log.plan_deg is not None and np.isnan(log.ecef_m).all():

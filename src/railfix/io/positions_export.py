@@ -1,7 +1,8 @@
 """Write positions of a run as KML, GPX, GeoJSON, GeoPackage or GeoParquet, with a style for QGIS.
 
-Templates write KML and GPX, because pyogrio gives KML no styles and GPX no description; polars writes GeoParquet, which
-the wheels of pyogrio cannot. Every file is built in memory, because GDAL does not always report a full disk.
+KML and GPX are written from templates, because pyogrio writes no styles to KML and no description to GPX. GeoParquet is
+written by polars, because the pyogrio wheels lack its driver. Files are built in memory, because GDAL does not always
+report a full disk.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from railfix.core.errors import NoPositionError, needs_extra
 from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 
-#: Columns of the tables of positions that become attributes, where a table has them.
+#: Columns written as attributes of each position, where the table has them.
 ATTRIBUTES: Final = (
     "time_gpst", "antenna", "status", "chainage_m", "kilometrage_m", "along_sigma_m", "protection_level_m",
     "protection_level_ground_m", "protection_status", "speed_mps", "track", "track_chainage_m", "track_probability",
 )  # fmt: skip
 COORDINATES: Final = ("longitude_deg", "latitude_deg", "height_m")
-#: Colour of each status with coordinates, by its reliability; "other" is the colour of any further status.
+#: Colour of each status, by the reliability of the position; "other" is for any further status.
 STATUS_COLOURS: Final[Mapping[str, str]] = {
     "ok": "#00805e",
     "tracking": "#00805e",
@@ -54,7 +55,7 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return the path of the QGIS style of a file; None where it needs none or already has it."""
+    """Return the path of the QGIS style to write for a file; None if the format has no such style or it exists."""
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
         return None
@@ -62,7 +63,10 @@ def style_file(path: Path) -> Path | None:
 
 
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates in the format of the ending, with style; NoPositionError: no position exists."""
+    """Write the rows with coordinates in the format of the ending, with the QGIS style; return their number.
+
+    NoPositionError: no row has coordinates.
+    """
     points = _points(rows)
     if points.is_empty():
         raise NoPositionError(f"{path}: no epoch has a position; nothing was written")
@@ -113,11 +117,11 @@ def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) 
     file = BytesIO()
     pyogrio.raw.write(
         file,
-        _wkb(points, "extended"),  # pyogrio up to 0.10 reads no other
+        _wkb(points, "extended"),  # the only flavor that pyogrio up to 0.10 accepts
         [value if value.dtype.kind in "fM" else value.astype(object) for value in values],
         np.array([column.name for column in fields]),
         field_mask=[column.is_null().to_numpy() for column in fields],
-        gdal_tz_offsets={"time_utc": np.full(len(points), 100)},  # GDAL's number of UTC
+        gdal_tz_offsets={"time_utc": np.full(len(points), 100)},  # GDAL's code for UTC
         layer=layer,
         driver=driver,
         geometry_type="Point Z",
@@ -128,7 +132,7 @@ def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) 
 
 
 def _geoparquet(points: pl.DataFrame, description: str) -> bytes:
-    """Return the content of a file by the specification of GeoParquet 1.1."""
+    """Return the content of a GeoParquet 1.1 file."""
     place = points.select(COORDINATES).to_numpy()
     column = {
         "encoding": "WKB",

@@ -1,7 +1,7 @@
-"""Reference positions of each antenna, and tables of tachometer pulses and longitudinal acceleration.
+"""Readers of reference positions, tachometer pulses and longitudinal acceleration.
 
-A reference is a CSV with ``time_gpst``, ``antenna`` (``front``, ``rear``), ``chainage_m``, ``x_m y_m z_m`` (or geodetic
-coordinates), ``speed_mps``, ``sigma_m`` along the track, ``source`` (``rtk``, ``bridged``, ``truth``) and
+A reference is a CSV file with ``time_gpst``, ``antenna`` (``front``, ``rear``), ``chainage_m``, ``x_m y_m z_m`` or
+geodetic coordinates, ``speed_mps``, ``sigma_m`` along the track, ``source`` (``rtk``, ``bridged``, ``truth``) and
 ``environment`` (``open``, ``cutting`` or any word). Only time and position are required.
 """
 
@@ -39,13 +39,13 @@ _FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 class AntennaReference(NotebookTable):
     """Reference positions of one antenna, R epochs."""
 
-    time: Datetimes  #: Rising, GPS time; shape (R,).
-    ecef_m: Floats  #: Shape (R, 3).
+    time: Datetimes  #: GPS time, strictly rising, shape (R,).
+    ecef_m: Floats  #: Position in ECEF, shape (R, 3).
     chainage_m: Floats  #: NaN where the file has none, shape (R,).
     speed_mps: Floats  #: Along the line, positive toward rising chainage; NaN where unknown; shape (R,).
     sigma_m: Floats  #: Standard deviation along the track; NaN where the file has none; shape (R,).
     source: Strings  #: One of `SOURCES`, shape (R,).
-    environment: Strings  #: Blank where the file has none, shape (R,).
+    environment: Strings  #: Environment such as "open", blank where the file has none, shape (R,).
 
     def __post_init__(self) -> None:
         epochs = len(self.time)
@@ -71,7 +71,7 @@ def read_reference(
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> dict[str, AntennaReference]:
-    """Read the reference of one antenna, or of several by the column ``antenna``.
+    """Read the reference positions of one or several antennas.
 
     Parameters
     ----------
@@ -79,9 +79,9 @@ def read_reference(
         A reference file or ground truth of the simulator (``.csv``, ``.csv.gz``), or a position log for
         `railfix.io.positions.read_positions`.
     antennas : sequence of str
-        Antennas to read. A file without the column ``antenna`` holds one antenna.
+        Antennas to read. A file without the column ``antenna`` has the positions of one antenna.
     quality : collection of int
-        Accepted qualities, where the log has them.
+        Accepted qualities; not applied to a log without qualities.
     columns : mapping of str, optional
         For CSV with other column names, as in `read_positions`.
     broken_lines, date
@@ -90,13 +90,16 @@ def read_reference(
     Returns
     -------
     dict of str to AntennaReference
-        Of rows with the same time the first is used. ``source`` is taken from the file; otherwise it is "truth" for
-        files of the simulator, "rtk" for position logs.
+        Rows without position or time are dropped; of rows with the same time the first is used. ``source`` is taken
+        from the file; without that column it is "truth" for files of the simulator and "rtk" for others.
 
     Raises
     ------
     InputFileError
-        No positions, no times, an unknown source, or no column ``antenna`` where two are to be read.
+        An antenna has fewer than two accepted positions with a time, a source is unknown, or several antennas are to be
+        read from a file without the column ``antenna``.
+    NoPositionError
+        No row has a position.
     """
     log = read_positions(path, columns=columns, broken_lines=broken_lines, date=date, antennas="several")
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
@@ -108,19 +111,19 @@ def read_reference(
     if "antenna" not in cells and len(antennas) > 1:
         raise InputFileError(
             path,
-            f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas; give a CSV file "
-            "with one (railfix reference makes it of a log of one antenna)",
+            f"the reference of several antennas must have a column antenna ({', '.join(antennas)}); give a CSV file "
+            "with this column (railfix reference writes it from a log of one antenna)",
         )
     values = _columns(log, cells)
     what = ""
     if log.has_quality:
         wanted, there = ", ".join(map(str, quality)), qualities_in_words(log)
-        what = f" and quality {wanted} (the log has {there}; railfix evaluate --reference-quality takes others)"
+        what = f" and quality {wanted} (the log has {there}; railfix evaluate --reference-quality accepts others)"
     return {name: _of_antenna(path, name, owner, usable, values, what) for name in antennas}
 
 
 def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:
-    """Collect all columns of all rows, blank where the file lacks them."""
+    """Return the columns of all rows, NaN or blank where the file lacks them; InputFileError: an unknown source."""
     source = table.texts("source", absent="truth" if all(name in table for name in _OF_TRUTH) else "rtk")
     unknown = ~np.isin(source, SOURCES)
     if unknown.any():
@@ -147,13 +150,13 @@ def _of_antenna(
     _, first = np.unique(columns["time"][rows], return_index=True)
     if len(first) < 2:
         others = sorted({*owner.tolist()} - {name})
-        there = f"; the file has those of {', '.join(others)}" if others else ""
+        there = f"; the file has positions of {', '.join(others)}" if others else ""
         raise InputFileError(path, f"fewer than two positions for the antenna {name} with a time{what}{there}")
     return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
 
 
 def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
-    """Return the rows of a reference file, by time and then antenna; null where blank."""
+    """Return references as the table of a reference file, sorted by time; null where unknown."""
     tables = [
         pl.DataFrame(
             {
@@ -175,7 +178,7 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
     )
 
 
-LONGEST_STEP_S = 1.0  #: Rows farther apart than this are a gap, within which values are unknown [s].
+LONGEST_STEP_S = 1.0  #: Longest interval between rows [s]; a longer interval is a gap, in which values are unknown.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,12 +187,16 @@ class Pulses:
 
     path: str
     time: Datetimes
-    count: Floats  #: Falling where the train runs backward, if the table has the direction; shape (P,).
-    kind: str  #: Rows are readings of a counter, single pulses, or distances in metres.
-    signed: bool  #: Whether the count has a direction: it falls somewhere, or the table has the column.
+    #: Pulses, or metres for kind "distance"; falls where the train runs backward, if `signed`; shape (P,).
+    count: Floats
+    kind: str  #: Source of the count: "count" (readings of a counter), "pulse" (single pulses) or "distance".
+    signed: bool  #: Whether the table has the running direction: a column of it, or a count that falls somewhere.
 
     def at(self, time: Datetimes) -> Floats:
-        """Interpolate the count linearly; NaN outside the table and in gaps during which the train moves."""
+        """Interpolate the count linearly; NaN outside the table and in gaps in which the count changes.
+
+        Single pulses (`kind` "pulse") have no gaps.
+        """
         at, known = seconds(time - self.time[0]), seconds(self.time - self.time[0])
         count = np.interp(at, known, self.count, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
@@ -203,7 +210,7 @@ class Pulses:
 class Acceleration:
     """Longitudinal acceleration toward the vehicle's front, A rows [m/s2].
 
-    `kind`: acceleration of the "motion", or "specific_force", which includes gravity on gradients.
+    `kind` is "motion", or "specific_force" if the values include gravity on gradients.
     """
 
     path: str
@@ -212,7 +219,7 @@ class Acceleration:
     kind: str
 
     def mean_over(self, time: Datetimes) -> Floats:
-        """Compute the mean between consecutive times, shape (len(time) - 1,) [m/s2]; NaN across gaps of the table."""
+        """Compute means between consecutive times, shape (len(time) - 1,); NaN outside the table or in gaps."""
         known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
         step = np.diff(known)
         velocity = np.concatenate(
@@ -226,12 +233,12 @@ class Acceleration:
 
 
 def read_pulses(path: FilePath) -> Pulses:
-    """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
+    """Read a tachometer table, CSV or Parquet, with ``time_gpst`` and the count.
 
-    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``pulse`` the number of a
-    pulse, as `railfix run` takes it, ``distance_m`` the distance run; with none of them each row is one pulse. A column
-    ``direction`` of 1 and -1 gives the sign. InputFileError: no such table, times that do not rise, a direction other
-    than 1 and -1.
+    The count is in the column ``count`` (reading of a counter, which falls when the train runs backward and never
+    wraps), ``pulse`` (number of a pulse, as for `railfix run`) or ``distance_m`` (distance run). Without these columns
+    each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: the file is not such a
+    table, its times do not rise, or a direction is neither 1 nor -1.
     """
     table = read_sensor_table(path, "pulses")
     names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
@@ -249,11 +256,11 @@ def read_pulses(path: FilePath) -> Pulses:
 
 
 def read_acceleration(path: FilePath) -> Acceleration:
-    """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
+    """Read a table of accelerations toward the front, CSV or Parquet, with ``time_gpst`` and one column of values.
 
     ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
-    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the acceleration of the
-    motion. InputFileError: none or several of the columns, or times that do not rise.
+    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the train's acceleration
+    without gravity. InputFileError: the table has none or several of these columns, or its times do not rise.
     """
     table = read_sensor_table(path, "acceleration")
     kinds = {

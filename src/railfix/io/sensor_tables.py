@@ -1,4 +1,4 @@
-"""Tables of the sensors on board, CSV (also packed) or Parquet, and EGNSS MATE tables with the same columns."""
+"""Reader of on-board sensor tables: CSV (also packed), Parquet, and EGNSS MATE tables."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "pulses": ("[count]", "[pulse]", "[distance_m]", "[direction]"),
     "acceleration": ("[specific_force_mps2]", "[force_forward_mps2]", "[acceleration_mps2]"),
 }  # fmt: skip
-#: Sensors that may have no output for some time, which rows with the time alone report; tables without a time.
+#: Sensors whose tables may have rows with only a time, where the sensor has no output.
 _SILENT: Final = ("tachometer", "ranging", "balises")
-_TIMELESS: Final = ("ranging_units", "list of balises")
+_TIMELESS: Final = ("ranging_units", "list of balises")  #: Tables without times.
 #: Tables without empty values, with strictly rising times and at least two rows.
 _COMPLETE: Final = ("pulses", "acceleration")
-_NAMES: Final = ("unit", "balise", "track")  #: Columns of names.
-_WHOLE: Final = ("pulse", "direction")  #: Columns of whole numbers.
+_NAMES: Final = ("unit", "balise", "track")  #: Text columns.
+_WHOLE: Final = ("pulse", "direction")  #: Integer columns.
 
 
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
-    """Read a table with `COLUMNS` of a kind, numbers as numbers, names as text, times as GPS time that does not fall.
+    """Read a sensor table of a kind in `COLUMNS`; names are text, and times are GPS time and do not fall.
 
-    InputFileError: the file is not such a table, has no rows, or a value is missing or wrong; the message names its
-    row.
+    Rows with only a time are dropped. InputFileError: the file is not such a table, has no rows, or a value is missing
+    or wrong; the message names the row.
     """
     with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
         if mate_table(path):
@@ -65,7 +65,7 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     if missing:
         raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
     if not len(table):
-        raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
+        raise InputFileError(path, f"has no rows; expected rows of the {kind}; without them, leave the file out")
     present = [name for name in names_of_columns(kind) if name in table.columns]
     silent = table.select(pl.all_horizontal(pl.col(present).is_null())).to_series() if kind in _SILENT else None
     table = table.with_columns(
@@ -77,14 +77,14 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     if silent is not None:  # a recorded stream has rows with the time alone (`railfix.live.stream`)
         table = table.filter(~silent)
         if not len(table):
-            raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")
+            raise InputFileError(path, f"has times but no values of the {kind}; leave the file out")
     if "balise" in present and (empty := table["balise"].is_null()).any():
         raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: balise is empty; name it")
     return table
 
 
 def names_of_columns(kind: str) -> list[str]:
-    """Return the names of the columns of a table, including columns that may be absent, without the time."""
+    """Return the column names of a kind of table except the time, including columns that may be absent."""
     return [column.strip("[]") for column in COLUMNS[kind]]
 
 
@@ -94,7 +94,7 @@ def get_times(table: pl.DataFrame) -> Datetimes:
 
 
 def get_column(table: pl.DataFrame, name: str) -> NDArray[Any]:
-    """Return a column of a table; an empty whole number is 0, other missing numbers are NaN."""
+    """Return a column of a table; empty cells are 0 in integer columns and NaN in others; NaN if it is absent."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     if name in _NAMES:
@@ -104,20 +104,20 @@ def get_column(table: pl.DataFrame, name: str) -> NDArray[Any]:
 
 def _check_times(path: FilePath, column: pl.Series, kind: str) -> None:
     if not column.dtype.is_temporal():
-        raise InputFileError(path, "time_gpst is no time; expected GPS time as 2024-03-05T03:10:00.000000000")
+        raise InputFileError(path, "time_gpst is not a time; expected GPS time such as 2024-03-05T03:10:00.000000000")
     if (unknown := column.is_null()).any():
         raise InputFileError(path, f"row {int(unknown.arg_max() or 0) + 2}: time_gpst is empty; remove the row")
     step, nothing = np.diff(column.to_numpy().astype("datetime64[ns]")), np.timedelta64(0, "ns")
     wrong = np.flatnonzero(step <= nothing if kind in _COMPLETE else step < nothing)
     if len(wrong):
-        how = "falls" if step[wrong[0]] < nothing else "is that of the row before"
-        raise InputFileError(path, f"row {int(wrong[0]) + 3}: time_gpst {how}; sort the table by time, each once")
+        how = "falls" if step[wrong[0]] < nothing else "repeats the row before"
+        raise InputFileError(path, f"row {int(wrong[0]) + 3}: time_gpst {how}; sort the rows, keep each time once")
     if kind in _COMPLETE and not len(step):
-        raise InputFileError(path, "fewer than two rows")
+        raise InputFileError(path, "has fewer than two rows")
 
 
 def _numbers(path: FilePath, column: pl.Series, kind: str, silent: pl.Series | None) -> pl.Series:
-    """Return a column as numbers; pulses and directions are whole numbers."""
+    """Return a column as numbers; InputFileError: a value is not a number, or is missing and must not be."""
     numbers = column.cast(pl.Int64 if column.name in _WHOLE else pl.Float64, strict=False)
     wrong = numbers.is_null() & column.is_not_null()
     if kind in _COMPLETE or column.name == "chainage_m":
@@ -131,7 +131,7 @@ def _numbers(path: FilePath, column: pl.Series, kind: str, silent: pl.Series | N
     return numbers
 
 
-#: Columns of a sensor's table by EGNSS MATE columns.
+#: railfix's column names by EGNSS MATE column names, for each table.
 _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
     "S_IMU": {
         "SPEC_FORCE_X": "force_forward_mps2", "SPEC_FORCE_Y": "force_right_mps2", "SPEC_FORCE_Z": "force_down_mps2",
@@ -142,7 +142,10 @@ _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
 
 
 def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
-    """Return a table of EGNSS MATE with `COLUMNS`; InputFileError: it is of another kind, or of several devices."""
+    """Read an EGNSS MATE table as a table with `COLUMNS`.
+
+    InputFileError: the table is of another kind, has several devices, or its forces do not include gravity.
+    """
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
     if name != expected.get(kind, "S_DM_BALISE" if kind == "list of balises" else ""):
@@ -158,7 +161,7 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     columns = _MATE_COLUMNS[name]
     table = only_device(path, read_mate(path, ("TIMESTAMP_UTC", *columns)))
     if name == "S_IMU" and table["COMPENSATED"].cast(pl.Boolean).fill_null(False).any():
-        raise InputFileError(path, "has compensated forces, without gravity; give specific forces, or leave it out")
+        raise InputFileError(path, "its forces are compensated for gravity; give specific forces, or no such table")
     codes = [column for column in table.columns if column.endswith("ERROR_CODE")]
     good = table.filter(pl.all_horizontal(pl.col(column).cast(pl.Int64).fill_null(0) == 0 for column in codes))
     values = [pl.col(column).cast(pl.Float64).alias(to) for column, to in columns.items()]
@@ -166,21 +169,21 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
 
 
 def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of the balise whose position represents each group."""
+    """Return the rows of the first balise of each group (N_PIG = 0), whose position is used as the group's."""
     return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
 
 
 def _group() -> pl.Expr:
-    """Identity of a balise group: country and group."""
+    """Return the expression of a balise group's identity, "NID_C-NID_BG"."""
     parts = [pl.col(name).cast(pl.Int64).cast(pl.String) for name in ("NID_C", "NID_BG")]
     return pl.concat_str(parts, separator="-").alias("balise")
 
 
 def _in_gps_time(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows in order of time, with the time of the schema as GPS time."""
+    """Return the rows sorted by time, with ``TIMESTAMP_UTC`` converted to GPS time in ``time_gpst``."""
     column = table["TIMESTAMP_UTC"]
     utc = column.str.to_datetime(time_unit="ns", strict=False) if column.dtype == pl.String else column
     if not utc.dtype.is_temporal() or utc.is_null().any():
-        raise InputFileError(path, "TIMESTAMP_UTC has a value that is no time; correct the row")
+        raise InputFileError(path, "TIMESTAMP_UTC has a value that is not a time; correct the row")
     gps = utc_to_gpst(utc.cast(pl.Datetime("ns")).to_numpy())
     return table.with_columns(time_gpst=pl.Series(gps, dtype=pl.Datetime("ns"))).sort("time_gpst", maintain_order=True)

@@ -1,4 +1,4 @@
-"""Precise ephemerides from SP3 files (versions a, c and d)."""
+"""Reader of precise ephemerides in SP3 files (versions a to d)."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from railfix.io.file_kind import wrong_kind
 
 #: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
-#: Time systems other than GPS time, by the names that files use.
+#: Functions that convert other time systems to GPS time, by the names of the systems in files.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
-_NO_CLOCK: Final = 999_999.0  #: Written where a clock is unknown [us]; some programs write 0.
+_NO_CLOCK: Final = 999_999.0  #: Value of an unknown clock in a file [us]; some programs write 0.
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:
-    """Read positions and clocks of one or several SP3 files, joined in order of time.
+    """Read satellite positions and clocks from one or several SP3 files, joined in order of time.
 
     Parameters
     ----------
     paths : path or sequence of paths
-        Plain, gzip, compress.
+        SP3 files, plain or packed.
 
     Returns
     -------
     PreciseEphemeris
-        Where files overlap, the file given first takes precedence. Positions of zero or at a radius that is not one
-        of the constellation, and clocks of zero, are absent.
+        Where files overlap, the file given first takes precedence. Positions that are zero or at an implausible radius
+        for the constellation, and clocks that are zero or unknown, are NaN.
 
     Raises
     ------
     InputFileError
-        A file is missing, is not an SP3 file, is in an unknown time system, or is broken; or all files
-        together have fewer epochs than the interpolation needs.
+        A file is missing, is not an SP3 file, is in an unknown time system, or is broken; all files together have
+        fewer epochs than the interpolation needs; or all positions are at implausible radii.
     """
     files = path_names(paths)
     epoch, satellite, numbers = zip(*(state for path in files for state in _states(path)), strict=True)
@@ -60,7 +60,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
         what = f"its satellites are {radius:,.0f} km from the Earth's centre; are the positions in metres? SP3 has km"
         raise InputFileError(source, what)
     zeros = (clock == 0.0) & known
-    counts = {"positions at the radius of no satellite": int((wrong & known).sum()), "clocks of 0": int(zeros.sum())}
+    counts = {"positions at an implausible radius": int((wrong & known).sum()), "clocks of 0": int(zeros.sum())}
     position[wrong] = np.nan
     clock[(np.abs(clock) >= _NO_CLOCK) | (clock == 0.0)] = np.nan
     return PreciseEphemeris(
@@ -74,7 +74,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
 
 
 def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
-    """Read epochs [ns of GPS time], satellites, positions [km] and clocks [us] of a file."""
+    """Read epoch [ns of GPS time since 1970], satellite, and x, y, z [km] and clock [us] of each position line."""
     lines = read_text_lines(path)
     if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
         raise wrong_kind(path, "a file of precise orbits, SP3 (its first line begins with #a, #b, #c or #d)")
@@ -98,7 +98,10 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
 
 
 def _satellite(text: str) -> str:
-    """Return the satellite as ``G01``; SP3-a omits the letter of GPS and may have blanks for zeros."""
+    """Return the satellite as ``G01``; SP3-a omits the letter of GPS and may have blanks for zeros.
+
+    ValueError: the text has no number.
+    """
     letter = text[0] if text[:1].isalpha() else "G"
     digits = text[1:].strip()
     if not digits.isdecimal():
@@ -107,7 +110,7 @@ def _satellite(text: str) -> str:
 
 
 def _numbers(line: str) -> list[float]:
-    """Parse position [km] and clock [us]; a blank clock is unknown."""
+    """Parse position [km] and clock [us], the clock NaN where blank; ValueError: a value is not a finite number."""
     x, y, z = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(3))
     text = line[46:60].strip()
     clock = float(text) if text else np.nan
@@ -117,7 +120,7 @@ def _numbers(line: str) -> list[float]:
 
 
 def _time_system(path: FilePath, lines: list[str]) -> str:
-    """Return the time system of the first %c line."""
+    """Return the time system of the first %c line, "GPS" without such a line; InputFileError: it is unsupported."""
     for number, line in enumerate(lines, start=1):
         if line.startswith("%c"):
             system = line[9:12].strip().upper()
@@ -129,7 +132,7 @@ def _time_system(path: FilePath, lines: list[str]) -> str:
 
 
 def _instant(line: str, system: str) -> int:
-    """Parse an epoch line as nanoseconds of GPS time since 1970."""
+    """Parse an epoch line as nanoseconds of GPS time since 1970; ValueError: it is not a valid time."""
     year, month, day, hour, minute = (int(line[a:b]) for a, b in ((3, 7), (8, 10), (11, 13), (14, 16), (17, 19)))
     seconds = float(line[20:31])
     if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):

@@ -1,7 +1,8 @@
-"""The position message of a train: one schema for live positions, supervision and control.
+"""Position message of a train, for live positions, supervision and control.
 
-CBOR with integer keys (RFC 8949, canonical order): about 100 bytes, and an older receiver skips unknown keys; a JSON
-view; and the position report of ETCS (SUBSET-026 v4, 7.4.2, packet 0). Needs ``railfix[live]``.
+A message is encoded in CBOR with integer keys (RFC 8949, canonical order) in about 100 bytes; receivers skip unknown
+keys. It can also be written as JSON, and as an ETCS position report (SUBSET-026 v4, 7.4.2, packet 0). CBOR needs
+``railfix[live]``.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from pydantic import Field, ValidationError, model_validator
 from railfix.core.errors import InputFileError, needs_extra
 from railfix.core.settings import Message, Model
 
-VERSION: Final = 1  #: Version of the schema; a receiver rejects other major versions.
-LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected unread.
+VERSION: Final = 1  #: Version of the schema; a receiver rejects other versions.
+LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected without decoding.
 
 Unsigned = Annotated[int, Field(ge=0, lt=1 << 63)]
 Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
@@ -63,28 +64,28 @@ class SuspectedInterference(IntEnum):
 class Unknown(IntFlag):
     """Unknown properties of the train."""
 
-    FACING = 1  #: The orientation of the front end: `over_cm` and `under_cm` cover both directions.
-    FRONT_END = 2  #: The front end: `chainage_cm` refers to the reference point, an antenna or its vehicle.
-    LENGTH = 4  #: The train's length.
+    FACING = 1  #: Direction of the front end; `over_cm` and `under_cm` are bounds in both directions.
+    FRONT_END = 2  #: Position of the front end; `chainage_cm` refers to the reference point of the train.
+    LENGTH = 4  #: Train length.
 
 
 class TrainMessage(Message):
-    """One position message."""
+    """Position message of a train."""
 
     train: Unsigned  #: Identity of the train.
     sequence: Unsigned  #: Number of the message, counted by the sender.
-    time_ns: Unsigned  #: Instant the position is valid at, GPS time since 1980-01-06.
-    sent_ns: Unsigned  #: Sender's clock when it was sent, GPS time; with the receiver's clock it gives the age.
+    time_ns: Unsigned  #: Time of validity of the position, GPS time since 1980-01-06.
+    sent_ns: Unsigned  #: Time of sending by the sender's clock, GPS time since 1980-01-06.
     line: Unsigned  #: Identity of the line or track.
     chainage_cm: Signed | None = None  #: Front end of the train along the line; None without a position.
     #: The front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
-    #: Positive with rising chainage; bound of its error [cm/s].
-    speed_cmps: Signed | None = None
-    speed_bound_cmps: Unsigned | None = None
-    direction: Annotated[int, Field(ge=-1, le=1)] = 0  #: Running direction against chainage, 0 where unknown.
-    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Orientation of the front end.
+    speed_cmps: Signed | None = None  #: Speed, positive toward rising chainage; None where unknown.
+    speed_bound_cmps: Unsigned | None = None  #: Bound of the speed error.
+    #: Running direction: 1 toward rising chainage, -1 toward falling chainage, 0 where unknown.
+    direction: Annotated[int, Field(ge=-1, le=1)] = 0
+    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Direction of the front end, coded as `direction`.
     standstill: bool = False
     status: MessageStatus = MessageStatus.NO_POSITION
     sources: Source = Source(0)
@@ -98,14 +99,14 @@ class TrainMessage(Message):
     authority: Unsigned | None = None
     authority_end_cm: Signed | None = None  #: End of the train's authority, rounded away from the train.
     interference: SuspectedInterference | None = None  #: None from trains without this check.
-    #: Safe front and rear end: no part of the train is ahead of the first or behind the second, in the direction of
-    #: `facing`. None without bounds, or where the end or the direction is unknown.
+    #: Safe front end and safe rear end: no part of the train is ahead of the safe front end or behind the safe rear
+    #: end, in the direction of `facing`. None without bounds, or where the end or the direction is unknown.
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
     unknown: Unknown = Unknown(0)  #: Properties of the train unknown to the sender.
-    #: Random number of a start of the train's unit: `sequence` begins again with each start.
+    #: Random number drawn at each start of the on-board unit, at which `sequence` restarts.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] | None = None
-    brake_order: Unsigned | None = None  #: Number of the order to brake that the train obeys, None without one.
+    brake_order: Unsigned | None = None  #: Number of the brake order that the train executes, None without an order.
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
@@ -113,7 +114,7 @@ class TrainMessage(Message):
         if placed and None in (self.chainage_cm, self.over_cm, self.under_cm):
             raise ValueError("a message with a position has chainage_cm, over_cm and under_cm")
         if self.chainage_cm is None and (self.over_cm is not None or self.under_cm is not None):
-            raise ValueError("over_cm and under_cm stand beside chainage_cm")
+            raise ValueError("over_cm and under_cm need chainage_cm")
         return self
 
 
@@ -125,7 +126,7 @@ _TRUTHS: Final = ("standstill", "complete")
 
 
 class MessageError(InputFileError):
-    """Bytes that are not a position message."""
+    """Error of bytes or text that are not a valid position message."""
 
     def __init__(self, what: str) -> None:
         super().__init__("position message", what)
@@ -133,22 +134,22 @@ class MessageError(InputFileError):
 
 @cache
 def cbor() -> ModuleType:
-    """Return the library of CBOR."""
+    """Return the module ``cbor2``, which is installed with ``railfix[live]``."""
     with needs_extra():
         import cbor2
     return cbor2
 
 
 def encode(message: TrainMessage) -> bytes:
-    """Return CBOR of a message, always the same bytes for the same message; absent fields are left out."""
-    # keys rise in the order of the fields, so that this is the canonical form
+    """Encode a message in CBOR; equal messages give equal bytes, and fields that are None are left out."""
+    # keys rise in the order of the fields, which is the canonical order
     values = {KEYS[name]: value for name, value in vars(message).items() if value is not None}
     data: bytes = cbor().dumps({_VERSION_KEY: VERSION, **values})
     return data
 
 
 def decode(data: bytes) -> TrainMessage:
-    """Decode CBOR, skipping unknown keys; MessageError where it is not a message of this version."""
+    """Decode CBOR, skipping unknown keys; MessageError: the bytes are not a valid message of this version."""
     cbor2 = cbor()
     if len(data) > LONGEST:
         raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")
@@ -164,7 +165,7 @@ def decode(data: bytes) -> TrainMessage:
     if type(version) is not int or version != VERSION:
         raise MessageError(f"is of version {version!r}, {VERSION} was expected")
     named = {_NAMES[key]: value for key, value in values.items() if key in _NAMES}
-    for name, value in named.items():  # a truth value or a number with a fraction is not an integer
+    for name, value in named.items():  # bool and float are not accepted as integers
         expected = bool if name in _TRUTHS else int
         if type(value) is not expected:
             raise MessageError(f"{name}: {type(value).__name__} instead of {expected.__name__}")
@@ -172,13 +173,13 @@ def decode(data: bytes) -> TrainMessage:
 
 
 def _entries(data: bytes) -> int:
-    """Return the number of entries in the head of a CBOR map (RFC 8949, 3.1); -1 without a length."""
+    """Return the number of entries in the head of a CBOR map (RFC 8949, 3.1); -1 for an indefinite length."""
     size = data[0] & 0x1F
     return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
 
 def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
-    """Return a message of a kind from its values; MessageError where they are out of range."""
+    """Return a message of a kind from its values; MessageError: a value is missing, out of range or inconsistent."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -188,7 +189,7 @@ def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
 
 
 def to_json(message: TrainMessage) -> str:
-    """Return one line of JSON with the names of the fields; statuses and sources in words."""
+    """Return a message as one line of JSON by field names; statuses and sources are written as names."""
     values = message.model_dump()
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
@@ -199,7 +200,7 @@ def to_json(message: TrainMessage) -> str:
 
 
 def from_json(line: str) -> TrainMessage:
-    """Return a message from its line of JSON; MessageError as in `decode`."""
+    """Parse a message from its line of JSON; MessageError: the text is not a valid message of this version."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):
@@ -223,12 +224,14 @@ def from_json(line: str) -> TrainMessage:
     return validate_message(TrainMessage, values)
 
 
-_LARGEST_LENGTH: Final = 32_766  #: Largest value of a length of packet 0; one more means unknown.
+_LARGEST_LENGTH: Final = 32_766  #: Largest value of a length in packet 0; the next value means unknown.
 
 
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
-    """Return the fields of packet 0 (SUBSET-026 v4, 7.4.2.1) against a reference at `reference_cm` of identity
-    `reference` (NID_BG or NID_LRBG). ValueError: no position of the front end, or too far.
+    """Return the fields of packet 0 (SUBSET-026 v4, 7.4.2.1), with the position relative to a balise group.
+
+    `reference_cm` is the chainage of the group, and `reference` its identity (NID_LRBG). ValueError: the message has no
+    position of the front end, or the front end is too far from the group.
     """
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")
@@ -236,8 +239,8 @@ def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> 
         raise ValueError("a message without the position of the front end has no packet 0")
     distance = message.chainage_cm - reference_cm
     metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
-    # Whole metres (Q_SCALE 1), tens of metres where these do not reach (Q_SCALE 2); confidence bounds are rounded up,
-    # including the rounding of the distance, so that they remain bounds.
+    # Lengths are in metres (Q_SCALE 1), or in tens of metres (Q_SCALE 2) if they are too large. Confidence bounds are
+    # rounded up, and include the rounding of the distance, so that they remain bounds.
     largest = max(metres.values())
     scale, unit = (1, 100) if largest <= 100 * _LARGEST_LENGTH - 200 else (2, 1000)
     rounded = {"D_LRBG": round(metres["D_LRBG"] / unit)}
@@ -247,7 +250,7 @@ def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> 
     for name, value in rounded.items():
         if value > _LARGEST_LENGTH:
             raise ValueError(
-                f"{name} is {value * unit / 100:.0f} m, at most 327660 m can be reported; take a nearer reference"
+                f"{name} is {value * unit / 100:.0f} m, at most 327660 m can be reported; use a nearer reference"
             )
     side = {1: 1, -1: 0, 0: 2}
     along = 0 if distance == 0 else (1 if distance > 0 else -1)

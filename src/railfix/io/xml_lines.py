@@ -1,4 +1,4 @@
-"""Lines of points in GPX (1.0, 1.1) and in KML (2.2, with Google's gx:Track), by the standard library."""
+"""Readers of lines of points in GPX (1.0, 1.1) and KML (2.2, with Google's gx:Track)."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Element = ElementTree.Element
 
 @dataclass(frozen=True, kw_only=True)
 class XmlLine:
-    """One line of a file, n points."""
+    """Line of a GPX or KML file, n points."""
 
     fields: dict[str, str]  #: ``name``, blank where the file has none, and ``ExtendedData`` of KML.
-    points: Floats  #: Longitude, latitude [deg], height as the file has it [m], NaN without one; shape (n, 3).
+    points: Floats  #: Longitude, latitude [deg] and height as written [m], NaN where missing; shape (n, 3).
     geoid_m: Floats  #: ``geoidheight`` of GPX, NaN where missing; shape (n,).
-    time: tuple[str, ...]  #: UTC as in the file, blank where missing.
+    time: tuple[str, ...]  #: UTC as written, blank where missing; n texts.
 
 
 def read_root(path: FilePath) -> Element:
-    """Return the root of an XML file; InputFileError where it is not such a file."""
+    """Return the root element of an XML file; InputFileError if the file is not XML."""
     content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros behind
     try:
         text: str | bytes = content.decode("utf-8")
@@ -49,7 +49,7 @@ def _texts(element: Element) -> dict[str, str]:
 
 
 def read_gpx_lines(path: FilePath) -> list[XmlLine]:
-    """Return the segments of tracks and the routes of a GPX file; InputFileError where a point has no position."""
+    """Return the track segments and routes of a GPX file; InputFileError: a point has no position."""
     lines = []
     for owner in read_root(path):
         if tag(owner) not in ("trk", "rte"):
@@ -83,7 +83,7 @@ def read_kml_lines(path: FilePath) -> list[XmlLine]:
             mode = _texts(part).get("altitudeMode", "")
             if mode.startswith("relativeTo"):
                 raise InputFileError(
-                    path, f"its altitudeMode is {mode}, no height of the track; write absolute heights or none"
+                    path, f"its altitudeMode is {mode}, which gives no track height; write absolute heights or none"
                 )
             rows = [_numbers(path, f"a coordinate of {name!r}", cells) for cells in _kml_cells(part)]
             if not rows:
@@ -97,7 +97,7 @@ def read_kml_lines(path: FilePath) -> list[XmlLine]:
 
 
 def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
-    """Yield longitude, latitude and, where it is there, height of the points of a LineString or gx:Track."""
+    """Yield longitude, latitude and, where written, height of each point of a LineString or gx:Track."""
     for child in part:
         if tag(child) == "coordinates":
             yield from ([*text.split(",")] for text in (child.text or "").replace(", ", ",").split())
@@ -106,7 +106,7 @@ def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
 
 
 def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[float]:
-    """Return longitude, latitude and the cells after them as numbers."""
+    """Return a point's longitude, latitude and further cells as numbers; InputFileError: not numbers, out of range."""
     if comma := next((cell for cell in cells if "," in str(cell)), None):
         raise InputFileError(path, f"{where}: {comma} has a comma in a number; a point was expected")
     try:
@@ -114,5 +114,5 @@ def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[fl
     except ValueError:
         values = []
     if not 2 <= len(values) <= 4 or not (abs(values[0]) <= 360.0 and abs(values[1]) <= 90.0):
-        raise InputFileError(path, f"{where}: {', '.join(map(str, cells))} is no longitude, latitude and height")
+        raise InputFileError(path, f"{where}: {', '.join(map(str, cells))} is not longitude, latitude and height")
     return values
