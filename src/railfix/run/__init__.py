@@ -1,4 +1,4 @@
-"""Position logs and write the results: files in, tables of positions out, and the results read back."""
+"""Runs: reading of logs, positioning, writing of result folders, and reading of these folders."""
 
 import lazy_loader
 

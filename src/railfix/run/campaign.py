@@ -1,7 +1,7 @@
-"""Campaigns: many logs positioned in one resumable command, each with its own results folder.
+"""Campaigns: positioning of many logs by one command that can be resumed, with one results folder per run.
 
-The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables
-together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/positions.parquet")``.
+The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables together are
+one hive-partitioned data set, which ``pl.scan_parquet(out / "runs/**/positions.parquet")`` reads.
 """
 
 from __future__ import annotations
@@ -30,32 +30,33 @@ from railfix.run.output import check_folder
 from railfix.run.processor_setup import with_measured_priors
 from railfix.run.record import read_record
 
-#: A field in a pattern: ``{day}``.
+#: Field in a pattern, such as ``{day}``.
 _FIELD: Final = re.compile(r"\{(\w+)\}")
 
 
 class Campaign(Settings):
-    """Files of a campaign; patterns are relative to its file and have fields in braces.
+    """Files of a campaign, given by patterns with fields in braces; paths are relative to the campaign file.
 
-    Fields that a pattern shares with `front` must agree: ``nav/{day}.nav*`` gives each run the files of its day,
-    ``{line}/track.csv`` the track of its line. Names without fields or ``*`` are files of every run.
+    A run has the files whose fields have the same values as those of its front log. With ``nav/{day}.nav*`` a run has
+    the navigation files of its day, with ``{line}/track.csv`` the track of its line. A name without fields and ``*`` is
+    a file of every run.
     """
 
-    #: Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files of
-    #: one antenna are joined in the order of their names. `rear` may be empty.
+    #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs with the same values of
+    #: the fields are one run; several files of one antenna are joined in the order of their names.
     front: str
-    nav: str  #: Pattern of navigation files; the pattern of precise orbits (`sp3`) may be empty.
-    track: tuple[str, ...]  #: Patterns of the track's files, joined to a route in this order.
-    rear: str = ""
-    sp3: str = ""
-    #: Patterns of one file for each run; may be empty.
+    nav: str  #: Pattern of navigation files.
+    track: tuple[str, ...]  #: Patterns of the files of the track, which are joined to a route in this order.
+    rear: str = ""  #: Pattern of the logs of the rear antenna; may be empty.
+    sp3: str = ""  #: Pattern of precise orbits; may be empty.
+    #: Patterns of files with one file per run; may be empty.
     vehicle: str = ""
     tachometer: str = ""
     inertial: str = ""
     radar: str = ""
-    reference: str = ""  #: Pattern of the reference trajectory of a run, for the page on the campaign; may be empty.
-    config: Path | None = None
-    options: RunOptions = RunOptions()  #: Options of every run.
+    reference: str = ""  #: Pattern of the reference trajectory of a run, for the campaign's page; may be empty.
+    config: Path | None = None  #: Settings file of all runs.
+    options: RunOptions = RunOptions()  #: Options of all runs.
 
 
 #: Patterns of several files per run, and patterns of one file per run.
@@ -65,18 +66,18 @@ _ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignRun:
-    """One run of a campaign; `fields` are in the order of the pattern of the front antenna."""
+    """One run of a campaign."""
 
-    fields: Mapping[str, str]
+    fields: Mapping[str, str]  #: Values of the fields, in the order of the pattern `front`.
     inputs: RunInputs
     config: Config
     options: RunOptions
-    out: Path
-    reference: Path | None = None
+    out: Path  #: Results folder.
+    reference: Path | None = None  #: Reference trajectory; None without.
 
     @property
     def done(self) -> bool:
-        """Whether results for the same inputs and settings exist."""
+        """Whether the results folder has results for the same inputs and settings."""
         try:
             record = read_record(self.out)
             record.check_inputs()
@@ -90,16 +91,14 @@ class CampaignProgress(Protocol):
     """Callback for the progress of a campaign."""
 
     def __call__(self, *, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-        """Report the numbers of runs done, kept from an earlier call, failed and in total, and the estimated time left
-        [s].
-        """
+        """Report the numbers of runs: finished, kept from an earlier call, failed, in total; and the time left [s]."""
 
 
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
-    """Read a campaign file and find the files of each run.
+    """Read a campaign file, and find the files of each run, whose results folders are below `out`.
 
-    InputFileError: no log matches its pattern. SettingsError: a setting is misspelt, or a pattern has no field, or a
-    field that the pattern of the front antenna's logs lacks.
+    InputFileError: no log matches the pattern `front`. SettingsError: a setting is misspelt, `front` has no field, a
+    pattern is ambiguous or has a field that `front` lacks, or a run has several files where one is expected.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
     folder, out = path.absolute().parent, out.absolute()
@@ -152,15 +151,15 @@ def run_campaign(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
-    """Position all logs of a campaign file and write one row per run to ``campaign.csv``.
+    """Position all logs of a campaign file, write one row per run to ``campaign.csv``, and return this table.
 
-    Runs with results of the same inputs and settings are not repeated: a campaign that was killed continues. A run that
-    fails is a row with its error: the fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`,
-    `ok_rate`, `wall_s`, `reference`, `folder` (below `out`).
+    Runs with results for the same inputs and settings are not repeated, so that a campaign continues after an
+    interruption. The columns are the fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`,
+    `ok_rate`, `wall_s`, `reference` and `folder` (below `out`); a failed run has a row with its error.
 
-    `reading` replaces the campaign's reading options where it differs from the default. The executor is of
-    `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the same files;
-    by the errors `lost` it reports that a worker process has ended.
+    `reading`, if it differs from the default, replaces the reading options of the campaign. `executor` has the
+    interface of `concurrent.futures`; its workers must have access to the same files. `lost` are the exceptions by
+    which it reports that a worker process has ended.
     """
     runs = read_campaign(path, out)
     if reading not in (None, LogReading()):
@@ -176,7 +175,10 @@ def position_runs(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
-    """Position runs below the folder ``out / "runs"``; parameters, result and errors as `run_campaign`."""
+    """Position runs whose results folders are below ``out / "runs"``; parameters and result as for `run_campaign`.
+
+    OutputError: `out` is not empty and not the folder of a campaign.
+    """
     if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
         raise OutputError(f"{out}: the folder is not empty and not the folder of a campaign; give another folder")
     began, results, kept = clock.perf_counter(), {}, 0
@@ -202,7 +204,10 @@ def position_runs(
 
 
 def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Position one run; a worker process that is interrupted meanwhile ends, once the run has removed its folder."""
+    """Return `position_run` of a run; if a worker process is interrupted in it, end the process.
+
+    The run has then already removed its incomplete results.
+    """
     try:
         return position_run(run)
     except SystemExit:
@@ -213,13 +218,13 @@ def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
 
 
 def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Position one run, unless its results exist; return its row, and whether they existed."""
+    """Position a run unless its results exist; return its row of the table, and whether its results existed."""
     try:
         check_folder(run.out, overwrite="replace")
         if not (kept := run.done):
             options = run.options.replaced(overwrite="replace")
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RailfixWarning)  # the report of the campaign has the notes
+                warnings.simplefilter("ignore", RailfixWarning)  # the notes are in the record of the run
                 run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:
@@ -236,9 +241,9 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
 
 
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
-    """Return the files that match a pattern, in order of their names, with the values of its fields.
+    """Return the files that match a pattern, in order of their names, each with the values of the fields.
 
-    A name without fields or ``*`` is that file, existing or not: the run reports the fault.
+    A name without fields and ``*`` is returned even if there is no such file; the run then reports the error.
     """
     if not pattern:
         return []
@@ -259,7 +264,7 @@ def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
 
 
 def _regex(part: str, seen: set[str]) -> str:
-    """Return the expression of a part of a pattern; a field that was `seen` before has the same value again."""
+    """Return the regular expression of a part of a pattern; a repeated field (in `seen`) must have the same value."""
     if part == "*":
         return "[^/]*"
     field = _FIELD.fullmatch(part)
@@ -271,7 +276,7 @@ def _regex(part: str, seen: set[str]) -> str:
 
 
 def _check_pattern(path: Path, name: str, pattern: str) -> None:
-    """Raise SettingsError where a pattern does not determine where the value of each field ends."""
+    """Raise SettingsError if a pattern has adjacent fields, ``**``, or an invalid name of a field."""
     if re.search(r"\}\{", pattern):
         raise SettingsError(f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}")
     if "**" in pattern:

@@ -1,4 +1,4 @@
-"""Checks that inputs match each other and that a run has positions."""
+"""Checks that the inputs of a run match each other, and that a run has positions."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Number of conventional positions, all more than `ANOTHER_PLACE_M` from the line, after which a run is stopped early.
+#: Number of conventional positions after which a run is stopped if all are farther from the line than
+#: `ANOTHER_PLACE_M`.
 ENOUGH_TO_STOP: Final = 10
-#: Largest time between the log and its navigation records; records further away are of another day.
+#: Largest time between a log and its navigation records; records farther away are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
-#: Records reach about this far beyond their reference time (Galileo, IODnav of 4 h and its margin).
+#: Longest time from the reference time of a navigation record at which the record may be used (Galileo: 4 h).
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
@@ -35,7 +36,7 @@ Span = tuple[np.datetime64, np.datetime64]
 
 
 def navigation_times(navigation: Navigation) -> Datetimes:
-    """Return the reference times of all records, in order."""
+    """Return the reference times of all navigation records and the times of precise orbits, in order."""
     times = [navigation.kepler.toe, navigation.glonass.toe]
     if navigation.precise is not None:
         times.append(navigation.precise.time)
@@ -44,13 +45,13 @@ def navigation_times(navigation: Navigation) -> Datetimes:
 
 
 def navigation_span(navigation: Navigation) -> Span | None:
-    """Return the reference times of the first and the last record; None without one."""
+    """Return the first and the last of `navigation_times`; None without records."""
     times = navigation_times(navigation)
     return (times[0], times[-1]) if len(times) else None
 
 
 def check_each_file(navigation: Navigation, log: Log) -> None:
-    """Raise MismatchError where one of several files of a log begins more than a day from every navigation record."""
+    """Raise MismatchError if one of several files of a log begins more than a day from every navigation record."""
     times = navigation_times(navigation)
     for path, first in log.first_epochs() if len(times) else ():
         if np.abs(times - first).min() > ANOTHER_DAY:
@@ -61,17 +62,17 @@ def check_each_file(navigation: Navigation, log: Log) -> None:
 
 
 def _spans(tally: Tally) -> dict[str, Span]:
-    """Return the first and last epoch of the log of each antenna."""
+    """Return the first and last epoch of each antenna."""
     return {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
 
 
 def spans_apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) -> bool:
-    """Return whether two spans have no time in common, the first extended by `reach` at both ends; False for NaT."""
+    """Return whether two spans, the first extended by `reach` at both ends, have no common time; False for NaT."""
     return bool(one[0] - reach > other[1] or one[1] + reach < other[0])
 
 
 def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
-    """Raise MismatchError where no pseudorange was used and the log is farther than `reach` from every record."""
+    """Raise MismatchError if no pseudorange was used and no navigation record is within `reach` of the log."""
     if any(antenna.used for antenna in tally.antennas.values()):
         return
     span = navigation_span(navigation)
@@ -89,10 +90,10 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
 
 
 def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
-    """Raise MismatchError where all conventional positions are farther than `ANOTHER_PLACE_M` from the line.
+    """Raise MismatchError if all conventional positions are farther than `ANOTHER_PLACE_M` from the line.
 
-    `antennas`: whether every antenna must be elsewhere (during a run, after a few positions of each), or one is enough
-    (at the end).
+    With "all", which is used during a run, this must be true of every antenna, with `ENOUGH_TO_STOP` positions of each.
+    With "any", which is used at the end, one position of one antenna suffices.
     """
     enough = ENOUGH_TO_STOP if antennas == "all" else 1
     elsewhere = [
@@ -110,7 +111,7 @@ def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -
 
 
 def check_same_time(tally: Tally) -> None:
-    """Raise MismatchError where the logs of two antennas have no time in common."""
+    """Raise MismatchError if the logs of two antennas have no common time."""
     spans = _spans(tally)
     if any(spans_apart(one, other) for one, other in combinations(spans.values(), 2)):
         spans_text = " and ".join(f"the {n} log covers {_period(*span)}" for n, span in spans.items())
@@ -118,7 +119,7 @@ def check_same_time(tally: Tally) -> None:
 
 
 def check_sbas_time(sbas: SbasCorrections | DfmcService | None, tally: Tally) -> None:
-    """Raise MismatchError where not one message of the SBAS was received during a log."""
+    """Raise MismatchError if the SBAS messages and a log have no common time."""
     for name, span in _spans(tally).items():
         if sbas is not None and spans_apart(span, sbas.span):
             raise MismatchError(
@@ -128,7 +129,7 @@ def check_sbas_time(sbas: SbasCorrections | DfmcService | None, tally: Tally) ->
 
 
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
-    """Raise MismatchError where a sensor has not one sample during the logs."""
+    """Raise MismatchError if the samples of a sensor and the logs have no common time."""
     spans = list(_spans(tally).values())
     for name, samples in sensors.tables.items():
         if not (spans and len(samples)):
@@ -142,7 +143,7 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
 
 
 def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajectory]) -> None:
-    """Raise MismatchError where a base station is too far from the line, or has no epoch in time for a log."""
+    """Raise MismatchError if a base station is too far from the line, or has no epoch recent enough for a log."""
     distance = min(np.linalg.norm(own.ecef_m - base.ecef_m, axis=1).min() for own in trajectories.values()) / 1e3
     if distance > LONGEST_KM:
         raise MismatchError(
@@ -166,9 +167,9 @@ def check_whole_run(
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> None:
-    """Raise MismatchError where the inputs of a whole run do not match, NoPositionError where the run has no position.
+    """Raise MismatchError if the inputs of a whole run do not match, or NoPositionError if the run has no position.
 
-    `causes`: likely causes by antenna, which the error names.
+    `causes` has the likely cause by antenna, for the message.
     """
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)
@@ -180,7 +181,7 @@ def check_whole_run(
 
 
 def check_positions(tally: Tally, likely: Mapping[str, str]) -> None:
-    """Raise NoPositionError, with the most frequent status and reason, where a run has no position."""
+    """Raise NoPositionError with the most frequent status and rejection reason if a run has no position."""
     if tally.positioned:
         return
     if not tally.epochs:
@@ -200,6 +201,6 @@ def _why_nothing(name: str, antenna: AntennaTally) -> str:
 
 
 def _period(first: np.datetime64, last: np.datetime64) -> str:
-    """``2021-05-17 02:33 to 03:00``."""
+    """Return a time span as text, such as ``2021-05-17 02:33 to 03:00``."""
     start, end = (str(t.astype("datetime64[m]")).replace("T", " ") for t in (first, last))
     return f"{start} to {end[11:] if start[:10] == end[:10] else end}"

@@ -1,7 +1,7 @@
-"""Receiver logs as RINEX files, positions of a run as ROS 2 messages, EGNSS MATE tables read and written.
+"""Conversion of receiver logs to RINEX, and of the positions of a run to ROS 2 messages and EGNSS MATE tables.
 
-Message definitions in an MCAP file are from sensor_msgs, and from https://github.com/EGNSS-MATE/emate_ros (MIT), commit
-9067868 of 16 April 2024, written for ROS 1; the third contains the row of the table.
+The message definitions in an MCAP file are from sensor_msgs and from https://github.com/EGNSS-MATE/emate_ros (MIT,
+commit 9067868 of 16 April 2024, for ROS 1); a third message, railfix_msgs/Row, contains a row of the table.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ def convert_logs(
     reading: LogReading | None = None,
     overwrite: Overwrite = "refuse",
 ) -> list[str]:
-    """Write RINEX files (version 3.04 or 4.02) of the logs of one receiver; return the written files and the skipped
-    items.
+    """Write the logs of one receiver as RINEX files, and return lines on the written files and the skipped items.
 
-    InputFileError: a log cannot be read or contains nothing that was requested. OutputError: a file exists already, is
-    an input, or cannot be written.
+    `out` receives the observations, `nav_out` the ephemerides; None omits the file. `rinex` selects version 3.04 or
+    4.02. InputFileError: a log cannot be read, or contains no data for a file. OutputError: both files are the same, or
+    a file exists already, is an input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
         raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")
@@ -78,7 +78,7 @@ def convert_logs(
 
 
 def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str], list[str]]:
-    """Return the header with the signals of the whole log, number of epochs, counts of skipped items, and notes."""
+    """Return the header with the signals of the whole log, the number of epochs, the skipped items, and notes."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped, problems = ObservationHeader(), 0, Counter[str](), list[str]()
@@ -115,12 +115,12 @@ _APPROXIMATED: Final = 1
 
 
 def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows of a table of positions that have coordinates, three topics per antenna; return their number.
+    """Write the rows with coordinates of a table of positions as an MCAP file of ROS 2 messages; return their number.
 
-    ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, written for
-    the filter only, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The
-    file contains the `description`: the kind of positions, and the frame of the coordinates. NoPositionError: no row
-    has coordinates. SettingsError: mcap-ros2-support is not installed.
+    Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix), ``/ANTENNA/row`` (all columns) and, for the
+    filter only, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time stamps are UTC. Absent numbers are NaN, and
+    absent texts are empty. `description`, on the kind of positions and the frame of the coordinates, is added to the
+    file. NoPositionError: no row has coordinates. SettingsError: mcap-ros2-support is not installed.
     """
     with needs_extra():
         from mcap_ros2.writer import Writer
@@ -160,7 +160,7 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
 
 
 def _fix(row: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of sensor_msgs/NavSatFix, with the variance along the line on each axis."""
+    """Return the values of a sensor_msgs/NavSatFix message, with the variance along the line for each axis."""
     return {
         "latitude": row["latitude_deg"],
         "longitude": row["longitude_deg"],
@@ -171,7 +171,7 @@ def _fix(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
-    """Return the values of emate_msgs/FusionResultTrack: its x axis points to rising chainage."""
+    """Return the values of an emate_msgs/FusionResultTrack message, whose x axis points to rising chainage."""
     nan = float("nan")
     on_network = bool(row.get("track"))
     return {
@@ -191,10 +191,11 @@ def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
 
 
 def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Track) -> dict[str, pl.DataFrame]:
-    """Return R_TRACK and R_ETCS_TPR of the first antenna of a run, from rows of its tables.
+    """Return the EGNSS MATE tables R_TRACK and R_ETCS_TPR of the first antenna of a run.
 
-    The last relevant balise group is the group read last according to the passings, empty before the first; track edges
-    are the track's sections.
+    `train` and `passings` are tables of the run. The last relevant balise group (LRBG) of a row is the group that was
+    read last according to the passings; it is empty before the first reading. The sections of the track are the track
+    edges.
     """
     rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
     chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()
@@ -241,7 +242,7 @@ def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Tra
 
 
 def add_mate_results(folder: OutputFolder, track: Track, log: Path) -> None:
-    """Write R_TRACK.parquet and R_ETCS_TPR.parquet from the tables of a run with a filter on a log of EGNSS MATE."""
+    """Write R_TRACK.parquet and R_ETCS_TPR.parquet if the log is an EGNSS MATE table and the filter was on."""
     train = folder.staging / "train.parquet"
     if not (mate_table(log) and train.exists()):
         return
@@ -256,7 +257,7 @@ def _metres(values: np.ndarray) -> pl.Series:
 
 
 def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
-    """Return the balise read last before each row, with its chainage; null before the first."""
+    """Return the balise read last before each row, with its chainage; before the first reading, null and NaN."""
     empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
     read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
     times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))
@@ -265,5 +266,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return the columns of a table of the schema in their order; columns without a value in railfix are empty."""
+    """Return a table with the columns of the EGNSS MATE schema in their order; columns without values are null."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

@@ -1,4 +1,4 @@
-"""Files examined before a run: kind and content of each, missing files, and the command to run."""
+"""Examination of files before a run: kind and content of each file, missing files, and the command to run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.vehicle import read_vehicle
 
 _SECOND: Final = np.timedelta64(1, "s")
-_MOST_NOTES: Final = 5  #: Largest number of notes shown for one file.
+_MOST_NOTES: Final = 5  #: Maximum number of notes shown for one file.
 Kind = Literal[
     "observations", "navigation", "orbits", "sbas", "track", "vehicle", "settings", "positions", "unknown"
 ]  # fmt: skip
@@ -40,28 +40,28 @@ Kind = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class FileFinding:
-    """Properties of one file: kind, facts, span in GPS time and position (ECEF, shape (3,) [m]) where known."""
+    """Properties of one file."""
 
     path: Path
     kind: Kind
-    facts: tuple[str, ...]
-    span: Span | None = None
-    place_ecef_m: Floats | None = None
-    ephemerides: Span | None = None  #: Reference times of the ephemerides in the file; None without any.
+    facts: tuple[str, ...]  #: Phrases on the content for the user.
+    span: Span | None = None  #: First and last time of the content, GPS time; None if unknown.
+    place_ecef_m: Floats | None = None  #: A position in the file, ECEF, shape (3,) [m]; None if unknown.
+    ephemerides: Span | None = None  #: First and last reference time of the ephemerides in the file; None without any.
     options: tuple[str, ...] = ()  #: Options that a command needs to read the file.
-    problems: tuple[str, ...] = ()  #: Faults of the file alone, one sentence each.
+    problems: tuple[str, ...] = ()  #: Sentences on faults of the file itself.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """Findings on each file, mismatches and missing files, and the command to run (blank: none)."""
+    """Result of the examination of files."""
 
     findings: tuple[FileFinding, ...]
-    problems: tuple[str, ...]
-    command: str
+    problems: tuple[str, ...]  #: Sentences on faults, mismatches and missing files.
+    command: str  #: Command to run; "" if a file for it is missing.
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the plain values for JSON."""
+        """Return the diagnosis as plain values for JSON."""
         return {
             "files": [
                 {
@@ -80,7 +80,11 @@ class Diagnosis:
 
 
 def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
-    """Read each file as every kind until one fits, and compare them; InputFileError where one is missing."""
+    """Examine each file, and compare the files with each other.
+
+    `date` is a time within half a week of logs that do not state the week. InputFileError: a file is missing, a folder,
+    or given twice.
+    """
     for path in paths:
         if path.is_dir():
             raise InputFileError(path, "is a folder; give the files in it")
@@ -94,7 +98,10 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
 
 
 def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Return the properties of a file: its content determines the kind, whose reader reports its faults."""
+    """Read a file as each kind that its content suggests until a reader accepts it, and return its properties.
+
+    If no reader accepts it, the first error is the problem of the file.
+    """
     errors: list[str] = []
     kinds = _find_kinds(path)
     for kind in kinds:
@@ -102,14 +109,14 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
             return _DATED[kind](path, date) if kind in _DATED else _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
-            if "--date" in str(error):  # the kind is known, the date is not
+            if "--date" in str(error):  # the kind is right, but the date is missing
                 return FileFinding(path=path, kind=kind, facts=(), problems=(errors[-1],))
     kind = "unknown" if len(kinds) > 1 else kinds[0]
     return FileFinding(path=path, kind=kind, facts=(), problems=(errors[0],))
 
 
 def _find_kinds(path: Path) -> tuple[Kind, ...]:
-    """Return the possible kinds of a file, the likely kind first."""
+    """Return the possible kinds of a file, the most likely first."""
     kind = find_kind(path)
     if kind in ("table", "gpx"):
         without: tuple[Kind, ...] = ("track",) if kind == "table" else ("positions", "track")
@@ -124,7 +131,7 @@ def _unknown(path: Path) -> FileFinding:
 
 
 def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Return the facts of a whole log, read piece by piece, with the memory of one piece."""
+    """Return the properties of a log of observations, which is read piece by piece to save memory."""
     header: ObservationHeader | None = None
     times, channels = [np.empty(0, dtype="datetime64[ns]")], set[tuple[str, str]]()
     broken, notes = Counter[str](), list[str]()
@@ -164,7 +171,7 @@ def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
 
 
 def _needs_lenient(path: Path, date: np.datetime64 | None) -> bool:
-    """Return whether a reader of the default policy stops at a line of the file."""
+    """Return whether the reader fails on the file without the option --lenient."""
     try:
         for _ in scan_observations(path, date=date):
             pass
@@ -174,12 +181,12 @@ def _needs_lenient(path: Path, date: np.datetime64 | None) -> bool:
 
 
 def _own_ephemerides(path: Path, date: np.datetime64 | None) -> tuple[int, Span] | None:
-    """Return the number and the reference times of the ephemerides in a receiver's log; None without any."""
+    """Return the number of ephemerides in a receiver's log, and the span of their times; None without ephemerides."""
     if find_kind(path) != "receiver":
         return None
     try:
         navigation = read_navigation([path], date=date)
-    except InputFileError:  # without navigation records: a log of observations alone is not faulty
+    except InputFileError:  # the log has no navigation records, which is not a fault
         return None
     span = navigation_span(navigation)
     return None if span is None else (len(navigation.kepler) + len(navigation.glonass), span)
@@ -201,7 +208,7 @@ def _navigation(path: Path, date: np.datetime64 | None) -> FileFinding:
 
 
 def _track(path: Path) -> FileFinding:
-    """Return the kind of a track map: one route, or a network in which a run finds the route; also without heights."""
+    """Return the properties of a track map, which may be a route or a network, and may lack heights."""
     options: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     datum = ""
@@ -213,7 +220,7 @@ def _track(path: Path) -> FileFinding:
         # OGC KML 2.3, 13.9: absolute altitudes are above EGM96
         kml = path.suffix.lower() in (".kml", ".kmz")
         datum = "orthometric" if kml else "ellipsoidal"
-        segments = read_segments(path, MapReading(height_datum="ellipsoidal"))  # its checks need no geoid
+        segments = read_segments(path, MapReading(height_datum="ellipsoidal"))  # the checks do not need a geoid
         options = ("--height-datum", datum, *(("--geoid", "egm96") if kml else ()))
         problems = (
             f"{path}: does not state its height datum; the command takes the heights as {datum}"
@@ -298,7 +305,7 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: Uses of a file of each kind.
+#: Kinds as which a command may use a file, by the kind of its content.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "observations": ("observations",),
     "navigation": ("navigation",),
@@ -309,7 +316,7 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
 }
-#: Readers of each kind of file, with a date and without.
+#: Readers by kind of file; those of `_DATED` have a date as second argument.
 _DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
@@ -337,7 +344,7 @@ def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
 
 
 def _problems(findings: Sequence[FileFinding]) -> list[str]:
-    """Return mismatches, and files missing for a run, one sentence each."""
+    """Return sentences on the faults of each file, on files missing for a run, and on mismatches between files."""
     problems = [problem for finding in findings for problem in finding.problems]
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     readable = [log for log in logs if log.span is not None]
@@ -374,7 +381,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
 
 
 def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str:
-    """Return the command of a run, blank where a file for it is missing."""
+    """Return the command of a run with the files; "" if a file for it is missing."""
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     logs = [log for log in logs if log.span is not None]
     tracks = [track for track in tracks if track.place_ecef_m is not None]

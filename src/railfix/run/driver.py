@@ -1,4 +1,4 @@
-"""Run: read logs in chunks, process epochs, write tables."""
+"""Positioning of the logs of a run: logs are read in chunks, epochs processed, and tables written."""
 
 from __future__ import annotations
 
@@ -48,18 +48,18 @@ class Progress(Protocol):
     """Callback for the progress of a run."""
 
     def __call__(self, *, epochs: int, fraction: float) -> None:
-        """Report the epochs done so far, and the fraction of the logs that has been read, 0 to 1."""
+        """Report the number of positioned epochs and the fraction of the logs that has been read, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
     """Summary of a run."""
 
-    tally: Tally
+    tally: Tally  #: Counts of all epochs and observations.
     record: Mapping[str, Any]  #: Content of ``run.json``.
     verdict: Verdict  #: Verdict of the run for the terminal, the report and JSON.
-    files: Mapping[str, Path]
-    wall_s: float
+    files: Mapping[str, Path]  #: Paths of the written files by name.
+    wall_s: float  #: Elapsed time of the run [s].
 
     def __repr__(self) -> str:
         return f"<RunSummary: {'; '.join(self.verdict.lines())}>"
@@ -84,8 +84,8 @@ def run_files(
 ) -> RunSummary:
     """Position the logs of one run along its line and write the results into the folder `out`.
 
-    `config` has all settings, `asked` the explicitly given settings, for ``run.json``. RailfixError: see
-    `railfix.core.errors`; nothing is left in `out` then.
+    `config` has all settings; `asked` has the explicitly given settings, which are recorded in ``run.json``.
+    RailfixError: see `railfix.core.errors`; `out` is then left as it was. Notes are issued as `RailfixWarning`.
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
@@ -148,7 +148,7 @@ def run_files(
 
 
 def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
-    """Return the verdict of a run; NoPositionError where no position of it can be used."""
+    """Return the verdict on a run; NoPositionError if it has no usable position."""
     verdict = judge_run(record)
     if not any(antenna.is_usable for antenna in verdict.antennas):
         of_map = [note for note in notes if ": the map " in note]
@@ -159,7 +159,7 @@ def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
 def open_inputs(
     inputs: RunInputs, options: RunOptions, config: Config
 ) -> tuple[Navigation, OpenedLine, dict[Antenna, Log]]:
-    """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks."""
+    """Read navigation data and line, and open the logs by antenna; in a network of tracks, find the route first."""
     navigation = read_navigation(inputs.nav, **options.logs.arguments)
     if inputs.sp3:
         from railfix.io.sp3 import read_sp3
@@ -194,7 +194,7 @@ def open_inputs(
 
 
 def find_record_time(navigation: Navigation) -> np.datetime64 | None:
-    """Return a time within days of the records, as the epoch of reference frames."""
+    """Return the median time of the navigation records, as the epoch of reference frames; None without records."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
         clocks = navigation.precise.time
@@ -202,7 +202,7 @@ def find_record_time(navigation: Navigation) -> np.datetime64 | None:
 
 
 def read_samples_and_units(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
-    """Read the samples of the sensors on board, and the ground units that they measured ranges to."""
+    """Read the samples of the on-board sensors, and the ground units of two-way ranges; None without ranges."""
     samples = read_sensors(
         tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging,
         balises=inputs.balises,
@@ -218,9 +218,10 @@ def _position(
     beside: Executor,
     progress: Progress | None,
 ) -> Tally:
-    """Position chunk by chunk, and return counts.
+    """Position the logs chunk by chunk and return the counts.
 
-    Five chunks are in work at a time: reading, screens, single epochs, filter, and writing by `beside`.
+    Five stages run in parallel on consecutive chunks: reading, screens, single epochs, filter, and writing (by
+    `beside`). `others` are the samples of the on-board sensors and the log of the base station.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()
@@ -252,7 +253,7 @@ def _screen_chunks(
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
 ) -> Iterator[Chunk]:
-    """Yield the screened ranges of chunks, each with samples of sensors and base station up to its end."""
+    """Yield the chunks after the screens; each includes the sensor samples and base-station epochs up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
@@ -264,7 +265,7 @@ def _screen_chunks(
 
 
 def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iterator[Chunk]:
-    """Yield the single epochs of chunks."""
+    """Yield the chunks after single-epoch positioning."""
     state = State()
     for chunk in screened:
         solved, state = processor.position(chunk, state)
@@ -274,7 +275,7 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return likely causes by antenna for antennas without a position on the line; blank if none was found."""
+    """Return the likely cause for each antenna that has no position on the line; "" if no cause was found."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
@@ -290,16 +291,16 @@ def _causes(
 def _notes_of_sensors(
     checks: SensorChecks | None, sensors: SensorSamples, units: GroundUnits | None, line: OpenedLine, config: Config
 ) -> tuple[str, ...]:
-    """Return notes on sensors whose settings or tables contradict the satellites; none without sensors."""
+    """Return notes on sensors whose settings or tables contradict satellite positioning; empty without sensors."""
     if checks is None:
         return ()
     trajectory = next(iter(line.trajectories.values()))
     return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
-#: Question at the end of a note on positions off the map whose cause was not found.
+#: Last clause of a note on positions off the map whose cause was not found.
 _TRACK: Final = "is this the right track?"
-#: Largest number of left-out satellites that are named in notes.
+#: Largest number of excluded satellites that are named in notes.
 _NAMED: Final = 3
 
 
@@ -312,9 +313,10 @@ def collect_notes(
     *,
     note_statistic: float,
 ) -> tuple[str, ...]:
-    """Return the notes of a run, each once; a note on the map only above the test statistic `note_statistic`.
+    """Return the notes of a run without repetitions.
 
-    `causes`: for each antenna without a position on the line, the reason.
+    `causes` has the likely cause for each antenna without a position on the line. There is a note on the offset of the
+    map if its test statistic exceeds `note_statistic`.
     """
     notes = [
         *line.notes,
@@ -359,12 +361,15 @@ def collect_notes(
     return tuple(dict.fromkeys(notes))
 
 
-#: Differences of other time scales from GPS time, for tags in a wrong scale [s].
+#: Differences of other time scales from GPS time [s], by which time tags in a wrong scale are recognised.
 _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 
 
 def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
-    """Return the meaning of a sign of interference as the beginning of a sentence."""
+    """Return a description of a sign of interference for the beginning of a sentence.
+
+    `tag_error_s` are the smallest and largest time-tag error.
+    """
     if sign == "left_map":
         return "the 3-D positions have left the map (column interference_causes)"
     if sign == "contradicted":
@@ -385,7 +390,7 @@ _STEADY_S: Final = 0.5
 
 
 def _describe_detectable(detectable_m: Floats) -> str:
-    """Return a clause on the map offsets that the run cannot detect."""
+    """Return a clause on the map offsets that the run cannot detect, from `AntennaTally.map_detectable_m`."""
     if np.isnan(detectable_m).any():
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
@@ -396,7 +401,7 @@ def _describe_detectable(detectable_m: Floats) -> str:
 
 
 def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
-    """Yield notes on assumptions of the protection levels that this run contradicts."""
+    """Yield notes on missing protection levels, the basis of their priors, and a prior that the run contradicts."""
     if not any(antenna.level_status for antenna in tally.antennas.values()):
         return
     for name, of_antenna in tally.antennas.items():
@@ -415,7 +420,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
         return
     used = sum(antenna.used for antenna in tally.antennas.values())
     excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
-    # Noise alone is excluded at the rate of false alarms; a larger rate contradicts the prior.
+    # Without faults, exclusions occur at the rate of false alarms; a significantly larger rate contradicts the prior.
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     faults = excluded - config.raim.false_alarm * observed
     prior = risk.local_prior + max(risk.satellite_prior.values())
@@ -428,7 +433,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
 
 
 def _footer(files: Iterable[Mapping[str, Any]], notes: Iterable[str]) -> dict[str, str]:
-    """Return a short provenance of the run for the footer of the Parquet files."""
+    """Return the metadata for the footers of the Parquet files: version, command, inputs and notes."""
     return {
         "railfix": __version__,
         "command": " ".join(sys.argv),

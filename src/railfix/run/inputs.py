@@ -1,4 +1,4 @@
-"""Input files of a run, named, checked and hashed; and options that do not change the positions."""
+"""Input files of a run, with checks and hashes, and options that do not change the positions."""
 
 from __future__ import annotations
 
@@ -24,49 +24,50 @@ from railfix.track.frames import MapMotion
 from railfix.track.route import MapReading
 from railfix.track.vehicle import Reference
 
-#: Word for the heights of the log's own positions.
+#: Value of `RunInputs.heights` for the heights of the log's own positions.
 OF_LOG = Path("log")
 Antenna = Literal["front", "rear"]
 
 
 def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any:
-    """Return a field that is an option for one or several input files."""
+    """Return a field that is a command-line option for one or several input files."""
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
 #: Texts of options shared by several commands.
 NAVIGATION: Final = (
-    "Navigation file, RINEX or a receiver's log; repeat it for several. Without it a receiver's log is used with its "
-    "own "
-    "ephemerides."
+    "Navigation file: RINEX, or a receiver's log; may be repeated. Without this option, the ephemerides in the "
+    "receiver's log itself "
+    "are used."
 )
 TRACK: Final = (
-    "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route is "
-    "found from the log."
+    "Track map; several files are joined to a route in the given order. In a single file with a network of tracks, the "
+    "route is found from the log."
 )
 VEHICLE: Final = (
-    "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is assumed to be the antenna's "
-    "own path."
+    "Vehicle file with bogie distance, gauge and antenna positions. Without it, the antenna is assumed to move along "
+    "the mapped track itself."
 )
 BALISE_LIST: Final = (
-    "Positions of the balises: CSV with balise, chainage_m and, if known, track (chainage_m is then "
-    "from the beginning of that track) and sigma_m."
+    "Positions of the balises: CSV with balise, chainage_m and, if known, sigma_m and track (chainage_m is then "
+    "measured from the beginning of that track)."
 )
 VIRTUAL_BALISES: Final = (
-    "Points whose passing is reported with its interval: a list in the format of --balise-list. Needs levels."
+    "Points on the line whose passing times are reported with bounds: a list in the format of --balise-list. "
+    "Requires protection levels."
 )
 
 
 class InputFiles(Settings):
-    """Input files of a command, each field a path, several paths, or None."""
+    """Input files of a command; each field is a path, several paths, or None."""
 
-    #: Fields of receiver logs whose own ephemerides are used where no navigation file is given.
+    #: Fields with receiver logs, whose ephemerides are used if no navigation file is given.
     own_navigation: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="before")
     @classmethod
     def _with_own_navigation(cls, values: Any) -> Any:
-        """Return the inputs with the receiver logs as navigation files where none is given."""
+        """Return the inputs with the receiver logs as navigation files if no navigation file is given."""
         if not cls.own_navigation or not isinstance(values, dict) or values.get("nav"):
             return values
         logs = [Path(path) for name in cls.own_navigation if values.get(name) for path in path_names(values[name])]
@@ -85,16 +86,16 @@ class InputFiles(Settings):
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """All files."""
+        """Paths of all files."""
         return tuple(path for _, path in self.files_by_name())
 
     def check_files(self) -> None:
-        """Raise InputFileError where a file is missing, a folder, or cannot be opened."""
+        """Raise InputFileError if a file is missing, is a folder, or cannot be read."""
         for name, path in self.files_by_name():
             _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Compute the hash of every file in parallel to other work."""
+        """Start computing the `fingerprint` of every file in `pool`, with paths as recorded in the results `folder`."""
         return [
             pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
         ]
@@ -104,52 +105,52 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run, each described by its option; files without an option are named by the settings."""
+    """Input files of a run, described by their options; files without an option here are named by the settings."""
 
     own_navigation = ("front", "rear")
     front: tuple[Path, ...] = input_option(
-        "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
+        "Observation file of the front (or only) antenna; may be repeated for a log in several files.",
         (),
         metavar="OBS",
     )
     nav: tuple[Path, ...] = input_option(NAVIGATION, ())
     track: tuple[Path, ...] = input_option(TRACK, (), metavar="TRACK")
     mate: Path | None = input_option(
-        "Folder with tables of EGNSS MATE, instead of --front, --track and the sensors; an option given as well "
-        "replaces its table.",
+        "Folder with EGNSS MATE tables, instead of --front, --track and the sensors; one of these options, if given "
+        "too, replaces the table.",
         None,
         metavar="FOLDER",
     )
     rear: tuple[Path, ...] = input_option(
-        "Observation file of the rear antenna, where there is one.", (), metavar="OBS"
+        "Observation file of the rear antenna, if there is one; may be repeated.", (), metavar="OBS"
     )
     base: tuple[Path, ...] = input_option(
-        "Observations of a base station: its errors are subtracted from the ranges; repeat it for several files.",
+        "Observations of a base station, whose range errors are subtracted from the train's ranges; may be repeated.",
         (),
         metavar="OBS",
     )
     sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used instead of the broadcast ones.", ())
     heights: Path | None = input_option(
-        "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or "
+        "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV with chainage_m or "
         "kilometrage_m, "
-        "positions of a run, or the word log for the log's own heights.",
+        "positions of a run, or the word log for the heights of the log's own positions.",
         None,
     )
     vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     tachometer: Path | None = input_option(
-        "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; "
-        "its wheel is described by the settings sensors.tachometer.",
+        "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, if known, direction; "
+        "the settings sensors.tachometer describe the wheel.",
         None,
     )
     inertial: Path | None = input_option("Specific forces and angular rates of an inertial unit: CSV or Parquet.", None)
     radar: Path | None = input_option("Speeds of a Doppler radar: CSV or Parquet with time_gpst, speed_mps.", None)
     ranging: Path | None = input_option(
-        "Two-way ranges to ground units: CSV or Parquet with time_gpst, unit, range_m and, where it is known, sigma_m.",
+        "Two-way ranges to ground units: CSV or Parquet with time_gpst, unit, range_m and, if known, sigma_m.",
         None,
     )
     ranging_units: Path | None = input_option("Surveyed ground units: CSV with unit, x_m, y_m, z_m (ECEF).", None)
     balises: Path | None = input_option(
-        "Balises read by the train: CSV or Parquet with time_gpst, balise and, where it is known, sigma_m.", None
+        "Balises read by the train: CSV or Parquet with time_gpst, balise and, if known, sigma_m.", None
     )
     balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
     virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
@@ -159,8 +160,8 @@ class RunInputs(InputFiles):
     integrity_support: Path | None = None
     sbas: tuple[Path, ...] = ()
     truth: Path | None = input_option(
-        "Reference positions: CSV with named columns (`antenna` where there are two) or RTKLIB .pos; "
-        "only positions of quality 1 are used where the file has qualities.",
+        "Reference positions: CSV with named columns (including `antenna` if there are two antennas) or RTKLIB .pos; "
+        "if the file has a quality for each position, only positions of quality 1 are used.",
         None,
         metavar="POSITIONS",
     )
@@ -168,7 +169,7 @@ class RunInputs(InputFiles):
     @model_validator(mode="before")
     @classmethod
     def _with_mate(cls, values: Any) -> Any:
-        """Return the inputs of a folder of tables, with explicitly given inputs added."""
+        """Return the inputs from the tables in the folder `mate`, replaced by inputs that are given explicitly."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
@@ -182,7 +183,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Return the inputs with the files that settings name, all checked, and the settings with the logs as files."""
+        """Return the checked inputs, including files named by settings, and settings with the logs for "stream"."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -190,14 +191,14 @@ class RunInputs(InputFiles):
         return inputs, config
 
     def with_settings(self, config: Config) -> Self:
-        """Return the inputs with the files that settings name."""
+        """Return the inputs including the files that settings name."""
         models = {name: getattr(config, name) for name in ("cn0_curve", "error_model", "integrity_support")}
         return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 
     def _with_own_sbas(self, config: Config) -> Config:
-        """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, which have the messages.
+        """Return settings in which ``sbas = "stream"`` is replaced by the receiver logs, which contain SBAS messages.
 
-        SettingsError: none of the logs is a receiver's.
+        SettingsError: all logs are RINEX files.
         """
         if config.sbas != "stream":
             return config
@@ -214,7 +215,7 @@ class RunInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Raise InputFileError where a file is missing or cannot be read, or the same log is given twice."""
+        """Raise InputFileError if a file is missing or cannot be read, or a log or track file is given twice."""
         self.check_files()
         logs = [("base", self.base), *self.logs.items()]
         check_given_once((f"--{name}", path) for name, paths in logs for path in paths)
@@ -222,13 +223,13 @@ class RunInputs(InputFiles):
 
 
 def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Antenna, tuple[Path, ...]]:
-    """Return the observation files of the antennas that have such files."""
+    """Return the observation files by antenna, without antennas that have none."""
     both: dict[Antenna, tuple[Path, ...]] = {"front": front, "rear": rear}
     return {name: paths for name, paths in both.items() if paths}
 
 
 def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
-    """Raise InputFileError where the same file is given twice, by whichever options and names."""
+    """Raise InputFileError if a file is given twice; `files` are pairs of the option's name and the path."""
     seen: dict[Path, tuple[str, Path]] = {}
     for name, path in files:
         resolved = path.resolve()
@@ -239,14 +240,14 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
 
 
 def record_path(path: Path, folder: Path) -> str:
-    """Return the path of an input for the record: relative to the results folder, unless it is absolute."""
+    """Return the path of an input for the record; a relative path becomes relative to the results folder."""
     if path.is_absolute():
         return str(path)
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
 def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
-    """Return the present path of a recorded input: relative paths are relative to the results folder."""
+    """Return the present path of a recorded input, whose relative path refers to the results folder."""
     path = folder / str(entry["path"])
     plain = Path(os.path.normpath(path))
     return plain if plain.exists() or not path.exists() else path
@@ -265,23 +266,23 @@ def _check_file(name: str, path: Path) -> None:
         raise InputFileError(path, f"cannot be read ({error.strerror}); check the path given by {name}") from error
 
 
-#: Last full year of 64-bit times in nanoseconds.
+#: Last full year that 64-bit times in nanoseconds can represent.
 LAST_YEAR: Final = 2261
 
 
 class TrackReading(Settings):
     """Options for reading the track, and the point of the vehicle to which the chainage refers."""
 
-    crs: str | None = option("CRS of the track, if its file does not state a CRS.", None, metavar="EPSG")
-    height_datum: str | None = option("Heights of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
+    crs: str | None = option("CRS of the track, if its file does not state it.", None, metavar="EPSG")
+    height_datum: str | None = option("Height datum of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
     geoid: str | None = option(
-        "Geoid of orthometric heights: egm96 (the world), japan (JPGEO2024), gsigeo2011, or a grid or CRS of PROJ.",
+        "Geoid of orthometric heights: egm96 (worldwide), japan (JPGEO2024), gsigeo2011, or a grid or CRS of PROJ.",
         None,
         metavar="MODEL",
     )
     plan_sigma: float | None = option(
-        "Standard deviation of the track in plan, instead of the value in its file (OpenStreetMap: 2 m "
-        "where the file states none).",
+        "Standard deviation of the track in plan, instead of the value in its file (for OpenStreetMap, 2 m "
+        "if the file states none).",
         None,
         metavar="M",
         gt=0,
@@ -295,47 +296,51 @@ class TrackReading(Settings):
         le=1000.0,
     )
     map_epoch: float | None = option(
-        "Epoch of the track's coordinates, where its frame is an ITRF or is fixed at an epoch (JGD2011).",
+        "Epoch of the track's coordinates, if its frame is an ITRF or is fixed at an epoch (JGD2011).",
         None,
         metavar="YEAR",
         gt=1980.0,
         lt=2100.0,
     )
-    plate: str | None = option("Plate that moves such coordinates to the time of the log.", None, metavar="NAME")
+    plate: str | None = option(
+        "Tectonic plate whose motion takes the track's coordinates from their epoch to the time of the log.",
+        None,
+        metavar="NAME",
+    )
     jgd_parameters: Path | None = option(
-        "Semi-dynamic correction parameters (.par) that move a map in JGD2011 to their epoch; --map-epoch names it.",
+        "Semi-dynamic correction parameters (.par) that transform a map in JGD2011 to the epoch given by --map-epoch.",
         None,
         metavar="FILE",
     )
-    reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
+    reference: Reference = option("Point of the vehicle to which the chainage refers.", "antenna")
 
     @property
     def of_map(self) -> MapReading:
-        """Keyword arguments of the map readers."""
+        """Options of the map readers."""
         return MapReading(crs=self.crs, height_datum=self.height_datum, geoid=self.geoid, sigma_plan_m=self.plan_sigma)
 
     @property
     def motion(self) -> MapMotion:
-        """Transformation of the track to the frame of the satellites."""
+        """Arguments of the transformation of the track to the frame of the satellites."""
         return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
 
     cache: Literal["use", "skip"] = option(
-        "Prepare the line again; neither read nor write the cache folder.", "use", name="--no-cache"
+        "Prepare the line without reading or writing the cache folder.", "use", name="--no-cache"
     )
 
 
 class LogReading(Settings):
-    """How to read logs and navigation files: the same policy in every command."""
+    """Options for reading logs and navigation files, the same for every command."""
 
     date: datetime | None = option(
-        "A time within half a week of RTCM 3 logs without ephemerides, GPS time: their observations do "
-        "not contain the week.",
+        "GPS time within half a week of the beginning of the log. It is required for RTCM 3 logs without ephemerides, "
+        "whose observations do not contain the week.",
         None,
         metavar="TIME",
     )
     broken_lines: BrokenLines = option(
-        "Skip and count broken parts of the input files, instead of stopping. Irregularities that lose "
-        "no data are accepted without this option: comments, further headers, duplicate and exchanged "
+        "Skip and count broken parts of the input files, instead of stopping with an error. Irregularities without "
+        "loss of data are accepted without this option: comments, repeated headers, duplicate or exchanged "
         "epochs, an incomplete last record.",
         "stop",
         name="--lenient",
@@ -349,25 +354,25 @@ class LogReading(Settings):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of the readers of positions and navigation."""
+        """Keyword arguments of the readers of positions and navigation files."""
         return {"date": self.instant, "broken_lines": self.broken_lines}
 
     @property
     def of_observations(self) -> dict[str, Any]:
-        """Return the arguments of the readers of observations."""
+        """Keyword arguments of the readers of observations."""
         return {**self.arguments, "reader": self.reader}
 
     @property
     def instant(self) -> np.datetime64 | None:
-        """The date as an argument of the readers."""
+        """`date` as GPS time in the type of the readers' arguments; None if it is not given."""
         return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
 
 
 class ColumnNames(Settings):
-    """Options for reading logs of positions: names of columns in tables, and the fields of `LogReading`."""
+    """Options for reading logs of positions: names of the columns of tables, and the fields of `LogReading`."""
 
     column: tuple[str, ...] = option(
-        "Column of CSV positions under another name, such as time_utc=Timestamp; may be repeated. Names: time_gpst, "
+        "Name of a column in CSV positions, as in time_utc=Timestamp; may be repeated. Quantities: time_gpst, "
         "time_utc, unix_s, or week and tow_s; latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m; antenna, "
         "chainage_m, quality, ...",
         (),
@@ -378,12 +383,12 @@ class ColumnNames(Settings):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of `railfix.io.read_positions`."""
+        """Keyword arguments of `railfix.io.read_positions`."""
         return {"columns": self.names, **self.logs.arguments}
 
     @property
     def names(self) -> dict[str, str]:
-        """Column names in the file by railfix name; SettingsError if a text is not NAME=COLUMN."""
+        """Name of the column in the file by quantity; SettingsError if a text is not NAME=COLUMN."""
         return column_names(self.column)
 
 
@@ -393,22 +398,25 @@ class RunOptions(Settings):
     start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
     base_place: str | None = option(
-        "Position of the base station in the frame of the satellites; by default from its header.",
+        "Position of the base station in the frame of the satellites; by default from the header of its log.",
         None,
         metavar="LAT,LON,HEIGHT",
     )
     observations: Literal["skip", "write"] = option(
-        "Also write observations.parquet: one row per epoch, satellite and signal, with its reason.",
+        "Also write observations.parquet, with one row per epoch, satellite and signal, and its rejection reason.",
         "skip",
         name="--observations",
     )
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
-        "Epochs in memory at a time; the results do not depend on it.", 4000, name="--chunk", metavar="EPOCHS", ge=1
+        "Number of epochs processed together in memory; results do not depend on it.",
+        4000,
+        name="--chunk",
+        metavar="EPOCHS",
+        ge=1,
     )
     smooth: Literal["off", "on"] = option(
-        "Also smooth the filter along the track: positions from all measurements before and after each "
-        "epoch, in columns of train.*",
+        "Also write smoothed positions, from all measurements before and after each epoch, to columns of train.*",
         "off",
         name="--smooth",
     )
@@ -417,7 +425,7 @@ class RunOptions(Settings):
 
     @property
     def of_filter(self) -> list[str]:
-        """Options, among those given, that need the filter along the track."""
+        """Names of the given options that need the filter along the track."""
         return ["smooth"] if self.smooth == "on" else []
 
     @field_validator("start", "end")

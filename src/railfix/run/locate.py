@@ -1,4 +1,4 @@
-"""Logs without a track map: 3-D positions, a map surveyed from several runs, measured features (P2 2.3)."""
+"""3-D positions of logs without a track map, survey of a map from several runs, and measured features (P2 2.3)."""
 
 from __future__ import annotations
 
@@ -45,18 +45,21 @@ class LocateInputs(InputFiles):
 
 @dataclass(frozen=True, kw_only=True)
 class LocateSummary:
-    """Counts of a log: epochs, positions, and median standard deviations north, east, up [m]."""
+    """Summary of `railfix locate`."""
 
-    epochs: int
-    positions: int
-    sigma_m: tuple[float, float, float]
+    epochs: int  #: Number of epochs.
+    positions: int  #: Number of epochs with a position.
+    sigma_m: tuple[float, float, float]  #: Median standard deviations north, east and up [m].
     notes: tuple[str, ...]
 
 
 def locate_files(
     inputs: LocateInputs, config: Config, *, out: Path, reading: LogReading | None = None
 ) -> LocateSummary:
-    """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single)."""
+    """Compute the 3-D positions of a log and write them as an RTKLIB solution file with quality 5 (single).
+
+    NoPositionError: no epoch has a position. OutputError: the file cannot be written.
+    """
     inputs.check_files()
     reading = reading or LogReading()
     navigation = read_navigation(inputs.nav, **reading.arguments)
@@ -93,7 +96,7 @@ def reasons_text(located: Located) -> str:
 
 
 def solution_text(located: Located) -> str:
-    """Return positions as RTKLIB's solution format (GPST, latitude, longitude, ellipsoidal height, sigmas).
+    """Return the text of an RTKLIB solution file: GPST, latitude, longitude, ellipsoidal height, standard deviations.
 
     An epoch without a position is a comment line with its time and the reason.
     """
@@ -118,17 +121,17 @@ def solution_text(located: Located) -> str:
     return "\n".join(lines) + "\n"
 
 
-#: Number of epochs positioned together.
+#: Number of epochs that are positioned together.
 _CHUNK_EPOCHS: Final = 3000
-#: Number of epochs tested, and distance in plan within which a position is on the line [m].
+#: Number of epochs that `likely_cause` tests, and distance in plan within which a position is on the line [m].
 _EPOCHS: Final = 5
 _ON_LINE_M: Final = 150.0
-#: Height difference from the line that range errors do not explain [m].
+#: Height difference from the line above which range errors do not explain it [m].
 _HEIGHT_M: Final = 30.0
-#: Seconds between GPS time and UTC since 2017; BeiDou time is 14 s behind GPS time.
+#: GPS time minus UTC since 2017, and GPS time minus BeiDou time [s].
 _LEAP_S: Final = 18
 _BEIDOU_S: Final = 14
-#: Time-zone shifts that are tested [h].
+#: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
 
@@ -136,8 +139,8 @@ _FEET: Final = 0.3048
 def likely_cause(observations: Observations, received: Received, config: Config, line: Trajectory) -> str:
     """Return a clause on the likely reason for positions off the line; "" if no cause was found.
 
-    Conventional positions of some epochs are compared with the line: in height, and with the time tags shifted by leap
-    seconds and by whole hours.
+    Conventional positions of a few epochs are compared with the line in plan and height. If they do not lie on the
+    line, the comparison is repeated with time tags shifted by leap seconds and whole hours.
     """
     step = max(len(observations) // _EPOCHS, 1)
     few = observations[: step * _EPOCHS : step]
@@ -158,7 +161,7 @@ def likely_cause(observations: Observations, received: Received, config: Config,
 
 
 def _shifts_s() -> Iterator[int]:
-    """Yield time-tag shifts due to common mistakes, the smallest first [s]."""
+    """Yield the time-tag shifts of common mistakes [s]: wrong time scales, then time zones in ascending order."""
     for seconds in (_LEAP_S, _BEIDOU_S):
         yield from (seconds, -seconds)
     for hours in range(1, _HOURS + 1):
@@ -169,7 +172,10 @@ def _shifts_s() -> Iterator[int]:
 def _offset_m(
     observations: Observations, received: Received, config: Config, line: Trajectory
 ) -> tuple[float, float, float] | None:
-    """Return the offset of the positions from the line in plan and height, and the line's height [m]."""
+    """Return the offset of the median position from the line in plan and height, and the height of the line [m].
+
+    The result is None if no epoch has a position.
+    """
     ecef: Floats = locate(observations, received, config, ChannelBook(config)).ecef_m
     if not np.isfinite(ecef[:, 0]).any():
         return None
@@ -177,13 +183,13 @@ def _offset_m(
     arc, _ = line.nearest(place[None])
     height = float(geodetic_from_ecef(place)[2])
     of_line = float(geodetic_from_ecef(line.at_arc(arc)[0])[2])
-    # moved to the height of the line, whose heights may be arbitrary
+    # offset in plan: the position is moved to the height of the line, which may be wrong
     level = place * (1.0 + (of_line - height) / float(np.linalg.norm(place)))
     return float(line.nearest(level[None])[1][0]), height - of_line, of_line
 
 
 def _cause_in_height(above_m: float, of_line_m: float) -> str:
-    """Return a clause on the height of the line, and the unit that explains it."""
+    """Return a clause on a height offset from the line, and on the unit or datum that may explain it."""
     height = of_line_m + above_m
     feet = abs(of_line_m * _FEET - height) < abs(above_m) / 4.0
     hint = "are the heights of the map in feet?" if feet else "is the height datum of the map the right one?"
@@ -198,7 +204,7 @@ def _duration(seconds: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Surveyed:
-    """A survey with its runs, and notes on the files."""
+    """Survey of a line, with its runs and notes on the files."""
 
     survey: Survey
     runs: tuple[SurveyRun, ...]
@@ -217,7 +223,8 @@ def survey_files(
 ) -> Surveyed:
     """Survey a line from files of positions and logs of observations.
 
-    MismatchError: the runs lie apart, or have no line in common.
+    InputFileError: a file is missing, given twice, or of another kind, or a log lacks navigation files. MismatchError:
+    the runs lie far apart, or have no line in common.
     """
     for path in (*paths, *nav):
         if not path.is_file():
@@ -265,7 +272,7 @@ def survey_files(
 
 
 def _check_together(runs: Sequence[SurveyRun]) -> None:
-    """Raise MismatchError where a run is at another location than the first run."""
+    """Raise MismatchError if a run lies farther than `ANOTHER_PLACE_M` from the first run."""
     places: list[Floats] = [np.nanmedian(run.ecef_m, axis=0) for run in runs]
     for run, place in zip(runs, places, strict=True):
         distance = float(np.linalg.norm(place - places[0]))
@@ -277,21 +284,24 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
             )
 
 
-#: Columns of ``train.parquet`` with measured properties of the line, and the unit of the second and third.
+#: Columns of ``train.parquet`` with measured properties of the line: chainage [m], gradient [permille] and curvature
+#: [1/m].
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
-#: Significance of a change in standard deviations, and number of values on either side.
+#: Minimum change of a feature in standard deviations, and minimum number of values in a mean.
 _SIGMAS: Final = 5.0
 _LEAST_VALUES: Final = 3
-#: Iterations that centre the window on a change.
+#: Number of iterations in which the window is centred on a change.
 _CENTRED: Final = 5
-#: Time around a slip in which values are left out, because a slip affects the gradient before it is detected.
+#: Time before and after a wheel slip in which values are omitted, because a slip affects the gradient before it is
+#: detected.
 _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
 
 
 def read_measured(folder: Path) -> pl.DataFrame:
-    """Read the measured properties of the line from a run, by chainage; of two antennas the rows of the first.
+    """Read the properties of the line that a run has measured, in order of chainage.
 
-    InputFileError: the folder has no filter results, or these have no values by wheel and inertial unit.
+    If the run has two antennas, the rows of the first are returned. InputFileError: the folder has no results of the
+    filter, or the run had no tachometer and inertial unit.
     """
     path = folder / "train.parquet"
     with reading_table(path, "has no measured line ({}); give a folder of railfix run"):
@@ -311,16 +321,17 @@ def read_measured(folder: Path) -> pl.DataFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredFeature:
-    """Feature detected from all runs together."""
+    """Feature detected in the combined values of all runs."""
 
-    feature: Feature  #: Feature, whose `arc_m` is a chainage.
-    places_m: Floats  #: Its chainage from each run that detects it alone, shape (R,).
-    map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
+    feature: Feature  #: The feature; its `arc_m` is a chainage.
+    places_m: Floats  #: Chainage of the feature in each run whose values alone suffice to detect it, shape (R,) [m].
+    map_m: float  #: Chainage of the same feature of the map [m]; NaN if the map has none.
 
 
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
-    """Return the features detected from all runs (`read_measured`) together, in order; `of_map` are features of the
-    map.
+    """Return the features detected in the combined values of all runs (`read_measured`), in order of chainage.
+
+    `of_map` are the features of the map with which they are compared.
     """
     alone = [_features(run) for run in runs]
     found = []
@@ -332,14 +343,14 @@ def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) 
 
 
 def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
-    """Return the position of the nearest feature of the same kind and direction; NaN if none is near."""
+    """Return the chainage of the nearest feature of the same quantity and sign of change [m]; NaN if none is near."""
     alike = [f.arc_m for f in others if f.quantity == feature.quantity and f.change * feature.change > 0.0]
     near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * BASE_M]
     return min(near, key=lambda at: abs(at - feature.arc_m), default=float("nan"))
 
 
 def _features(rows: pl.DataFrame) -> list[Feature]:
-    """Return the features of rows by chainage; stretches without values separate them."""
+    """Return the features in rows ordered by chainage; each stretch with enough values is searched separately."""
     at = rows[_COLUMNS[0]].to_numpy()
     grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), STEP_M)
     first = np.searchsorted(at, grid - 0.5 * BASE_M)
@@ -360,7 +371,10 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
 
 
 def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
-    """Return features at the middle of their change, which noise cannot shift on a flat transition."""
+    """Return features moved to the centre of their change.
+
+    On a long transition, noise shifts the detected position, but hardly the centre.
+    """
     lag = max(round(BASE_M / STEP_M), 1)
     found = []
     for feature in features:
@@ -376,7 +390,7 @@ def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Fea
 
 
 def _means(values: Floats, first: np.ndarray, last: np.ndarray) -> tuple[Floats, Floats]:
-    """Return the means of values between indices, and their standard deviations."""
+    """Return the means of values from index `first` up to before `last`, and the standard deviations of the means."""
     count = np.maximum(last - first, 1)
     middle = values - values.mean()
     sums, squares = (np.concatenate([[0.0], np.cumsum(each)]) for each in (middle, middle**2))

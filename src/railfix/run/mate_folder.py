@@ -1,4 +1,4 @@
-"""Inputs of a run from a folder with tables of EGNSS MATE."""
+"""Inputs of a run from a folder with EGNSS MATE tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Final
 from railfix.core.errors import InputFileError
 from railfix.io.mate import mate_table
 
-#: Inputs of a run by table; of the two track tables the first existing one is used.
+#: Input of a run by the name of its table; if both tables of the track exist, the first is used.
 _INPUTS: Final = {
     "S_GNSS_SAT": "front", "S_DM_TRACKPOINT": "track", "S_DM_TRACK_SEGMENT_POSITION": "track", "S_IMU": "inertial",
     "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "balise_list",
@@ -16,9 +16,9 @@ _INPUTS: Final = {
 
 
 def find_inputs(folder: Path) -> dict[str, Any]:
-    """Return the inputs of a run from the tables in a folder, with the names of `railfix.run.inputs.RunInputs`.
+    """Return the paths of the tables in a folder, by the field of `railfix.run.inputs.RunInputs` that each provides.
 
-    InputFileError: the folder has no S_GNSS_SAT, or no table of the track.
+    InputFileError: there is no such folder, or it has no table S_GNSS_SAT, or none of the track.
     """
     if not folder.is_dir():
         raise InputFileError(folder, "--mate expects a folder with tables of EGNSS MATE")
@@ -30,6 +30,6 @@ def find_inputs(folder: Path) -> dict[str, Any]:
     for name, needed in (("front", "S_GNSS_SAT"), ("track", "S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT")):
         if name not in given:
             raise InputFileError(folder, f"has no table {needed} (.parquet or .csv) of EGNSS MATE; add it")
-    if not {"balises", "balise_list"} <= given.keys():  # the files are only usable together
+    if not {"balises", "balise_list"} <= given.keys():  # balise readings and their list are only usable together
         given = {name: path for name, path in given.items() if not name.startswith("balise")}
     return given

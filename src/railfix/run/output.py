@@ -1,8 +1,8 @@
-"""Outputs of all commands: written under temporary names, moved into the output folder when complete, never over an
-input.
+"""Outputs of all commands: files are written under temporary names, moved to the output folder when all are complete,
+and never replace an input.
 
-Staging folders are hidden, and locked. A process that is killed leaves its staging folder behind; the
-operating system releases the lock at the same moment, which distinguishes a leftover from the folder of a living run.
+Staging folders are hidden and locked. If a process is killed, its staging folder remains, but the operating system
+releases the lock. A staging folder without a lock therefore belongs to a process that has ended.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ READY: Final = "ready"
 
 @dataclass(frozen=True, kw_only=True)
 class Staging:
-    """A hidden folder inside a results folder, and its open, locked file with the number of the process."""
+    """Hidden folder inside a results folder, and the locked, open file with the identifier of the process."""
 
     path: Path
     lock: IO[str]
 
     def remove(self) -> None:
-        """Remove the folder, then the lock."""
+        """Remove the folder and then the lock file."""
         shutil.rmtree(self.path, ignore_errors=True)
         name = Path(self.lock.name)
         if sys.platform == "win32":
@@ -53,7 +53,7 @@ class Staging:
 
 
 def make_staging(folder: Path) -> Staging:
-    """Return a new staging folder inside a folder, locked by this process; OSError where that cannot be written."""
+    """Create a staging folder inside a folder, locked by this process; OSError if `folder` cannot be written."""
     while True:
         name = folder / f"{_PREFIX}{secrets.token_hex(4)}"
         path, staging = name.with_name(name.name + _LOCK), None
@@ -62,7 +62,7 @@ def make_staging(folder: Path) -> Staging:
             staging = Staging(path=name, lock=lock)
             lock.write(f"{os.getpid()}\n")
             lock.flush()
-            # Another process may have taken the new file for a leftover before it was locked.
+            # Another process may have removed the new file as a leftover before it was locked.
             if _try_lock(lock) and Path(lock.name).exists():
                 name.mkdir()
                 return staging
@@ -76,9 +76,9 @@ def make_staging(folder: Path) -> Staging:
 
 
 def clean_up(folder: Path) -> None:
-    """Remove the staging folders of killed processes; finish those that only had to be moved.
+    """Remove the staging folders of killed processes; move the files of a complete staging folder to `folder` first.
 
-    OutputError: a living process is writing to the folder.
+    OutputError: another process is writing to the folder.
     """
     for path in [p for p in folder.iterdir() if p.name.startswith(_PREFIX)]:
         if path.name.endswith(_LOCK):
@@ -88,7 +88,7 @@ def clean_up(folder: Path) -> None:
 
 
 def _release(lock: Path) -> None:
-    """Remove the lock of a dead process with its staging folder."""
+    """Remove the lock file of a killed process and its staging folder; OutputError if the process is running."""
     try:
         file = lock.open("r+", encoding="ascii", errors="replace")
     except FileNotFoundError:
@@ -110,9 +110,9 @@ def _release(lock: Path) -> None:
 
 
 def move_in_place(ready: Path, folder: Path) -> dict[str, Path]:
-    """Move all files of a folder into another one, records (JSON) last, and return their paths.
+    """Move all files of the folder `ready` into `folder`, records (JSON) last, and return the new paths by name.
 
-    A record that is replaced is removed first, so that it is never in one folder with the tables of another run.
+    Records that will be replaced are removed first, so that a record is never next to the tables of another run.
     """
     files = sorted(ready.iterdir(), key=lambda path: (path.suffix == ".json", path.name))
     for source in files:
@@ -123,7 +123,7 @@ def move_in_place(ready: Path, folder: Path) -> dict[str, Path]:
 
 
 def _try_lock(file: IO[str]) -> bool:
-    """Lock a file for this process; false where another process has locked it."""
+    """Lock a file for this process and return whether this succeeded; False if another process has locked it."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -140,17 +140,17 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-#: Rows of a group of a file, which is combined in memory.
+#: Rows per row group of a Parquet file; a group is assembled in memory.
 _GROUP: Final = 30_000
 #: Interval at which a waiting caller checks the writer for a failure [s].
 _LOOK_S: Final = 0.1
 
 
 class ParquetFile:
-    """A Parquet file to which tables of one schema are appended; memory does not grow with their number.
+    """Parquet file to which tables of one schema are appended, in memory that does not grow with their number.
 
-    polars writes a file from one query. Here the source of the query waits for the next rows, in a thread, and at most
-    one table waits to be written.
+    polars writes a file from one query. The source of that query runs in a thread and waits for the next table; at most
+    one table is queued.
     """
 
     def __init__(self, path: Path, schema: pl.Schema) -> None:
@@ -162,7 +162,7 @@ class ParquetFile:
         self._thread.start()
 
     def append(self, table: pl.DataFrame) -> None:
-        """Append rows; raises errors of writing earlier rows."""
+        """Queue rows for writing; raises errors that occurred while writing earlier rows, or SchemaError."""
         from polars.exceptions import SchemaError
 
         if table.schema != self._schema:
@@ -170,7 +170,7 @@ class ParquetFile:
         self._give(table)
 
     def end(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write the footer, with `metadata`; raises errors of writing."""
+        """Write the remaining rows and the footer with `metadata`; raises errors that occurred while writing."""
         self._metadata = dict(metadata or {})
         self._give(None)
         self._thread.join()
@@ -194,17 +194,17 @@ class ParquetFile:
 
         try:
             rows = register_io_source(tables, schema=self._schema)
-            # The metadata is requested last, with the footer.
+            # polars requests the metadata last, when it writes the footer.
             rows.sink_parquet(self._path, row_group_size=_GROUP, metadata=lambda _: self._metadata)
         except BaseException as error:  # noqa: BLE001  raised again when rows are appended
             self._error = error
 
 
-#: Treatment of existing files.
+#: Whether existing files are an error or are replaced.
 Overwrite = Literal["refuse", "replace"]
-#: Kind of a single file, for `check_output_file`.
+#: Kind of a single output file, for `check_output_file`.
 FileKind = Literal["page", "csv", "pos", "picture", "png", "map", "any"]
-#: For each kind: description, ending of the name, and how to obtain other forms.
+#: For each kind of file, its description, the endings of its name, and a hint on other formats.
 _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "page": ("an HTML page", (".html", ".htm"), "; for a PDF file, print the page in a browser"),
     "csv": ("a table in CSV", (".csv",), ""),
@@ -213,25 +213,25 @@ _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "png": ("a picture in PNG", (".png",), ""),
     "map": ("a file for maps", (".kml", ".gpx", ".geojson", ".gpkg", ".parquet", ".mcap"), ""),
 }
-#: Format of times in CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
+#: Format of times in CSV: ISO 8601 to the nanosecond without a time zone; the times are GPS time.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
-#: Number of rows that `OutputFolder.change` reads at a time.
+#: Number of rows that `OutputFolder.change` transforms together.
 _ROWS: Final = 50_000
 
-#: Number of attempts to make a folder while other runs make and remove its parent folders.
+#: Number of attempts to create a folder while other runs create and remove its parent folders.
 _ATTEMPTS: Final = 10
 
 
 class OutputFolder:
-    """A folder that receives all files of a command at once, or none; made where it does not exist.
+    """Output folder of a command, which receives all files at once or none; it is created if it does not exist.
 
-    Used as a context manager. Inside it, files are written to a hidden staging folder; `commit` moves them to their
-    folder. Leaving without `commit` (an error) removes the written files, and the folder itself if it is new. The next
-    `OutputFolder` there removes the remains of a killed process. With "replace" a folder may have files; files of the
-    same names are replaced at the end; `inputs` are never overwritten.
+    It is a context manager. In its block, files are written to a hidden staging folder, from which `commit` moves them
+    to the output folder. If the block ends with an error, the written files are removed, and the output folder too if
+    it was created. Remains of a killed process are removed by the next `OutputFolder` at the same path. With "replace",
+    existing files of the same names are replaced by `commit`; `inputs` are never overwritten.
 
-    OutputError: the folder cannot be made or written, is not empty, is being written by another process, or a file
-    would overwrite an input.
+    OutputError: the folder cannot be created or written, is not empty (with "refuse"), is being written by another
+    process, or a file would overwrite an input.
     """
 
     def __init__(self, path: Path, *, overwrite: Overwrite = "refuse", inputs: Sequence[Path] = ()) -> None:
@@ -248,12 +248,12 @@ class OutputFolder:
             try:
                 self._make()
                 self._staging = make_staging(path)
-            except BaseException:  # a signal that ends the program among them
+            except BaseException:  # including a signal that ends the program
                 self._unmake()
                 raise
 
     def _make(self) -> None:
-        """Make the folder and its parents, which other runs may make or remove at the same time."""
+        """Create the folder and its parents, which other runs may create or remove at the same time."""
         for left in reversed(range(_ATTEMPTS)):
             try:
                 for folder in reversed([p for p in (self.path, *self.path.parents) if not p.exists()]):
@@ -281,7 +281,7 @@ class OutputFolder:
         for handle in self._csv.values():
             handle.close()
         for file in self._parquet.values():
-            with suppress(Exception):  # it is removed
+            with suppress(Exception):  # the file is removed anyway
                 file.end()
         self._staging.remove()
         if kind is not None:
@@ -289,11 +289,11 @@ class OutputFolder:
 
     @property
     def staging(self) -> Path:
-        """The temporary folder; `stage` registers the files in it that are results."""
+        """Path of the staging folder; only its files that `stage` has registered are results."""
         return self._staging.path
 
     def stage(self, name: str) -> Path:
-        """Return the temporary path at which to write one file; `commit` moves it to its path.
+        """Return the temporary path at which a result is to be written; `commit` moves it to the output folder.
 
         OutputError: the file would overwrite an input, or a folder of that name exists.
         """
@@ -306,7 +306,7 @@ class OutputFolder:
         return self._staging.path / name
 
     def append_csv(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a CSV file; the header is written once."""
+        """Append rows to a CSV file; the header is written before the first rows."""
         with _writing(self.path / name):
             first = name not in self._csv
             if first:
@@ -314,14 +314,14 @@ class OutputFolder:
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a Parquet file; they are written while the caller continues (`ParquetFile`)."""
+        """Append rows to a Parquet file; another thread writes them (`ParquetFile`)."""
         with _writing(self.path / name):
             if name not in self._parquet:
                 self._parquet[name] = ParquetFile(self.stage(name), table.schema)
             self._parquet[name].append(table)
 
     def end_parquet(self, metadata: Mapping[str, str] | None = None) -> None:
-        """End the Parquet files, with `metadata` in the footer of each: from then on `scan` reads them."""
+        """End all Parquet files, with `metadata` in each footer; `scan` can then read them."""
         while self._parquet:
             name, file = next(iter(self._parquet.items()))
             with _writing(self.path / name):
@@ -329,7 +329,7 @@ class OutputFolder:
             del self._parquet[name]
 
     def change(self, name: str, transform: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
-        """Change a table, Parquet and CSV, and write it again, some rows at a time."""
+        """Apply a function to blocks of rows of a table, in order, and write its Parquet and CSV files again."""
         import polars as pl
 
         from railfix.pipeline.result_tables import round_floats
@@ -345,21 +345,21 @@ class OutputFolder:
                 self.append_csv(f"{name}.csv", round_floats(table))
 
     def scan(self, name: str) -> pl.LazyFrame:
-        """Return a Parquet file that has ended."""
+        """Return a lazy frame of a Parquet file after `end_parquet`."""
         import polars as pl
 
         return pl.scan_parquet(self.staging / name)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write one JSON file; NaN and infinities, which JSON lacks, are written as words."""
+        """Write a JSON file; NaN and infinities, which JSON lacks, are written as the texts of `finite_values`."""
         with _writing(self.path / name):
             text = json.dumps(finite_values(content), indent=2, ensure_ascii=False, allow_nan=False)
             self.stage(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
-        """Move every file to its folder; return the paths by name.
+        """Move all registered files to the output folder and return their paths by name.
 
-        `metadata` is written into the footer of each Parquet file that has not ended.
+        `metadata` is written to the footer of each Parquet file that has not ended.
         """
         staging = self._staging.path
         with _writing(self.path):
@@ -370,15 +370,14 @@ class OutputFolder:
             ready.mkdir()
             for name in self._staged:
                 self.stage(name).replace(ready / name)
-            # After this rename a killed process counts as finished: the next process moves the files to their folder.
+            # If the process is killed after this rename, the next process moves the files to the output folder.
             return move_in_place(ready.replace(staging / READY), self.path)
 
 
 def check_folder(path: Path, *, overwrite: Overwrite) -> None:
-    """Clean up a results folder after killed processes, and raise OutputError where it must not be written.
+    """Remove the remains of killed processes from a results folder, and raise OutputError if it must not be written.
 
-    It must not be written if it is a file, is being written by another process, or contains files that must not be
-    replaced.
+    It must not be written if it is a file, is being written by another process, or, with "refuse", is not empty.
     """
     with _writing(path):
         if path.exists() and not path.is_dir():
@@ -390,17 +389,17 @@ def check_folder(path: Path, *, overwrite: Overwrite) -> None:
 
 
 def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
-    """Raise OutputError where a file to be written is an input, under whichever name."""
+    """Raise OutputError if a file to be written is one of the inputs, also under another name (link)."""
     for path in inputs:
         if target.resolve() == path.resolve() or (target.exists() and path.exists() and target.samefile(path)):
             raise OutputError(f"{target}: is an input, which is never overwritten; give another output")
 
 
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
-    """Raise OutputError where a single file of a kind cannot or must not be written.
+    """Raise OutputError if an output file cannot or must not be written.
 
-    Its folder does not exist or is not writable, it exists, is one of `inputs`, or its name has the ending of another
-    kind.
+    This is the case if its folder does not exist or is not writable, if it is a folder or one of `inputs`, if it exists
+    (with "refuse"), or if its name has not the ending of its kind.
     """
     with _writing(target):
         check_not_input(target, inputs)
@@ -421,7 +420,7 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Convert system errors on a file to an OutputError of one sentence."""
+    """Convert errors of the system and of polars in the block to an OutputError that names the file."""
     from polars.exceptions import PolarsError
 
     try:
@@ -433,7 +432,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def finite_values(value: Any) -> Any:
-    """Return plain values with NaN and infinities as words."""
+    """Return nested plain values with NaN and infinities replaced by the texts "nan", "inf" and "-inf"."""
     if isinstance(value, Mapping):
         return {key: finite_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

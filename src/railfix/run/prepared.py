@@ -1,8 +1,8 @@
-"""Cache of prepared lines on disk: the track as read, and the antenna paths on it.
+"""Cache of prepared lines on disk: tracks as read from their files, and antenna trajectories.
 
-Reading a line of 2000 km and computing the paths of two antennas takes seconds, with the same result for the same
-files, settings and version of railfix. Long lines are therefore kept in the user's cache folder, which can be deleted
-at any time: the platform's folder (``~/.cache/railfix`` on Linux), or the folder named by `VARIABLE`.
+Reading a line of 2000 km and computing the trajectories of two antennas takes seconds. The result depends only on the
+files, the settings and the version of railfix, so that long lines are stored in a cache folder. It is the platform's
+folder (``~/.cache/railfix`` on Linux) or the folder named by `VARIABLE`, and may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -31,34 +31,37 @@ from railfix.track import Track
 from railfix.track.track import Provenance
 from railfix.track.trajectory import Trajectory
 
-#: Environment variable with the cache folder.
+#: Environment variable with the path of the cache folder.
 VARIABLE: Final = "RAILFIX_CACHE_DIR"
-#: Smallest number of points of a cached line. 5000 points with two antennas take 0.11 s to prepare, 0.01 s to load.
+#: Minimum number of points of a cached line. 5000 points with two antennas take 0.11 s to prepare and 0.01 s to load.
 LEAST_POINTS: Final = 2_000
-#: Number of cache entries; the entries written last are kept.
+#: Maximum number of cache entries; the oldest are deleted.
 MOST_ENTRIES: Final = 48
-#: Fields computed from the points of a trajectory and cached with them.
+#: Attributes that are computed from the points of a trajectory and cached with the points.
 _DERIVED: Final = ("up", "across")
-#: Errors of reading a damaged file.
+#: Exceptions raised when a damaged cache file is read.
 _DAMAGE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def cache_folder() -> Path:
-    """Return the folder of prepared lines."""
+    """Return the path of the cache folder, which may not exist yet."""
     import platformdirs
 
     return Path(os.environ.get(VARIABLE) or platformdirs.user_cache_path("railfix", appauthor=False))
 
 
 class PreparedLines:
-    """Prepared lines of one command; `notes` report damaged files and files that could not be written."""
+    """Reader and writer of the cache; `notes` collects messages on damaged files and files that cannot be written.
+
+    With ``use=False`` nothing is read or written.
+    """
 
     def __init__(self, *, use: bool = True) -> None:
         self.notes: list[str] = []
         self._folder = cache_folder() if use else None
 
     def track(self, key: str) -> Track | None:
-        """Return the track that was kept under a key; None without one."""
+        """Return the cached track with a key (`compute_key`); None if there is none."""
         found = self._load(key)
         if found is None:
             return None
@@ -69,13 +72,13 @@ class PreparedLines:
         return Track(**values, provenance=Provenance(**provenance))
 
     def keep_track(self, key: str, track: Track) -> None:
-        """Keep a track."""
+        """Write a track to the cache if it has at least `LEAST_POINTS` points."""
         if len(track) >= LEAST_POINTS:
             plain, arrays = _parts(track)
             self._keep(key, {**plain, "provenance": asdict(track.provenance)}, arrays)
 
     def path(self, key: str) -> Trajectory | None:
-        """Return the trajectory that was kept under a key; None without one."""
+        """Return the cached trajectory with a key (`compute_key`); None if there is none."""
         found = self._load(key)
         if found is None:
             return None
@@ -87,7 +90,7 @@ class PreparedLines:
         return trajectory
 
     def keep_path(self, key: str, path: Trajectory) -> None:
-        """Keep a trajectory."""
+        """Write a trajectory to the cache if it has at least `LEAST_POINTS` points."""
         if len(path) >= LEAST_POINTS:
             plain, arrays = _parts(path)
             self._keep(key, plain, arrays | {name: getattr(path, name) for name in _DERIVED})
@@ -125,7 +128,10 @@ class PreparedLines:
 
 
 def compute_key(kind: str, *parts: object) -> str:
-    """Return the key of an object made from `parts`: files by their content, arrays, and other values as text."""
+    """Return the cache key of an object made from `parts`: paths of files, arrays, and other values.
+
+    The key depends on the content of files and arrays, on the text of other values, and on the version of railfix.
+    """
     digest = hashlib.sha256(f"{kind} {__version__} {_code()}".encode())
     for part in parts:
         if isinstance(part, Path):
@@ -139,19 +145,19 @@ def compute_key(kind: str, *parts: object) -> str:
 
 @cache
 def _code() -> list[tuple[str, int, int]]:
-    """Return the files of code that prepare lines, with size and time: a change prepares the lines again."""
+    """Return name, size and modification time of each source file that affects a prepared line, as part of the key."""
     files = sorted(Path(railfix.track.__file__).parent.glob("*.py"))
     return [(file.name, (state := file.stat()).st_size, state.st_mtime_ns) for file in files]
 
 
 def track_key(track: Track) -> str:
-    """Return the key of a track as it is in memory."""
+    """Return the cache key of a track from its content in memory."""
     plain, arrays = _parts(track)
     return compute_key("track", json.dumps(plain), *arrays.values(), repr(track.provenance))
 
 
 def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the plain fields and the arrays, provenance left out."""
+    """Return the fields that are not arrays, and the arrays; both without the provenance."""
     values = {item.name: getattr(value, item.name) for item in fields(value) if item.name != "provenance"}
     arrays = {name: array for name, array in values.items() if isinstance(array, np.ndarray)}
     return {name: v for name, v in values.items() if name not in arrays}, arrays

@@ -1,4 +1,4 @@
-"""Epoch processor of a run, with the files that the settings name and the observations of a base station."""
+"""Epoch processor of a run with the files named by its settings, and the log of a base station."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings with the fault priors, and the stretches without a level, of their error model.
+    """Return settings with the fault priors, and the stretches without a protection level, of their error model.
 
-    Explicitly given settings stay unchanged; all settings stay unchanged if the model does not bound its priors.
+    The settings remain unchanged if they have no error model, if a fault prior is given explicitly, or if the error
+    model has no bounds of fault priors. Stretches without a protection level that are given explicitly are kept.
     """
     given = config.risk.model_fields_set & {"local_prior", "side_prior", "priors"}
     if config.error_model is None or given:
@@ -54,10 +55,11 @@ def make_processor(
 ) -> EpochProcessor:
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
-    `track` is the line itself, for positions by its features; `units` are the surveyed stations of two-way ranges,
-    `balises` the positions of the balises. `base_ecef_m`: position of a base station; "stream": the position in the
-    headers of its observations. InputFileError: a file named by the settings is not as expected. SettingsError: SBAS
-    and precise ephemerides together, or no SBAS message of the requested GEO satellite.
+    `trajectories` has the trajectory of each antenna. `track` is required for positioning by features of the line.
+    `units` are the surveyed ground units of two-way ranges, `balises` the positions of the balises. `base_ecef_m` is
+    the position of a base station [m]; with "stream" it is taken from the headers of the station's observations.
+    InputFileError: a file named by the settings is missing or malformed. SettingsError: SBAS is combined with precise
+    orbits, or there is no SBAS message of the requested GEO satellite.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
@@ -81,12 +83,15 @@ def make_processor(
     )
 
 
-#: Largest difference by which the base station's time tags may be later than the train's at the same instant.
+#: Largest time by which the base station's time tags may be later than the train's time tags for the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
 def parse_position(text: str, option: str) -> Floats:
-    """Parse a position LAT,LON,HEIGHT of the command line to ECEF, shape (3,) [m]."""
+    """Parse a position LAT,LON,HEIGHT [deg, deg, m] and return it in ECEF, shape (3,) [m].
+
+    SettingsError: the text is not such a position; `option` names the option in the message.
+    """
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
     except ValueError:
@@ -97,7 +102,10 @@ def parse_position(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station at LAT,LON,HEIGHT, or at the position of its header; InputFileError if that is missing."""
+    """Log of a base station, whose position is `place` (LAT,LON,HEIGHT) or the position in the header of the log.
+
+    InputFileError: the log has no epoch, or neither `place` nor the header gives the position.
+    """
 
     def __init__(self, log: Log, place: str | None) -> None:
         self._parts = log.parts()
@@ -105,13 +113,13 @@ class BaseLog:
         if self._waiting is None:
             raise InputFileError(log.paths[0], "has no epoch in the requested time")
         header = self._waiting.header
-        self.span = self._waiting.time[0], self._waiting.time[-1]  #: Times of the epochs read so far [ns].
+        self.span = self._waiting.time[0], self._waiting.time[-1]  #: First and last time of the epochs read so far.
         self.ecef_m = header.approximate_ecef_m if place is None else parse_position(place, "--base-place")
         if not np.linalg.norm(np.nan_to_num(self.ecef_m)) > 1e6:
             raise InputFileError(log.paths[0], "its header has no position; give the station's position (--base-place)")
 
     def until(self, time: np.datetime64) -> Observations | None:
-        """Return the epochs up to a time that have not been returned before."""
+        """Return the epochs up to a time that have not been returned before; None if there are none."""
         parts = list(self._until(time + _SAME_INSTANT))
         return concatenate(parts) if parts else None
 
@@ -130,13 +138,13 @@ class BaseLog:
 
 
 def check_base_place(base: object, place: str | None) -> None:
-    """Raise SettingsError where a position of a base station is given without its observations."""
+    """Raise SettingsError if the position of a base station is given without its observations."""
     if not base and place is not None:
         raise SettingsError("--base-place is given without --base; give the observations of the base station, too")
 
 
 def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:
-    """Return the log of a base station; None without files."""
+    """Open the log of a base station; None without files."""
     check_base_place(paths, options.base_place)
     if not paths:
         return None

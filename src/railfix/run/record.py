@@ -1,4 +1,4 @@
-"""Record of a run (``run.json``): inputs, settings given and used, results; written, read back, and as tables."""
+"""Record of a run (``run.json``): inputs, given and used settings, results; and tables of a record."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from railfix.run.output import OutputFolder
 from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import TrackStatus
 
-#: Packages whose version may matter to a result.
+#: Packages whose versions may affect results.
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Limits within which the filter's levels are counted [m].
+#: Limits for which the filter's protection levels below them are counted [m].
 WITHIN_M: Final = (20, 50)
-#: Figures of an antenna without rows.
+#: Figures of an antenna without rows in the tables.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
-    """Return percentiles of each antenna from the rows written [m]; None for missing figures.
+    """Return statistics of each antenna from the written tables, with lengths in [m]; None for missing statistics.
 
-    The figures are statistics of sigma along the line; of finite protection levels, with epochs by status; and of the
-    filter, with epochs by status, and its levels with the numbers within `WITHIN_M`.
+    They describe the sigma along the line, the chainage, the finite protection levels (with epochs by status), and the
+    filter (with epochs by status, and the number of protection levels within each limit of `WITHIN_M`).
     """
     return {
         name: {
@@ -100,19 +100,19 @@ def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
 
 
 def _figures(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, Any]:
-    """Return statistics of many rows of one column."""
+    """Return the values of aggregating expressions over all rows."""
     return rows.select(**figures).collect().row(0, named=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunProvenance:
-    """Inputs of a run."""
+    """Inputs of a run that are recorded."""
 
-    files: Sequence[Mapping[str, Any]]  #: Inputs with size and hash.
+    files: Sequence[Mapping[str, Any]]  #: Input files with size and hash (`fingerprint`).
     packages: Mapping[str, str]  #: Result of `package_versions`.
-    asked: Mapping[str, Any]  #: Settings as given.
-    config: Config  #: Settings in force.
-    options: RunOptions  #: Options that are not settings of the positions.
+    asked: Mapping[str, Any]  #: Settings as given explicitly.
+    config: Config  #: All settings that were used.
+    options: RunOptions  #: Options that do not change the positions.
     line: Mapping[str, Any]  #: Properties of the track map, the vehicle and the trajectories.
     navigation: Navigation
 
@@ -164,7 +164,7 @@ def run_record(
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of `PACKAGES`, "absent" for those that are not installed."""
+    """Return the version of each of `PACKAGES`; "absent" if a package is not installed."""
     versions = {}
     for name in PACKAGES:
         try:
@@ -174,19 +174,19 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
-#: Settings, by group and name, that were removed because nothing used them: records of earlier runs have them.
+#: Settings, by group and name, that records of earlier versions contain although they never affected a result.
 WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """Record of a run: ``run.json`` in the folder that `run_files` wrote."""
+    """Record of a run, the file ``run.json`` in a results folder."""
 
-    path: Path  #: The folder.
-    record: Mapping[str, Any]  #: ``run.json``.
+    path: Path  #: Results folder.
+    record: Mapping[str, Any]  #: Content of ``run.json``.
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return a table of the record; InputFileError: it is missing or not a table."""
+        """Return a table of the record; InputFileError if it is missing or not a table."""
         table = self.record.get(name)
         if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
@@ -194,10 +194,9 @@ class RunRecord:
 
     @cached_property
     def config(self) -> Config:
-        """Settings that were used, with the current paths of their files.
+        """Settings that were used, with the present paths of their files, without the settings `WITHOUT_EFFECT`.
 
-        Recorded settings of earlier versions that never affected a result are left out. InputFileError: the record
-        lacks them, or they are not settings of this version.
+        InputFileError: the record lacks the settings, or they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
         for group, name in WITHOUT_EFFECT:
@@ -210,7 +209,7 @@ class RunRecord:
 
     @cached_property
     def inputs(self) -> RunInputs:
-        """Input files with their current paths."""
+        """Input files with their present paths; InputFileError if they do not fit this version."""
         kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
         several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
         values = {
@@ -220,7 +219,7 @@ class RunRecord:
 
     @cached_property
     def options(self) -> RunOptions:
-        """Options that were used."""
+        """Options that were used; InputFileError if they do not fit this version."""
         return self._this_version(lambda: validate(RunOptions, self.part("options"), source="options"))
 
     def _this_version(self, read: Callable[[], Model]) -> Model:
@@ -231,7 +230,7 @@ class RunRecord:
             raise InputFileError(path, f"does not fit this version ({error}); repeat the run with it") from None
 
     def check_inputs(self) -> None:
-        """Raise InputFileError where an input file is missing, MismatchError where one has changed since the run."""
+        """Raise InputFileError if an input file is missing, or MismatchError if an input has changed since the run."""
         self.inputs.check()
         for entry in self.entries:
             path = input_path(entry, self.path)
@@ -241,12 +240,12 @@ class RunRecord:
                 )
 
     def input_paths(self, kind: str) -> list[Path]:
-        """Return the present paths of one kind of input, in order; see `railfix.run.inputs.input_path`."""
+        """Return the present paths of the inputs of one kind, in the recorded order; see `input_path`."""
         return [input_path(entry, self.path) for entry in self.entries if entry["input"] == kind]
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:
-        """Input files with kind, path and SHA-256; InputFileError: the record has no such list."""
+        """Recorded input files with kind, path and SHA-256; InputFileError if the record has no such list."""
         entries = self.record.get("inputs", [])
         complete = isinstance(entries, list) and all(
             isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
@@ -259,7 +258,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run from its folder; InputFileError: the file does not exist, or is not a record."""
+    """Read the record of a run from a results folder; InputFileError if ``run.json`` is missing or malformed."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; give that folder")
@@ -270,7 +269,7 @@ def read_record(folder: Path) -> RunRecord:
 
 
 def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFrame:
-    """Read a table that a run wrote: all columns, or those selected; InputFileError where it is not Parquet."""
+    """Read all or the selected columns of a table that a run wrote; InputFileError if it is not a Parquet file."""
     with reading_table(path):
         if columns is None:
             return pl.read_parquet(path)
@@ -278,21 +277,22 @@ def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFr
 
 
 Facts = Mapping[str, Any]
-#: Names of percentiles in the record, by their names in the tables.
+#: Names of statistics in the record, by their labels in the tables.
 _OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
 _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
 def level_basis(record: Facts) -> str:
-    """Return the term for the levels of a run, by measured or assumed priors."""
+    """Return "protection" if the fault priors of the run are measured, otherwise "indicative protection"."""
     risk = (record.get("settings_used") or {}).get("risk") or {}
     return "protection" if risk.get("priors") == "measured" else "indicative protection"
 
 
 def budget_tables(antennas: Mapping[str, Facts], basis: str) -> list[Table]:
-    """Return the filter by status, where it is on, single epochs by status, and pseudoranges by reason.
+    """Return tables of filter epochs by status, single epochs by status, and pseudoranges by rejection reason.
 
-    `antennas` are from ``run.json``; fields missing in a record of an earlier version are shown as a dash.
+    `antennas` has the facts of each antenna from ``run.json``, `basis` the result of `level_basis`. The first table is
+    absent if the filter was off. Fields missing in a record of an earlier version are shown as a dash.
     """
     filtered = {name: facts["filter"] for name, facts in antennas.items() if facts.get("filter")}
     caption = "Single epochs (positions.csv)" if filtered else "Epochs by status"
@@ -349,7 +349,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield epochs with too few satellites by the reason that left too few, with the number due to it alone."""
+    """Yield rows with the number of epochs with too few satellites due to each reason, and due to that reason alone."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):
@@ -385,7 +385,7 @@ def _ratio(part: float, whole: float) -> float | None:
 
 
 def _metres(what: str, found: Sequence[Facts | None], fields: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a row for each field of the antennas' figures, with None where missing."""
+    """Yield a row of lengths [m] for each field of the antennas' figures, with a dash if an antenna has none."""
     for label, field in fields.items():
         yield [f"{what}, {label}", *(number(None if each is None else each[field], 2, " m") for each in found)]
 

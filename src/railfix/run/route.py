@@ -1,7 +1,7 @@
 """Route of a log through a network of tracks, found from the log itself, with neighbouring tracks as hypotheses.
 
-Conventional positions once a second are matched to the network (`railfix.track.network_match`); the most probable
-sequence of tracks is the route on which positions are computed, and every other track keeps its probability.
+One conventional position per second is matched to the network (`railfix.track.network_match`). The most probable
+sequence of tracks is the route on which positions are computed; the probabilities of all other tracks are kept.
 """
 
 from __future__ import annotations
@@ -35,42 +35,43 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: Tracks of the route within this distance are candidates for a position on it [m]; difference between lengths in plan
-#: and along the line.
+#: Distance within which tracks of the route are candidates for a position on the route [m], and bound of the relative
+#: difference between lengths in plan and along the line, which extends that distance.
 _REACH_M: Final = 50.0
 _LENGTHS_DIFFER: Final = 1e-3
-#: Minimum probability of another track from which on it is written and reported.
+#: Minimum probability at which another track is written to the table, and at which it is reported in the notes.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
 #: Number of alternatives reported in the notes; all are in ``run.json``.
 _NAMED: Final = 8
-#: Largest gap within one alternative [s].
+#: Largest gap between positions of one `Alternative` [s].
 _TOGETHER_S: Final = 60.0
-#: Probability of an unmapped track above which the log indicates one: twice the prior.
+#: Probability above which the log indicates an unmapped track: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name of an unmapped track.
 NONE: Final = "none"
 
 #: Additional columns of positions on a network.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
-    "track": "track of the network on which the position lies, part of the route found from the log",
-    "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
-    "track_probability": "probability of the route at this position, given the whole log; `tracks.csv` has the "
-    "alternatives",
-    "unmapped_probability": "probability of a track that is not in the map, given the whole log",
-    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, to the right "
-    "of that track",
-    "unconstrained_up_m": "height of that position above the track, less the antenna height if the vehicle is known",
+    "track": "track of the network on which the position lies; it is part of the route found from the log",
+    "track_chainage_m": "distance in plan of the antenna along that track from the first point of the track",
+    "track_probability": "probability, given the whole log, that the train is on the route at this position; "
+    "`tracks.csv` has the alternatives",
+    "unmapped_probability": "probability, given the whole log, that the train is on a track that is not in the map",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from that "
+    "track; positive to the right",
+    "unconstrained_up_m": "height of the 3-D position without the map above that track, less the antenna height if the "
+    "vehicle is known",
 }
 #: Columns of the table of tracks near each position.
 TRACK_COLUMNS: Final[dict[str, str]] = {
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
-    "track": "track of the network; `none`: a track that the map does not have",
+    "track": "track of the network; `none` is a track that the map does not have",
     "on_route": "whether the track belongs to the route on which the positions are computed",
     "probability": "probability of this track given the whole log; the rows of an epoch and antenna sum to 1",
-    "chainage_m": "distance in plan along the track from its first point, of the nearest point to the position",
-    "kilometrage_m": "kilometrage as marked on the line at that point, if the map has it",
+    "chainage_m": "distance in plan along the track from its first point to the point nearest to the position",
+    "kilometrage_m": "kilometrage at the point of `chainage_m` as marked on the line, if the map has it",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
     "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive right of it",
 }
@@ -78,17 +79,17 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Alternative:
-    """A stretch of the log on which another track is possible."""
+    """Stretch of a log on which a track outside the route is possible."""
 
-    track: str
-    instead_of: str
-    first: np.datetime64
+    track: str  #: Name of the alternative track.
+    instead_of: str  #: Name of the track of the route.
+    first: np.datetime64  #: First epoch, GPS time.
     last: np.datetime64
-    probability: float
+    probability: float  #: Largest probability of the alternative track.
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Plain values of the alternative for JSON."""
         return {
             "track": self.track,
             "instead_of": self.instead_of,
@@ -99,7 +100,7 @@ class Alternative:
 
     @property
     def sentence(self) -> str:
-        """Sentence for the notes of a run."""
+        """Sentence on the alternative for the notes of a run."""
         span = f"{str(self.first)[:19]} to {str(self.last)[11:19]}"
         return f"route: from {span} the train may be on {self.track} instead of {self.instead_of} " + (
             f"(probability up to {self.probability:.2f})"
@@ -112,13 +113,12 @@ class RouteOfLog:
 
     network: Network
     tracks: tuple[int, ...]  #: Tracks of the route, in order.
-    #: Tracks of the most probable sequence that no route connects with the tracks of the route: the train turned back
-    #: over them.
+    #: Tracks of the most probable sequence that cannot be joined to the route, because the train reversed on them.
     left_out: tuple[int, ...]
     log: PlanLog  #: Matched positions in the frame of the network.
-    matched: Matched
-    time: np.datetime64  #: Coordinates at the frame's epoch.
-    reading: TrackReading
+    matched: Matched  #: Tracks near each matched position with their probabilities.
+    time: np.datetime64  #: Epoch of the coordinates of positions, for the transformation to the frame of the network.
+    reading: TrackReading  #: Options with which the network was read.
 
     @cached_property
     def probability(self) -> Floats:
@@ -126,12 +126,12 @@ class RouteOfLog:
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
 
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
-        """Return whether a track outside the route has a probability above a risk.
+        """Return whether the probability that the train is not on the route exceeds `risk` at each time, shape (T,).
 
-        An unmapped track is considered only above `_UNMAPPED_LIMIT`; below, the levels include it (`with_unmapped`). It
-        is computed from the tracks of the route within `_REACH_M` of each chainage, because parallel parts of the route
-        have their own probabilities, and at the matched positions before and after each time, because the track may
-        differ between two positions with known tracks.
+        The probability of the route is the sum over its tracks within `_REACH_M` of the chainage, since a parallel part
+        of the route is another track at that position. The smaller of the values at the matched positions before and
+        after the time is used, since the track may change between these positions. An unmapped track counts only by its
+        probability in excess of `_UNMAPPED_LIMIT`; protection levels include the rest (`with_unmapped`).
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
@@ -142,8 +142,9 @@ class RouteOfLog:
         return np.asarray(np.fmin(*known) < 1.0 - risk)
 
     def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
-        """Return the probability of the route's tracks near chainages, at matched positions; of all its tracks without
-        a chainage.
+        """Return the probability of the route's tracks near chainages [m] at matched positions, by index, shape (T,).
+
+        If a chainage is NaN, all tracks of the route are included.
         """
         lengths = self.network.length_m[list(self.tracks)]
         end = np.cumsum(lengths)
@@ -156,13 +157,14 @@ class RouteOfLog:
 
     @cached_property
     def unmapped(self) -> Floats:
-        """Probability of an unmapped track, shape (n,)."""
+        """Probability of an unmapped track at each matched position, shape (n,)."""
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
 
     def with_unmapped(self, config: Config) -> Config:
-        """Return the settings with the probability of an unmapped track as the prior of a wrong map.
+        """Return settings in which the prior of a wrong map is at least the probability of an unmapped track.
 
-        It is the largest probability of the log, at most `_UNMAPPED_LIMIT`; above that there is no level.
+        The largest probability in the log is used, limited to `_UNMAPPED_LIMIT`; where the probability is larger, there
+        is no protection level (`is_uncertain`).
         """
         share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
         limits, risk, araim = config.tracking, config.risk, config.araim
@@ -178,7 +180,7 @@ class RouteOfLog:
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:
-        """Stretches on which another track has a probability of at least 1 %, the most probable first."""
+        """Stretches on which a track outside the route has a probability of at least 1 %, the most probable first."""
         names = (*self.network.names, NONE)
         beside = np.where(self._on_route > 0.0, -1, self.matched.candidates.track)
         known, found = np.flatnonzero(np.isin(self.matched.track, self.tracks)), []
@@ -223,7 +225,7 @@ class RouteOfLog:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Plain values of the route for JSON."""
         return {
             "found_from": self.log.path,
             "tracks": self.names,
@@ -234,9 +236,10 @@ class RouteOfLog:
         }
 
     def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return a table of positions with `ON_TRACK_COLUMNS`, and every track near each position (`TRACK_COLUMNS`).
+        """Return a table of positions with `ON_TRACK_COLUMNS` added, and a table of `TRACK_COLUMNS`.
 
-        `line` is the route, whose sections are its tracks. Epochs without a position have no rows of tracks.
+        The second table has one row per position and track near it; epochs without a position have no rows. `line` is
+        the track map of the route, whose sections are the tracks of the route.
         """
         chainage = table["chainage_m"].to_numpy()
         ecef = table.select("x_m", "y_m", "z_m").to_numpy()
@@ -284,7 +287,10 @@ class RouteOfLog:
         return positions, long[order]
 
     def _unconstrained(self, epoch: Indices, track: Indices) -> tuple[pl.Series, pl.Series]:
-        """Return offset and height of matched positions from tracks near them, shape (n,); null without one."""
+        """Return offset and height [m] of matched positions, by index, from given tracks, shape (n,).
+
+        The values are null if the track is not among the candidates of the position.
+        """
         near = self.matched.candidates
         same = (near.track[epoch] == track[:, None]) & (track >= 0)[:, None]
         column = same.argmax(axis=1)
@@ -306,27 +312,27 @@ class BaseObservations(Protocol):
     ecef_m: Floats  #: Position of the station; shape (3,).
 
     def until(self, time: np.datetime64) -> Observations | None:
-        """Return the epochs up to a time that have not been returned before."""
+        """Return the epochs up to a time that have not been returned before; None if there are none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogPositions:
-    """Conventional positions of a log once per second, from which an unknown line is found."""
+    """Conventional positions of a log once per second, from which its route through a network is found."""
 
     path: str  #: Name of the log in messages.
-    parts: Callable[[], Iterable[Observations]]  #: The pieces of the log in order of time.
+    parts: Callable[[], Iterable[Observations]]  #: Returns the pieces of the log in order of time.
     navigation: Navigation
     config: Config
     time: np.datetime64 | None  #: Epoch of the transformation between frames; None without a navigation record.
     reading: TrackReading
-    antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
+    antenna_up_m: float | None = None  #: Height of the antenna above the rails [m]; None if no vehicle is given.
     open_base: Callable[[], BaseObservations | None] = lambda: (
         None
-    )  #: Open the log of a base station; None without one.
+    )  #: Opens the log of the base station; returns None if there is no base station.
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions of quality 5 (single), or 4 with a base station; NoPositionError if the log has no position."""
+        """Positions with quality 5 (single), or 4 (DGPS) with a base station; NoPositionError if there is none."""
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         base, state, located = self.open_base(), BaseState(), []
         station = None if base is None else BaseStation(self.config, base.ecef_m)
@@ -348,7 +354,7 @@ class LogPositions:
         )  # fmt: skip
 
     def route(self, network: Network) -> RouteOfLog:
-        """Find the route of the log through a network; MismatchError where there is no route, or no position."""
+        """Find the route of the log through a network; MismatchError if there is no route or no navigation record."""
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         of_antenna = plan_log(self.positions, antenna_up_m=self.antenna_up_m)

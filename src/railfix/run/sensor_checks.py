@@ -1,7 +1,6 @@
-"""Checks of the sensors on board against the positions of single epochs: signs, units, axes, time tags, diameter.
+"""Checks of on-board sensors against satellite positions and speeds: signs, units, axes, time tags, wheel diameter.
 
-Single epochs do not depend on the sensors, but the filter's speeds do: a sensor mounted backwards affects the filter
-too.
+Signs are checked against single-epoch positions, because speeds of the filter depend on the sensors.
 """
 
 from __future__ import annotations
@@ -24,34 +23,34 @@ from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Positions are averaged over cells of this length [s].
+#: Length of the cells of time over which positions are averaged [s].
 _CELL_S: Final = 4.0
 #: Minimum speed for a check of signs [m/s].
 _MOVING_MPS: Final = 1.0
-#: Number of cells required for a statement, and minimum root mean square of the compared quantities: changes of a force
-#: [m/s2] and of a speed [m/s], a rate [rad/s].
+#: Minimum number of cells for a check, and minimum variation of the compared force [m/s2], speed [m/s] and turn rate
+#: [rad/s].
 _LEAST_CELLS: Final = 15
 _LEAST_FORCE_MPS2: Final = 0.08
 _LEAST_SPEED_MPS: Final = 1.0
 _LEAST_RATE_RADPS: Final = 0.003
-#: A slope of measured over expected values below this is a reversed sign, above that a rate in degrees.
+#: Slope of measured over expected values below which the sign is reversed, and above which a rate is in degrees.
 _REVERSED: Final = -0.3
 _IN_DEGREES: Final = 10.0
-#: Tested lags, and smallest reported lag [s]; the residual without a lag must be larger by this factor.
+#: Largest tested and smallest reported lag [s], and minimum ratio of the unexplained variances without and with a lag.
 _LONGEST_LAG_S: Final = 20.0
 _LEAST_LAG_S: Final = 2.0
 _LESS_ALIKE: Final = 2.0
-#: Fraction of gravity by which a force at rest may differ from it.
+#: Largest difference of the mean force from gravity, as a fraction of gravity.
 _GRAVITY_SHARE: Final = 0.12
 
 
 @dataclass(frozen=True)
 class PositionMotion:
-    """Motion of an antenna by its positions, M cells of time; NaN where a neighbour is missing."""
+    """Motion of an antenna from its positions, averaged over M cells of time; NaN if a neighbouring cell is empty."""
 
     time: Datetimes  #: Shape (M,).
-    #: Speed and acceleration toward rising chainage; gradient of the line as climb over horizontal length; rate of the
-    #: line's heading, positive to the right; shape (M,).
+    #: Speed and acceleration toward rising chainage, gradient of the line (rise over horizontal length), and turn rate
+    #: of the line's heading, positive to the right; shape (M,).
     speed_mps: Floats
     acceleration_mps2: Floats
     gradient: Floats
@@ -59,7 +58,7 @@ class PositionMotion:
 
 
 def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
-    """Compute the motion by ``time_gpst`` and ``chainage_m`` of single epochs, from cells of 4 s that have some."""
+    """Compute the motion from ``time_gpst`` and ``chainage_m`` of single epochs, by means over cells of 4 s."""
     time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
     since = seconds(time - time[0])
     cell = (since // _CELL_S).astype(np.int64)
@@ -82,9 +81,9 @@ def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMoti
 def sign_notes(
     samples: SensorSamples, places: pl.DataFrame, trajectory: Trajectory, tachometer: TachometerLimits
 ) -> Iterator[str]:
-    """Yield a sentence on each sensor with a wrong sign, unit or axis, or with time tags off by seconds.
+    """Yield a sentence on each sensor with a wrong sign, unit or axis, or with time tags that are wrong by seconds.
 
-    `places`: positions with ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
+    `places` has ``time_gpst`` and ``chainage_m`` of the single-epoch positions of one antenna that passed every check.
     """
     wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
     yield from _forces_at_rest(inertial)
@@ -125,7 +124,11 @@ def sign_notes(
 def _of_speeds(
     name: str, time: Datetimes, forward: Floats, speeds: Callable[[Datetimes], Floats], directed: str | None
 ) -> Iterator[str]:
-    """Check the time tags of a sensor of speeds, and its sign; `directed` names the sensor with a sign."""
+    """Check the time tags and the sign of a speed sensor, and yield sentences on errors.
+
+    `forward` are the expected speeds at `time`, `speeds` returns the measured speeds. `directed` begins the clause on a
+    wrong sign; without it the sign is not checked.
+    """
     lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
     if lag:
         yield _late(name, lag, time[0])
@@ -137,7 +140,7 @@ def _of_speeds(
 
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
-    """Return the lag of the sensor's time tags behind the satellites' [s]; 0 if no lag of seconds is certain."""
+    """Return the lag of a sensor's time tags [s], positive for late tags; 0 if no lag of 2 s or more is certain."""
     x, found = _centre(expected), {}
     for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
         y = measured(time + timedelta(np.array([lag])))
@@ -164,7 +167,7 @@ def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
 
 
 def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
-    """Return the means of samples over two cells about instants; NaN outside the time of the samples."""
+    """Return the means of samples within one cell length before and after each instant; NaN outside the samples."""
     half = timedelta(np.array([_CELL_S]))
     begin, end = middle - half, middle + half
     first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
@@ -174,13 +177,13 @@ def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
 
 
 def _centre(values: Floats) -> Floats:
-    """Return values less their mean: an offset of the unit on the body has no effect on the comparison."""
+    """Return values less their mean, so that a bias or misalignment of the unit does not affect the comparison."""
     known = np.isfinite(values)
     return values - (values[known].mean() if known.any() else 0.0)
 
 
 def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
-    """Check that the mean force is gravity, upward: -9.8 m/s2 on the axis that points down."""
+    """Yield a sentence if the median specific force is not gravity, which is -9.8 m/s2 on the axis that points down."""
     if not np.isfinite(inertial.force_mps2).any(axis=0).all():
         return
     forward, right, down = np.nanmedian(inertial.force_mps2, axis=0).tolist()
@@ -197,7 +200,7 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
-    """Return the slope of measured over expected values; NaN where there are too few, or these are too small."""
+    """Return the slope of measured over expected values; NaN if there are too few values or they are too small."""
     known = np.isfinite(expected) & np.isfinite(measured)
     x, y = expected[known], measured[known]
     if len(x) < _LEAST_CELLS or np.sqrt(np.mean(x * x)) < least:
@@ -207,35 +210,35 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
 
 #: Interval of the compared wheel speeds [ns].
 _STEP_NS: Final = 500_000_000
-#: Largest time difference between an instant and a satellite speed [s].
+#: Largest time between a sample and the satellite speeds before and after it [s].
 _NEAR_S: Final = 1.5
-#: Smallest scale error, and smallest lag, that are reported.
+#: Smallest scale error and smallest lag [s] that are reported.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
-#: Largest scale error of a worn wheel.
+#: Scale error above which a wrong number of pulses per turn is suggested too, as wear does not explain it.
 _OTHER_TEETH: Final = 0.1
-#: Comparison of ranges with satellite positions: largest time between two positions [s], minimum distance run
-#: between them [m], largest distance of the unit [m], minimum cosine of its direction along the track, and number
-#: required on each side.
+#: Comparison of ranges with satellite positions: largest time between two positions [s], minimum distance between them
+#: [m], largest distance of the unit [m], minimum cosine of the angle between its direction and the track, and minimum
+#: number of ranges on each side.
 _BETWEEN_S: Final = 3.0
 _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0
 _AHEAD: Final = 0.7
 _LEAST_RANGES: Final = 10
-#: Difference between ranges and satellites that is reported: twice the error of codes over minutes [m].
+#: Smallest reported difference between ranges and satellite positions [m]: twice the code error over minutes.
 _RANGE_M: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorChecks:
-    """Positions and speeds of one antenna by satellites, for the comparison with the sensors on board."""
+    """Satellite positions and speeds of one antenna, collected for the checks of the on-board sensors."""
 
-    #: Doppler speeds (`doppler_speeds`), and single-epoch positions that passed every check; per chunk.
+    #: Doppler speeds (`doppler_speeds`) and single-epoch positions that passed every check, one frame per chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
     places: list[pl.DataFrame] = field(default_factory=list)
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
-        """Add the rows of a chunk; two positions per second are kept."""
+        """Add the rows of a chunk; at most two positions per second are kept."""
         passed = positions.filter(pl.col("status") == "ok").select("time_gpst", "chainage_m")
         self.places.append(passed.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True))
         self.speeds.append(doppler_speeds(train))
@@ -243,7 +246,10 @@ class SensorChecks:
     def notes(
         self, samples: SensorSamples, units: GroundUnits | None, trajectory: Trajectory, limits: SensorLimits
     ) -> tuple[str, ...]:
-        """Return a sentence on each sensor whose settings or tables contradict the satellites."""
+        """Return a sentence on each sensor whose settings or table contradicts the satellites.
+
+        If a sign, unit, axis or time tag is wrong, scale errors and ranges are not checked.
+        """
         if not self.speeds:
             return ()
         places = pl.concat(self.places)
@@ -256,7 +262,7 @@ class SensorChecks:
         return notes
 
     def radar_alarms(self, radar: RadarSpeeds) -> tuple[str, ...]:
-        """Return a sentence on each alarm of the radar while its table lasts (live: `railfix.live.console`)."""
+        """Return a sentence on each alarm of the radar (`RadarWatch`) in the time span of its table."""
         if not self.speeds or not len(radar):
             return ()
         speeds = pl.concat(self.speeds)
@@ -268,9 +274,10 @@ class SensorChecks:
 def range_notes(
     ranging: StationRanges, units: GroundUnits, places: pl.DataFrame, trajectory: Trajectory, limits: SensorLimits
 ) -> Iterator[str]:
-    """Yield sentences on ranges that are displaced along the track, or biased, compared with satellite positions.
+    """Yield sentences on ranges that contradict satellite positions by an offset along the track or a range bias.
 
-    `places` has ``time_gpst`` and ``chainage_m`` of an antenna, `limits` the position of the vehicle's ranging unit.
+    `places` has ``time_gpst`` and ``chainage_m`` of an antenna; `limits` has the position of the ranging unit on the
+    vehicle.
     """
     of_unit = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([of_unit.get(str(name), -1) for name in ranging.station], dtype=np.intp)
@@ -317,16 +324,15 @@ def range_notes(
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
-    """Return times and speeds of filtered positions (`railfix.pipeline.result_tables`) for which Dopplers were used."""
+    """Return ``time_gpst`` and ``speed_mps`` of the filtered positions for which Dopplers were used."""
     known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
     return known.select("time_gpst", "speed_mps")
 
 
 def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
-    """Return a sentence on each sensor whose speeds have a wrong unit, a delay, or a scale error.
+    """Return a sentence on each speed sensor with a wrong unit, a lag, or a scale error.
 
-    `speeds` are the satellite speeds of one antenna (`doppler_speeds`), `tachometer` the wheel as entered in the
-    settings.
+    `speeds` are the satellite speeds of one antenna (`doppler_speeds`), `tachometer` the settings of the wheel.
     """
     right_time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
     right = speeds["speed_mps"].to_numpy()
@@ -350,7 +356,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
 
 
 def _check(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
-    """Compare speeds with satellite speeds; None with too few in common."""
+    """Compare sensor speeds with satellite speeds (`right_mps`); None if too few have a common time."""
     if len(right_time) < 2 or not len(time):
         return None
     after = np.clip(np.searchsorted(right_time, time), 1, len(right_time) - 1)

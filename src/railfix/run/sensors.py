@@ -1,4 +1,4 @@
-"""Tables of the on-board sensors as samples, and their parts by time."""
+"""Reading of the samples of on-board sensors, of surveyed ground units, and of lists of balises."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.pipeline.config import Config
 from railfix.track import Track
 from railfix.track.track import section_spans
 
-#: Class of the samples of each sensor.
+#: Class of the samples by the name of the sensor.
 _CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}
 
 
@@ -30,9 +30,9 @@ def read_sensors(
     ranging: Path | None = None,
     balises: Path | None = None,
 ) -> SensorSamples:
-    """Read the tables of the sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
+    """Read the tables of on-board sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
 
-    InputFileError: a file is no such table, or its times are not in order.
+    InputFileError: a file is not a table of the sensor, or its times are not in order.
     """
     paths = {
         "tachometer": tachometer, "inertial": inertial, "radar": radar, "ranging": ranging, "balises": balises
@@ -47,7 +47,7 @@ def read_sensors(
 
 
 def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Samples:
-    """Return samples from all columns of a sensor table except the time; NaN where a number is absent."""
+    """Return the samples of a sensor from the times and the other columns of its table; absent numbers are NaN."""
     values = dict(columns)
     if sensor == "tachometer":
         values = {name: np.nan_to_num(column).astype(np.int64) for name, column in columns.items()}
@@ -60,10 +60,10 @@ def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any
 
 
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
-    """Read the ground units of ranges, given as a table or a stream; None without ranges.
+    """Read the surveyed ground units of two-way ranges; None without ranges.
 
-    InputFileError: no such table. MismatchError: the table lacks the unit of a range. SettingsError: one of the two is
-    given without the other.
+    `ranging` is the table of the ranges or their stream. InputFileError: `units` is not a table of ground units.
+    MismatchError: it lacks the unit of a range. SettingsError: only one of `units` and `ranging` is given.
     """
     if ranging is None and units is not None:
         raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
@@ -78,9 +78,9 @@ def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path
 
 
 def read_units(path: Path) -> GroundUnits:
-    """Read the surveyed positions of ground units: ``unit,x_m,y_m,z_m``, ECEF of the line's frame.
+    """Read a table ``unit,x_m,y_m,z_m`` with surveyed ECEF positions of ground units, in the frame of the line.
 
-    InputFileError: no such table, or a unit twice.
+    InputFileError: the file is not such a table, or has a unit twice.
     """
     table = read_sensor_table(path, "ranging_units")
     names = table["unit"]
@@ -90,12 +90,12 @@ def read_units(path: Path) -> GroundUnits:
 
 
 def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
-    """Read balises, or virtual balises, along a line: ``balise,chainage_m`` and, if known, ``track,sigma_m``.
+    """Read a table ``balise,chainage_m`` and, if known, ``track,sigma_m`` of balises, or of virtual balises.
 
-    With the name of a track, a chainage is measured from the beginning of that track; balises of tracks that are not
-    part of the line, or beyond its ends, are left out.
+    In a row with the name of a track, the chainage is measured from the beginning of that track. Balises on tracks that
+    are not part of the line, or beyond the ends of the line, are omitted.
 
-    InputFileError: no such table, a name twice, or none on the line.
+    InputFileError: the file is not such a table, has a name twice, or has no balise on the line.
     """
     table = read_sensor_table(path, "list of balises")
     names = get_column(table, "balise")
@@ -122,9 +122,7 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
 
 
 def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
-    """Return start and end chainages of a line's tracks by file, by file and name, or by name; None is the whole
-    line.
-    """
+    """Return start and end chainage [m] of each track by its source, name or file, and of the whole line by None."""
     spans: dict[str | None, tuple[float, float]] = {None: (0.0, float(track.chainage_m[-1]))}
     for source, (begin, end) in zip(track.sections, section_spans(track), strict=True):
         file, _, name = source.removesuffix(")").partition(" (")
@@ -135,11 +133,11 @@ def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
 def load_balises(
     readings: Path | str | None, places: Path | None, virtual: Path | None, track: Track, config: Config
 ) -> ListedBalises | None:
-    """Read the positions of the balises, whose readings are a table or a stream, and of virtual balises; None without
-    any.
+    """Read the lists of balises (`places`) and of virtual balises (`virtual`); None if neither is given.
 
-    InputFileError: see `read_listed_balises`. SettingsError: readings without a list, or a list without readings;
-    virtual balises without levels of the filter.
+    `readings` is the table or the stream of balise readings. InputFileError: see `read_listed_balises`. SettingsError:
+    readings are given without a list or a list without readings, or virtual balises without protection levels of the
+    filter.
     """
     if virtual is not None and (config.filter == "off" or config.tracking.level == "off"):
         raise SettingsError(
@@ -157,7 +155,7 @@ def load_balises(
 
 
 def check_filter(config: Config, options: Iterable[str]) -> None:
-    """Raise SettingsError if an option of the filter along the track is given while the filter is off."""
+    """Raise SettingsError if the filter along the track is off and `options`, which need it, is not empty."""
     for name in options:
         if config.filter == "off":
             raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")

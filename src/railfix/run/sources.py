@@ -1,4 +1,4 @@
-"""Inputs of a run: the line with its trajectories, navigation, and logs in chunks of equal time spans."""
+"""Inputs of a run: the line with the trajectories of the antennas, and logs in chunks of equal time spans."""
 
 from __future__ import annotations
 
@@ -38,31 +38,31 @@ if TYPE_CHECKING:
     from railfix.run.route import LogPositions, RouteOfLog
 
 
-#: Shortest track of a run [m].
+#: Minimum length of the track of a run [m].
 _SHORTEST_M: Final = 1.0
-#: File name, in the results folder, of a run's track that differs from its files.
+#: Name of the file in the results folder with the track of a run, if the track differs from the input files.
 TRACK_FILE: Final = "track.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenedLine:
-    """The line and the path of each antenna on it."""
+    """Line of a run with the trajectory of each antenna."""
 
     track: Track
     vehicle: Vehicle | None
-    trajectories: dict[str, Trajectory]
+    trajectories: dict[str, Trajectory]  #: Trajectory by antenna.
     #: Transformation of the track to the frame of the satellites; None if no time was given.
     frame: FrameShift | None = None
-    #: The route through a network of tracks that was found from the log; None where the files are one route.
+    #: Route through a network of tracks that was found from the log; None if the files are a single route.
     route: RouteOfLog | None = None
-    #: Whether the track is unchanged from its files: not a route of a network, without heights from another source, and
+    #: Whether the track equals its files: it is not a route of a network, has no heights from another source, and was
     #: not transformed to another frame.
     from_file: bool = True
     preparing: tuple[str, ...] = ()  #: Notes on the cache of prepared lines.
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the map, the vehicle and the trajectories, each once."""
+        """Notes on the map, the vehicle and the trajectories, without repetitions."""
         notes = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
         notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ()), *self.preparing]
         if turns := [turn for turn in self.turns_m.values() if np.isfinite(turn)]:
@@ -73,7 +73,7 @@ class OpenedLine:
 
     @property
     def turns_m(self) -> dict[str, float]:
-        """Length of a closed line by the chainage of each antenna [m]; infinite for others."""
+        """Length of a closed line in the chainage of each antenna [m]; infinite if the line is not closed."""
         turns = {}
         for name, path in self.trajectories.items():
             before, after = path.chainage_at(np.array(path.joins_m))
@@ -83,7 +83,7 @@ class OpenedLine:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Plain values of the line for JSON."""
         track, provenance = self.track, self.track.provenance
         return {
             "track": {
@@ -117,11 +117,12 @@ def open_line(
     at: np.datetime64 | None = None,
     log: LogPositions | None = None,
 ) -> OpenedLine:
-    """Read the track and the vehicle, and compute the path of each antenna.
+    """Read the track and the vehicle, and compute the trajectory of each antenna.
 
-    With a time `at` the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
-    without it the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a
-    network: `log` gives the route through it, and the heights of a map without heights where `heights` is `OF_LOG`.
+    With a time `at`, the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
+    otherwise the coordinates remain in the frame of the map. A single file whose tracks do not join to one route is a
+    network, in which the route is found from `log`. If `heights` is `OF_LOG`, the positions of `log` are the heights of
+    a map without heights. RailfixError: see `railfix.core.errors`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -147,7 +148,7 @@ def open_line(
 
 
 def _check_extent(files: tuple[Path, ...], track: Track) -> None:
-    """Raise MismatchError where the heights of a track are impossible, or it is no line."""
+    """Raise MismatchError if the track is shorter than `_SHORTEST_M`, or has impossible heights."""
     if (length := float(track.chainage_m[-1] - track.chainage_m[0])) < _SHORTEST_M:
         raise MismatchError(f"{', '.join(map(str, files))}: is {length:g} m long; give the track of a line")
     low, high = float(np.nanmin(track.height_m)), float(np.nanmax(track.height_m))
@@ -161,7 +162,7 @@ def _check_extent(files: tuple[Path, ...], track: Track) -> None:
 def _read_line(
     track: tuple[Path, ...], reading: TrackReading, *, heights: Path | None, log: LogPositions | None
 ) -> tuple[Track, RouteOfLog | None]:
-    """Read the track, and find the route in a network."""
+    """Read the track, and find the route if the file is a network; the route is None otherwise."""
     if not track:
         raise SettingsError("no track map was given")
     segments = [segment for path in track for segment in read_segments(path, reading.of_map)]
@@ -196,7 +197,7 @@ def _read_line(
 def _paths(
     track: Track, vehicle: Path | None, antennas: tuple[Antenna, ...], reading: TrackReading, prepared: PreparedLines
 ) -> tuple[Vehicle | None, dict[str, Trajectory]]:
-    """Return the vehicle, and the path of each antenna."""
+    """Return the vehicle and the trajectory of each antenna; without a vehicle, the track is the trajectory."""
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
@@ -218,20 +219,20 @@ def _paths(
 
 @dataclass(kw_only=True)
 class Log:
-    """Files of one antenna's log, read piece by piece."""
+    """Log of one antenna in one or several files, read piece by piece."""
 
     paths: tuple[Path, ...]
-    chunk_epochs: int
+    chunk_epochs: int  #: Maximum number of epochs of a piece.
     reading: LogReading = field(default_factory=LogReading)
-    #: Time from which epochs are read, and time before which the last epoch lies; None without a limit.
+    #: Time of the first epoch that is read, and time before which epochs are read, GPS time; None without a limit.
     start: datetime | None = None
     end: datetime | None = None
     share: float = 0.0  #: Fraction of the files that has been read, 0 to 1.
     problems: list[str] = field(default_factory=list)  #: Sentences on broken and skipped parts.
-    skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
+    skipped: Counter[str] = field(default_factory=Counter)  #: Numbers of skipped items by kind.
 
     def parts(self) -> Generator[Observations]:
-        """Yield the pieces of the log in order of time; errors as of `railfix.io.rinex.scan_observations`."""
+        """Yield the pieces of the log in order of time; raises the errors of `railfix.io.logs.scan_observations`."""
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,
@@ -247,7 +248,7 @@ class Log:
                 yield piece
 
     def first_epochs(self) -> Iterator[tuple[Path, np.datetime64]]:
-        """Yield each of several files with its first epoch within the times of the log; nothing for one file."""
+        """Yield the path and the first epoch of each file, within `start` and `end`; nothing if there is only one."""
         for path in self.paths if len(self.paths) > 1 else ():
             alone = replace(self, paths=(path,), problems=[], skipped=Counter(), chunk_epochs=1)
             with suppress(MismatchError), closing(alone.parts()) as parts:
@@ -258,16 +259,16 @@ class Log:
 
 
 Item = TypeVar("Item")
-#: Largest time-tag difference of two receivers at one instant [ns].
+#: Largest difference of the time tags of two receivers for the same instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
 
 
 def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
-    """Yield chunks of observations that cover the same span of time for every antenna so far.
+    """Yield chunks of observations that cover the same time span for every antenna.
 
-    Each antenna keeps its own epochs, possibly none in the span. A chunk ends where the first of the current
-    parts ends; later epochs of the other parts wait for the next chunk. Epochs that belong together but are tagged a
-    little apart (`SAME_INSTANT_NS`) stay in one chunk.
+    Each antenna has its own epochs, and may have none in a span. A chunk ends at the earliest end of the current parts;
+    later epochs of the other parts are in the next chunk. Epochs of the same instant whose time tags differ slightly
+    (`SAME_INSTANT_NS`) are in the same chunk.
     """
     live = dict(logs)
     waiting: dict[str, Observations] = {}
@@ -295,7 +296,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
             horizon = min(waiting[name].time[-1] for name in live) + np.timedelta64(slack, "ns")
             cut = {name: int(np.searchsorted(part.time, horizon, side="right")) for name, part in waiting.items()}
         yield {name: part[: cut[name]] for name, part in waiting.items()}
-        # A short remainder would split every following chunk: it is joined with the next part.
+        # A short remainder would split every following chunk, and is therefore joined with the next part.
         short = [n for n in live if 0 < len(waiting[n]) - cut[n] < len(waiting[n]) // 2]
         waiting = {name: part[cut[name] :] for name, part in waiting.items()}
         for name in short:
@@ -303,7 +304,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
 
 
 def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """Yield items while a separate thread makes the next one."""
+    """Yield the items of an iterator, whose next item is computed in a separate thread; the items must not be None."""
     with ThreadPoolExecutor(max_workers=1) as reader:
         coming = reader.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -312,7 +313,10 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
 
 
 def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
-    """Return results whose statuses and levels account for other tracks more probable than `Config.track_risk`."""
+    """Return results with doubtful statuses and infinite protection levels where the track is uncertain.
+
+    The track is uncertain if other tracks are more probable than `Config.track_risk` (`RouteOfLog.is_uncertain`).
+    """
     antennas, fusion = dict(result.antennas), dict(result.fusion)
     for name, single in antennas.items():
         beside = route.is_uncertain(single.time, single.chainage_m, risk=config.track_risk)

@@ -1,4 +1,4 @@
-"""Codes and carrier phases of an antenna at rest, less the codes and phases of a base station if one is given."""
+"""Pseudoranges (codes) and carrier phases of an antenna at rest, differenced with those of a base station if given."""
 
 from __future__ import annotations
 
@@ -22,37 +22,40 @@ from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.track_choice import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: Minimum fraction of the epochs in which a satellite has a residual, so that all means are over the same satellites.
+#: Minimum fraction of the epochs in which a satellite must have a residual, so that the means of all satellites cover
+#: nearly the same epochs.
 _SHARE: Final = 0.9
-#: Residual standard deviation of satellite and atmospheric errors with a base station [m]; it is at most 10 km away.
+#: Standard deviation of satellite and atmospheric errors that remain with a base station at most 10 km away [m].
 _BESIDE_BASE_M: Final = 0.05
-#: Largest difference of the median positions of the thirds of the log [m].
+#: Largest horizontal distance between the median positions of the thirds of the log of an antenna at rest [m].
 _AT_REST_M: Final = 8.0
-#: Change of a double difference between epochs that indicates a slip [wavelengths].
+#: Change of a double difference between epochs that indicates a cycle slip [wavelengths].
 _SLIP: Final = 0.25
-#: Fraction of the epochs over which a double difference must be unbroken.
+#: Minimum fraction of the epochs that the longest part of a double difference without a slip must have.
 _UNBROKEN: Final = 0.5
-#: Bits of the loss-of-lock indicator: a slip since the previous epoch, and an unknown half cycle.
+#: Bits of the loss-of-lock indicator (RINEX): a slip since the previous epoch, and half-cycle ambiguity.
 _LOST, _HALF_CYCLE = 1, 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillCodes:
-    """Codes of one antenna at rest, less the codes computed for an origin: T epochs, K satellites."""
+    """Code residuals of one antenna at rest with respect to an origin: T epochs, K satellites."""
 
     time: Datetimes  #: Shape (T,).
-    residual_m: Floats  #: Codes without the receiver clock of each constellation, shape (T, K).
-    system: Strings  #: Shape (K,).
-    #: `common_m`: standard deviation of satellite and atmosphere errors; shape (K,).
+    #: Measured minus computed codes, less their mean over the satellites of each clock group, shape (T, K); NaN where
+    #: a satellite was not used.
+    residual_m: Floats
+    system: Strings  #: Clock group of each satellite, shape (K,).
+    #: Mean directions of the satellites, and standard deviation of satellite and atmospheric errors; shape (K,).
     azimuth_deg: Floats
     elevation_deg: Floats
     common_m: Floats
-    receivers: int  #: Variance factor, 2 where a base station's codes are subtracted.
+    receivers: int  #: Factor of the variance of receiver errors: 2 if a base station's codes are subtracted, else 1.
     origin_ecef_m: Floats  #: Shape (3,).
     phases: StandstillPhases | None = None  #: Carrier phases; None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
-        """Return the mean position over some epochs."""
+        """Return the mean position over some epochs; None if the satellites do not determine it."""
         seconds = float((self.time[epochs][-1] - self.time[epochs][0]) / np.timedelta64(1, "s"))
         return standstill_fix(
             self.azimuth_deg,
@@ -74,12 +77,12 @@ def standstill_codes(
     base: tuple[Observations, Floats] | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
-    """Return codes, and with a base station phases, of an antenna at rest about an origin, by default its mean
-    position.
+    """Return code residuals, and with a base station also phases, of an antenna at rest with respect to an origin.
 
-    `base` are the observations of a base station and its position, ECEF, shape (3,) [m].
-    NoPositionError: the log has no position. MismatchError: the antenna moves, or the log shares no epoch or satellite
-    with the base station.
+    The default origin is the median position of the antenna. `base` has the observations of a base station and its
+    position, ECEF, shape (3,) [m]. NoPositionError: the log has fewer than two positions. MismatchError: the antenna
+    moves, no satellite is observed over the whole log, or the log has no epoch or signal in common with the base
+    station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = ranges_without_map(obs, received, config, book)
@@ -87,7 +90,7 @@ def standstill_codes(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
         raise NoPositionError("the log has no position; are the navigation files from the day of the log?")
-    # thirds of the log, as a train that returns is at its first position in the end
+    # three parts, because a train that returns has the same position at the beginning and the end of the log
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
     moved = float(np.linalg.norm(level, axis=1).max())
@@ -132,14 +135,14 @@ def standstill_codes(
 
 
 def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
-    """Return observed minus computed codes at a position with the Earth's rotation during transit; NaN if not used."""
+    """Return measured minus computed codes at a position [m]; NaN where a code is not used."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)
 
 
 def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Indices]:
-    """Return the epochs of two logs with the same time tags, to a tenth of a second."""
+    """Return the indices of the epochs of two logs with the same time tags, rounded to 0.1 s; MismatchError if none."""
     step = np.timedelta64(100, "ms")
     stamps = [np.round((t - obs.time[0]) / step).astype(np.int64) for t in (obs.time, other.time)]
     _, mine, its = np.intersect1d(*stamps, return_indices=True)
@@ -149,7 +152,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
 
 
 def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[Indices, Indices]:
-    """Return the channels of two receivers with the same satellites and signals."""
+    """Return the indices of the channels that two receivers have in common; MismatchError if there are none."""
     names = [s.corrected.channels.names.tolist() for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
     if not shared:
@@ -160,19 +163,23 @@ def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[I
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillPhases:
-    """Carrier phases of an antenna at rest less a base station's, T epochs, M satellites."""
+    """Single differences of carrier phases between an antenna at rest and a base station: T epochs, M satellites."""
 
-    #: Phases less the phases computed for the origin; NaN where one of the receivers has none; shape (T, M).
+    #: Measured minus computed single differences, shape (T, M); NaN if a receiver has no usable phase.
     difference_m: Floats
-    lost: Masks  #: Whether one of them reports a slip since the previous epoch, shape (T, M).
-    toward: Floats  #: Unit vectors to the satellites, east, north, up; shape (T, M, 3).
+    lost: Masks  #: Whether one of the receivers reports a cycle slip since the previous epoch, shape (T, M).
+    toward: Floats  #: Unit vectors to the satellites: east, north, up; shape (T, M, 3).
     elevation_deg: Floats  #: Shape (T, M).
     wavelength_m: Floats  #: Shape (M,).
-    group: Strings  #: Satellites on one clock and signal, shape (M,).
-    distance_m: float  #: Distance from the base station.
+    group: Strings  #: Clock group and signal; double differences are formed within one group; shape (M,).
+    distance_m: float  #: Distance of the antenna from the base station [m].
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
-        """Return the mean double differences over some epochs, of each satellite over its longest unbroken part."""
+        """Return the mean double differences over some epochs, each over its longest part without a cycle slip.
+
+        The reference satellite of a group is the one with the highest elevation. Satellites whose longest part is
+        shorter than `_UNBROKEN` of the epochs are omitted.
+        """
         difference, lost, toward = self.difference_m[epochs], self.lost[epochs], self.toward[epochs]
         least = _UNBROKEN * len(difference)
         elevation = np.where(np.isfinite(difference), self.elevation_deg[epochs], 0.0).sum(axis=0)
@@ -205,7 +212,7 @@ class StandstillPhases:
 
 
 def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
-    """Return the longest run of epochs with values and without a slip."""
+    """Return the longest run of epochs with values and without a slip; an empty slice if there are no values."""
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return slice(0, 0)
@@ -215,18 +222,18 @@ def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
     return slice(int(known[bounds[longest]]), int(known[bounds[longest + 1] - 1]) + 1)
 
 
-#: Log, corrected ranges, position, and the epochs and channels to use.
+#: One receiver: log, corrected ranges, ECEF position, and indices of the epochs and channels to use.
 _Side = tuple[Observations, RangesWithoutMap, Floats, Indices, Indices]
 
 
 def _phases(train: _Side, base: _Side) -> StandstillPhases:
-    """Return the single differences of the phases; GLONASS, whose wavelengths differ, is left out."""
+    """Return the single differences of the phases without GLONASS, whose wavelengths differ between satellites."""
     sides, lost = [], []
     for obs, seen, place, epochs, columns in (train, base):
         channel = seen.corrected.channels.columns[columns]
         wavelength = SPEED_OF_LIGHT / seen.corrected.channels.frequency_hz[columns]
         rows = np.ix_(epochs, columns)
-        # orbit, clock and troposphere as for the codes; the ionosphere, of opposite sign, is equal at both ends
+        # corrections as for the codes; the ionospheric delay, of opposite sign for phases, cancels in the difference
         corrections = seen.ranges.code_m[rows] - obs.code_m[np.ix_(epochs, channel)]
         lock = obs.loss_of_lock[np.ix_(epochs, channel)]
         phase = obs.phase_cycles[np.ix_(epochs, channel)] * wavelength + corrections

@@ -1,4 +1,4 @@
-"""Counts over a run, and the tables of each chunk."""
+"""Counts of the epochs and observations of a run, and writing of the tables of each chunk."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
-#: Causes for which the map may still be wrong.
+#: Suspicions of interference with which a map offset is still attributed to the map.
 _MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetFound:
-    """Mean offset of the 3-D positions from the line at the end of one window [m]."""
+    """Mean offset of the 3-D positions in a window from the line."""
 
-    time: np.datetime64
-    across_m: float
-    up_m: float
-    across_sigma_m: float
+    time: np.datetime64  #: End of the window.
+    across_m: float  #: Offset to the right of the line [m].
+    up_m: float  #: Offset above the line [m].
+    across_sigma_m: float  #: Standard deviations of the offsets [m].
     up_sigma_m: float
-    statistic: float
+    statistic: float  #: Test statistic of the offset (`railfix.integrity`).
 
     @property
     def text(self) -> str:
-        """Offset with its likely cause, one clause."""
+        """Clause on the offset with its likely causes."""
         across, up = abs(self.across_m) / self.across_sigma_m, abs(self.up_m) / self.up_sigma_m
         causes = "heights without the geoid, or in another height system" if up > across else "a parallel track"
         side, above = "right" if self.across_m > 0 else "left", "above" if self.up_m > 0 else "below"
@@ -77,23 +77,23 @@ class AntennaTally:
     """Counts of one antenna."""
 
     min_satellites: int = 3  #: Minimum number of satellites per epoch.
-    judged: dict[str, bool] = field(default_factory=dict)  #: Whether each screen verdict has checked anything.
-    #: Epochs; those with at least one pseudorange; those with coordinates.
+    judged: dict[str, bool] = field(default_factory=dict)  #: Whether each screen has tested any observation.
+    #: Numbers of epochs, of epochs with at least one pseudorange, and of epochs with coordinates.
     epochs: int = 0
     observed: int = 0
     positioned: int = 0
-    #: Pseudoranges, and those that were used.
+    #: Numbers of pseudoranges, and of used pseudoranges.
     observations: int = 0
     used: int = 0
 
-    status: Counter[str] = field(default_factory=Counter)
-    status_positioned: Counter[str] = field(default_factory=Counter)  #: Values at the epochs with coordinates.
-    #: Epochs with too few satellites: by the first reason that left too few, and by a single reason without which there
-    #: would be enough. `not_observed` means that too few were observed; `used` that enough were used, but their clocks
-    #: left no range for the position.
+    status: Counter[str] = field(default_factory=Counter)  #: Epochs by status.
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Epochs with coordinates by status.
+    #: Epochs with too few satellites by the first reason, in the order of the bits, after which too few satellites
+    #: remain, and by a single reason without which enough satellites would remain. `not_observed` means that too few
+    #: satellites were observed, `used` that enough remained, but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
     short_only: Counter[str] = field(default_factory=Counter)
-    #: Rejected observations by their first reason, and observations rejected by one reason alone.
+    #: Rejected observations by their first reason, and observations with one reason only by that reason.
     first_reason: Counter[str] = field(default_factory=Counter)
     only_reason: Counter[str] = field(default_factory=Counter)
     satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
@@ -103,29 +103,30 @@ class AntennaTally:
     first: np.datetime64 | None = None
     last: np.datetime64 | None = None
     conventional: int = 0  #: Epochs with a valid conventional position.
-    #: Smallest distance of a conventional position from the trajectory; NaN without one.
+    #: Smallest distance of a conventional position from the trajectory [m]; NaN without a conventional position.
     conventional_nearest_m: float = float("nan")
-    #: Epochs by status of the protection level; empty where levels are off.
+    #: Epochs by status of the protection level; empty if protection levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
-    #: Epochs without a level because faults of more satellites than can be left out are more probable than the risk
-    #: allows, or because too many satellites are excluded.
+    #: Epochs without a protection level because simultaneous faults of more satellites than can be left out exceed the
+    #: risk, or because too many satellites are excluded.
     without_budget: int = 0
-    #: Largest contradiction of 3-D positions and map; None before there were enough positions.
+    #: Map offset with the largest test statistic; None before there were enough positions.
     map_offset: MapOffsetFound | None = None
-    #: Number of epochs at which the filter, and single epochs, left out a satellite's codes as persistently wrong, and
-    #: the first of these epochs.
+    #: By satellite, the number of epochs at which its codes were excluded as persistently wrong, and the first of these
+    #: epochs: `left_out` by the filter, `lasting` by single epochs.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: Number of epochs with each sign of interference, and the first of these epochs.
+    #: By sign of interference, the number of epochs with this sign, and the first of these epochs.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: Smallest and largest time-tag error where that is the cause, positive for late tags; NaN without any [s].
+    #: Smallest and largest time-tag error at epochs with suspected time tags [s], positive for late tags; NaN without
+    #: such epochs.
     tag_error_s: tuple[float, float] = (float("nan"), float("nan"))
-    #: Smallest and largest offset, across (first column) and up, that a window detects; NaN without any window; shape
-    #: (2, 2).
+    #: Smallest (row 0) and largest (row 1) over all windows of the map offset that a window can detect, across (column
+    #: 0) and up (column 1); shape (2, 2) [m]; NaN without a window.
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
-        """Add the counts of a chunk."""
+        """Add the counts of a chunk of results."""
         if not len(result.time):
             return
         self.first = result.time[0] if self.first is None else self.first
@@ -156,7 +157,10 @@ class AntennaTally:
             self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
 
     def add_conventional(self, result: AntennaResult) -> None:
-        """Count the valid conventional positions; inconsistent ranges give arbitrary positions."""
+        """Count the valid conventional positions, and update their smallest distance from the trajectory.
+
+        Other conventional positions are ignored, because inconsistent ranges give arbitrary positions.
+        """
         offset = result.conventional_offset_m[result.conventional_status == PointStatus.VALID]
         self.conventional += len(offset)
         if len(offset):
@@ -170,7 +174,7 @@ class AntennaTally:
             self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
-        """Keep the window with the largest contradiction of the map, unless `suspicion` explains it."""
+        """Keep the window with the largest test statistic of the map offset that interference does not explain."""
         offset, interference = result.map_offset, result.interference
         if not np.isfinite(offset.statistic).any():
             return
@@ -206,14 +210,14 @@ class AntennaTally:
                 counter[str(result.satellite[channel])] += int(of_channel[channel])
 
     def _add_short(self, result: AntennaResult) -> None:
-        """Count the reasons for too few satellites at epochs."""
+        """Count the reasons for too few satellites (`short_first`, `short_only`)."""
         short = np.flatnonzero(result.status == Status.TOO_FEW_SATELLITES)
         if not len(short):
             return
         names, which = np.unique(result.satellite, return_inverse=True)
         member = (which[:, None] == np.arange(len(names))).astype(np.int64)
         reason = result.reason[short]
-        # Signals that were not checked cannot replace it.
+        # An unselected signal of a satellite was not checked, and therefore does not count as usable.
         looked_at = (reason & Reason.OTHER_SIGNAL_TAKEN) == 0
 
         def enough(without: int) -> Masks:
@@ -233,11 +237,11 @@ class AntennaTally:
 
     @property
     def never_recorded(self) -> dict[str, int]:
-        """Observed satellites without a usable record, with their observations."""
+        """Numbers of observations of the satellites that never had a valid navigation record, by satellite."""
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the plain values for JSON."""
+        """Return the counts as plain values for JSON."""
         return {
             "epochs": self.epochs,
             "epochs_with_observations": self.observed,
@@ -270,12 +274,12 @@ class Tally:
     min_satellites: int = 3  #: Minimum number of satellites per epoch.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)  #: Notes as keys, in the order of arrival.
-    #: First epoch of each chunk, its epochs of all antennas, and the time since the previous chunk [s].
+    #: For each chunk, its first epoch, its number of epochs of all antennas, and the elapsed time of positioning [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
-    order: AntennaOrder | None = None  #: Test of the order of two antennas.
+    order: AntennaOrder | None = None  #: Test whether front and rear antenna are exchanged; None with one antenna.
 
     def add(self, result: Result) -> None:
-        """Add the counts of a chunk."""
+        """Add the counts of a chunk of results."""
         for name, antenna in result.antennas.items():
             tally = self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites))
             tally.add(antenna)
@@ -289,31 +293,34 @@ class Tally:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """Notes of the chunks, and of their comparison."""
+        """Notes of all chunks, and the note on the order of the antennas if there is one."""
         order = None if self.order is None else self.order.note
         return tuple(self.notes) if order is None else (*self.notes, order)
 
     def took(self, times: Iterable[Datetimes], spent_s: float) -> None:
-        """Record the positioning time of a chunk [s], with its time tags by antenna."""
+        """Record the elapsed time of positioning a chunk [s]; `times` has the time tags of each antenna."""
         some = [part for part in times if len(part)]
         if some:
             self.chunks.append((min(part[0] for part in some), sum(map(len, some)), spent_s))
 
     @property
     def epochs(self) -> int:
-        """Epochs of all antennas."""
+        """Number of epochs of all antennas."""
         return sum(a.epochs for a in self.antennas.values())
 
     @property
     def positioned(self) -> int:
-        """Epochs with a position, of all antennas."""
+        """Number of epochs with coordinates of all antennas."""
         return sum(a.positioned for a in self.antennas.values())
 
 
 def _count_left_out(
     counts: dict[str, tuple[int, np.datetime64]], left_out: Masks, satellite: Strings, time: Datetimes
 ) -> None:
-    """Count the epochs of a chunk at which satellites were left out, shape (T, K), and keep the first of each."""
+    """Add to `counts` the number of epochs with a set flag in `left_out`, shape (T, K), by the name of the column.
+
+    The first such epoch of each name is kept.
+    """
     for k in np.flatnonzero(left_out.any(axis=0)).tolist():
         name, first = str(satellite[k]), time[int(np.argmax(left_out[:, k]))]
         before = counts.get(name, (0, first))
@@ -322,19 +329,19 @@ def _count_left_out(
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRows:
-    """Output of each chunk of results."""
+    """Writer of the tables of a run, chunk by chunk."""
 
     folder: OutputFolder
     line: OpenedLine
-    observations: bool  #: Whether rows of observations are requested.
-    checks: SensorChecks | None  #: Collects the rows of the first antenna if there are sensors.
-    replays: Mapping[str, Replays]  #: Keeps the filter's input by antenna; empty without smoothing.
-    passings: bool = False  #: Whether rows of balises and virtual balises are requested.
-    #: Balises so far that were missed, or read at a wrong position.
+    observations: bool  #: Whether the table of observations is written.
+    checks: SensorChecks | None  #: Collects the positions of the first antenna; None without sensors.
+    replays: Mapping[str, Replays]  #: Stores the input of the filter by antenna; empty without smoothing.
+    passings: bool = False  #: Whether the table of passings of balises and virtual balises is written.
+    #: Notes on balises that were missed, or read at a wrong position.
     balise_notes: list[str] = field(default_factory=list)
 
     def write(self, result: Result) -> None:
-        """Write the rows of a chunk, with their tracks on a route of a network."""
+        """Append the rows of a chunk to the tables; on a route of a network, the rows include the tracks."""
         tables = {"positions": positions_table(result)}
         if result.fusion:
             tables["train"] = train_table(result)
@@ -360,18 +367,18 @@ class ResultRows:
                 self.folder.append_csv(f"{name}.csv", round_floats(table))
 
 
-#: Largest number of notes on balises in a run.
+#: Maximum number of notes on balises in a run.
 _MOST_NOTES: Final = 20
 
 
 def shorten_notes(notes: list[str]) -> list[str]:
-    """Return the first notes and a sentence with the number of further ones."""
+    """Return at most `_MOST_NOTES` notes, followed by a sentence with the number of omitted notes if there are any."""
     more = len(notes) - _MOST_NOTES
     return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
 
 
 class Replays:
-    """Filter input, chunk by chunk, in a file that is deleted with the process."""
+    """Input of the filter for smoothing, stored in a temporary file that is deleted at the latest with the process."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run
@@ -381,19 +388,19 @@ class Replays:
         self._file.close()
 
     def keep(self, chunk: tuple[Replay, ...]) -> None:
-        """Add a chunk."""
+        """Store the input of a chunk."""
         self._starts.append(self._file.tell())
         pickle.dump(chunk, self._file, protocol=pickle.HIGHEST_PROTOCOL)
 
     def backward(self) -> Iterator[Replay]:
-        """Yield the stored input, last chunk first."""
+        """Yield the stored input in reverse order of time."""
         for start in reversed(self._starts):
             self._file.seek(start)
             yield from reversed(pickle.load(self._file))
 
 
 def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, folder: OutputFolder) -> None:
-    """Write `train.*` again with the columns of the smoother, after the last chunk."""
+    """Smooth the stored filter input of each antenna, and write `train.*` again with the columns of the smoother."""
     smoothed = {}
     for name, kept in replays.items():
         trajectory = processor.trajectories[name]

@@ -1,6 +1,6 @@
-"""Verdict of a run: the figures that the terminal, the report, JSON and Python show under the same names.
+"""Verdict on a run: the figures that the terminal, the report, JSON and Python show under the same names.
 
-`judge_run` takes them from the record of the run (``run.json``), so that each figure has one source.
+`judge_run` reads all figures from the record of the run (``run.json``), so that they agree everywhere.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from railfix.core.reasons import Status
 from railfix.core.tables import count, number
 from railfix.run.record import level_basis
 
-#: Names of the figures, the same on the terminal, on the cards of the report and in JSON.
+#: Names of the figures on the terminal, in the report and in JSON.
 POSITIONS: Final = "epochs with a position"
 PASSED: Final = "epochs that passed every check"
 SIGMA: Final = "sigma along the line, median"
@@ -24,13 +24,13 @@ _PROMISED: Final = ("tracking", "coasting")
 
 @dataclass(frozen=True, kw_only=True)
 class PositionFigures:
-    """Figures of one kind of positions of an antenna; None where none exist."""
+    """Figures of the filtered or single-epoch positions of an antenna; None if a figure does not exist."""
 
-    epochs: int  #: Number of epochs: all for the filter along the track, epochs with observations for single epochs.
+    epochs: int  #: Number of all epochs for the filter along the track, of epochs with observations for single epochs.
     positions: int  #: Number of epochs with a position.
-    passed: int  #: Epochs of status `ok`, or `tracking` and `coasting` for the filter.
+    passed: int  #: Number of epochs with status `ok`, or, for the filter, `tracking` or `coasting`.
     statuses: Mapping[str, int]  #: Number of epochs of each occurring status, the most frequent first.
-    chainage_first_m: float | None  #: Least and largest chainage [m].
+    chainage_first_m: float | None  #: Smallest and largest chainage [m].
     chainage_last_m: float | None
     sigma_p50_m: float | None  #: Median, 95th percentile and largest standard deviation along the line [m].
     sigma_p95_m: float | None
@@ -41,26 +41,26 @@ class PositionFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaVerdict:
-    """Verdict on one antenna: filter along the track, if on, and single epochs."""
+    """Verdict on one antenna."""
 
     antenna: str
-    level_name: str  #: "protection level", or "indicative protection level" where the priors of faults are assumed.
-    filter: PositionFigures | None
+    level_name: str  #: "protection level", or "indicative protection level" if the fault priors are assumed.
+    filter: PositionFigures | None  #: Figures of the filter along the track; None if it was off.
     single_epochs: PositionFigures
 
     @property
     def leading(self) -> PositionFigures:
-        """Return the leading figures: those of the filter, or of single epochs without it."""
+        """Figures of the filter, or of single epochs if the filter was off."""
         return self.filter or self.single_epochs
 
     @property
     def is_usable(self) -> bool:
-        """Return whether any position lies on the map."""
+        """Whether any position lies on the map."""
         off_map = 0 if self.filter is not None else self.leading.statuses.get(Status.OFF_MAP.text, 0)
         return self.leading.positions > off_map
 
     def figures(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the name of each figure, its leading value, and the single-epoch value if the filter leads."""
+        """Yield name, value of `leading`, and single-epoch value of each figure; the latter is "" without a filter."""
         texts: dict[str, Callable[[PositionFigures], str]] = {
             POSITIONS: lambda of: f"{count(of.positions)} of {count(of.epochs)}",
             PASSED: lambda of: f"{count(of.passed)} of {count(of.epochs)}",
@@ -76,15 +76,15 @@ class Verdict:
     """Verdict on a run."""
 
     antennas: tuple[AntennaVerdict, ...]
-    causes: tuple[str, ...]  #: Likely causes where positions are off the line.
+    causes: tuple[str, ...]  #: Likely causes of positions off the line.
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the plain values for JSON."""
+        """Return the verdict as plain values for JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return the verdict in sentences: one for each antenna, one on the checks of all, and the likely cause."""
+        """Return sentences: one per antenna, one on the checks, one on the filter, and one on the likely cause."""
         lines = [_describe(antenna) for antenna in self.antennas]
         lines.append(_describe_checks([antenna.single_epochs for antenna in self.antennas]))
         filtered = [antenna.filter for antenna in self.antennas if antenna.filter is not None]
@@ -94,7 +94,7 @@ class Verdict:
 
 
 def judge_run(record: Mapping[str, Any]) -> Verdict:
-    """Return the verdict on a run from its record; figures missing in a record of an earlier version are None."""
+    """Return the verdict on a run from its record; figures that a record of an earlier version lacks are None."""
     level_name = f"{level_basis(record)} level"
     antennas = []
     for name, facts in (record.get("antennas") or {}).items():
@@ -114,7 +114,7 @@ def judge_run(record: Mapping[str, Any]) -> Verdict:
 
 
 def _figures(facts: Mapping[str, Any], promised: Sequence[str]) -> PositionFigures:
-    """Return the figures in the facts of an antenna or its filter."""
+    """Return the figures of an antenna or its filter; `promised` are the statuses of positions that passed."""
     statuses = Counter({word: epochs for word, epochs in facts["status"].items() if epochs})
     chainage, sigma, level = (facts.get(name) or {} for name in ("chainage_m", "along_sigma_m", "level"))
     return PositionFigures(
@@ -146,7 +146,7 @@ def _describe(antenna: AntennaVerdict) -> str:
 
 
 def _describe_checks(figures: Sequence[PositionFigures]) -> str:
-    """Return how many single epochs passed every check, and the most frequent status of the other epochs."""
+    """Return a sentence on the number of single epochs that passed every check, and on the most frequent failure."""
     passed, epochs = sum(of.passed for of in figures), sum(of.epochs for of in figures)
     failed = _count_statuses(figures)
     del failed[Status.OK.text]

@@ -1,7 +1,7 @@
 """Probability of each track of a network from logs of a train at rest.
 
-A train that was on a known track when it was switched off, and has not moved since, is still there: a
-cold-movement detector or the odometer shows how far it has moved, and misses a move with a probability.
+A train that was switched off on a known track and has not moved since is still on that track. A cold-movement detector
+or the odometer measures the distance moved; it misses a movement with a given probability.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 
-#: Distance up to which a moved train is on the same track [m]: creep of wheels, slack of couplings.
+#: Largest distance moved for which the train is still on the same track [m], due to wheel creep and coupler slack.
 _SAME_PLACE_M: Final = 1.0
-#: Error of the distance moved: fraction, and constant part [m].
+#: Error bound of the distance moved: a fraction of the distance plus a constant [m].
 _ODOMETER_SHARE: Final = 0.05
 _ODOMETER_M: Final = 10.0
-#: Distance from the most likely track, in standard deviations, from which on a note is given.
+#: Distance of the code position from the most likely track, in standard deviations, above which a note is issued.
 _NOTED_MISFIT: Final = 2.5
 #: Minimum probability of an unmapped track.
 _LEAST_UNMAPPED: Final = 1e-9
@@ -51,7 +51,10 @@ TrackPrior = tuple[dict[str, float], float]
 
 
 def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path) -> None:
-    """Write the probabilities of all tracks, as the prior of the next start-up; OutputError where it cannot."""
+    """Write the probabilities of all tracks as JSON, for the prior at the next start-up (`prior_of_last_place`).
+
+    OutputError: the file cannot be written.
+    """
     shares = dict(zip(posterior.names, posterior.probability.tolist(), strict=True))
     write_whole(path, json.dumps({"time_gpst": str(time), "probability": shares}, indent=2) + "\n")
 
@@ -59,10 +62,10 @@ def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path)
 def prior_of_last_place(
     path: Path, network: Network, *, moved_m: float, missed_move: float, unmapped: float
 ) -> TrackPrior:
-    """Return the prior of tracks from the last position (`write_last_place`) and the distance moved since [m].
+    """Return the prior of tracks from the file of `write_last_place` and the distance moved since then [m].
 
-    `missed_move` is the probability that the train was moved unnoticed, anywhere; `unmapped` the prior of an unmapped
-    track, for a train that was moved. InputFileError: the file is not a last position on this network.
+    `missed_move` is the probability that the train was moved to any track without being noticed; `unmapped` is the
+    prior of an unmapped track in that case. InputFileError: the file has no probabilities of tracks of this network.
     """
     record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")
@@ -89,9 +92,7 @@ def prior_of_last_place(
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
-    """Return the tracks that a train from anywhere on a track can have reached after a distance, including
-    reversals.
-    """
+    """Return the names of the tracks within a distance of any point of a track, with reversals allowed."""
     near = nx.multi_source_dijkstra_path_length(
         network.graph.to_undirected(as_view=True), {4 * track + k for k in range(4)}, cutoff=within_m
     )
@@ -99,9 +100,9 @@ def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
 
 
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
-    """Parse the interlocking's track weights ``NAME=WEIGHT,...``.
+    """Parse the interlocking's track weights ``NAME=WEIGHT,...``; unnamed tracks are absent from the result.
 
-    SettingsError: it is not such a text, or names a track that is not in the map.
+    SettingsError: the text has another form, names a track that is not in the map, or has weights of 0 only.
     """
     weights = {}
     for pair in text.split(","):
@@ -119,14 +120,18 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     return weights
 
 
-#: Distance from the train within which tracks are hypotheses, and within which their points are used [m].
+#: Distance from the train within which a track is a hypothesis, and within which points of a track are used [m].
 _NEAR_M: Final = 60.0
 _POINTS_M: Final = 400.0
 _MOST_TRACKS: Final = 64
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Tracks of a network near a position in its frame, east and north of it; MismatchError without one within 60 m."""
+    """Return the tracks of a network near a position, with points relative to it; MismatchError if none is near.
+
+    `origin_ecef_m` is in the frame of the network. Tracks within 60 m of the position are returned, with their points
+    within 400 m.
+    """
     latitude, longitude, height = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
     near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
     numbers = sorted(int(t) for t in near.track[0] if t >= 0)
@@ -153,9 +158,11 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackDecision:
-    """Posterior at each evaluation, with the time at rest, shape (L,) [s], and the decision.
+    """Decision on the track of a train at rest, with the posterior at each of L evaluations.
 
-    `track` is a name, ``"none"``, or ``"undecided"``, with NaN for `decided_s`; `end` is the last epoch.
+    `seconds`, shape (L,), is the time at rest at each evaluation [s]. `track` is the name of a track, ``"none"`` for an
+    unmapped track, or ``"undecided"``; `decided_s` is the time at rest at the decision [s], NaN if undecided. `end` is
+    the last epoch.
     """
 
     seconds: Floats
@@ -177,11 +184,11 @@ def decide_track(
     every_s: float = 10.0,
     prior: Mapping[str, float] | None = None,
 ) -> TrackDecision:
-    """Evaluate the posterior repeatedly and decide when the risk of another track is below a bound.
+    """Evaluate the posterior repeatedly and decide when the probability of all other tracks is below `risk`.
 
-    `tracks`, `antennas` (all about the same origin), `arms_m`, `errors` and `prior` are as for `track_posterior`.
-    `risk` bounds the probability of a wrong track; the first evaluation is after `least_s`, the next ones are `every_s`
-    apart [s].
+    `tracks`, `arms_m`, `errors` and `prior` are as for `track_posterior`; the positions of all `antennas` refer to the
+    same origin. The first evaluation is after `least_s` [s], and the interval of evaluations is `every_s` [s]. A log
+    shorter than `least_s` is evaluated once, without a decision. MismatchError: there is no position.
     """
     start = max(codes.time[0] for codes in antennas)
     length = float((min(codes.time[-1] for codes in antennas) - start) / np.timedelta64(1, "s"))
@@ -227,12 +234,15 @@ class WhichTrackInputs(InputFiles):
     nav: tuple[Path, ...] = input_option(NAVIGATION, (), metavar="NAV")
     map: tuple[Path, ...] = input_option("Map files with the tracks of the yard or station.", metavar="MAP")
     last: Path | None = input_option(
-        "Probabilities of the tracks at the end of the last standstill (file of --save-last).", None
+        "Probabilities of the tracks at the end of the last standstill, a file written by --save-last.", None
     )
 
 
 class WhichTrackOptions(Settings):
-    """Options of `railfix which-track`, described in their fields; `same_frame` applies to the train's position too."""
+    """Options of `railfix which-track`.
+
+    With `same_frame`, the train's position, too, is not transformed to the frame of the map.
+    """
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
     base_place: str | None = option("Position of the base station: latitude, longitude, height.", None, metavar="L,L,H")
@@ -242,13 +252,13 @@ class WhichTrackOptions(Settings):
         "Weights of the tracks that the interlocking considers possible: T1=0.9,T2=0.1.", None, metavar="NAME=P,..."
     )
     moved: float | None = option(
-        "Distance moved since --last, from cold-movement detection (0: none) or odometer.",
+        "Distance moved since --last was written, from the odometer, or 0 if cold-movement detection reports no move.",
         None,
         metavar="M",
         ge=0,
     )
     missed_move: float = option(
-        "Probability that the train was moved unnoticed since --last.", 1e-3, metavar="P", gt=0, lt=1
+        "Probability that the train was moved unnoticed since --last was written.", 1e-3, metavar="P", gt=0, lt=1
     )
     start: datetime | None = option("First epoch of the standstill, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
@@ -263,7 +273,10 @@ class WhichTrackOptions(Settings):
 
 
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
-    """Decide the track of a standing train from logs and map."""
+    """Decide on which track a train at rest is, from its logs and a map.
+
+    RailfixError: see `railfix.core.errors`.
+    """
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
         raise SettingsError("a base station needs both --base and --base-place")
@@ -274,7 +287,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if inputs.rear and not options.spacing > 0.0:
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front antenna")
     if (inputs.last is None) != (options.moved is None):
-        raise SettingsError("the last position needs --last and --moved, the distance moved since (0: none)")
+        raise SettingsError("--last and --moved, the distance moved since then (0 if none), must be given together")
     navigation = read_navigation(inputs.nav, **options.logs.arguments)
     base = None
     if options.base_place is not None:
@@ -316,7 +329,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if last.misfit_sigmas[best] > _NOTED_MISFIT:
         notes.append(
             f"the code position lies {last.misfit_sigmas[best]:.1f} standard deviations from {last.names[best]}, the "
-            "most likely track; beyond 4 nothing is decided: is the map displaced, or a track missing?"
+            "most likely track, and there is no decision beyond 4; check whether the map is displaced or lacks a track"
         )
     return replace(decision, notes=tuple(notes))
 
@@ -330,7 +343,7 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Return the weights of all tracks: interlocking weights times weights of the last position."""
+    """Return the product of the interlocking's weights and those of the last position, and the unmapped prior."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(
