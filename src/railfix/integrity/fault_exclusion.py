@@ -1,4 +1,4 @@
-"""Detect and exclude faulty satellites, then re-solve the positions: RAIM (P1 2.3(4), P4)."""
+"""Receiver autonomous integrity monitoring (RAIM): exclude faulty satellites and re-solve (P1 2.3(4), P4)."""
 
 from __future__ import annotations
 
@@ -33,31 +33,31 @@ class RaimResult(NotebookTable):
     """Detection and exclusion of T epochs."""
 
     outcome: Codes  #: `raim.Outcome`, shape (T,).
-    #: Test statistic before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
+    #: Test statistic before any exclusion, shape (T,); in noise variances, or in m^2 with the fixed limit.
     statistic: Floats
-    threshold: Floats
-    scale: Floats  #: Noise scale for the test of the residuals, from earlier epochs; shape (T,).
-    excluded: Masks  #: Shape (T, K).
-    own_error_m: Floats  #: Error of the faulty channels relative to all others; NaN elsewhere; shape (T, K).
-    #: Level by `raim.reliability` of the remaining ranges; infinite where a fault of one range cannot be detected; NaN
-    #: without a position, with a remaining fault, or where the level or RAIM is off; shape (T,).
+    threshold: Floats  #: Threshold of the statistic, NaN where the epoch cannot be tested; shape (T,).
+    scale: Floats  #: Noise scale used in the test of the residuals, shape (T,).
+    excluded: Masks  #: True for excluded channels, shape (T, K).
+    own_error_m: Floats  #: Error of the faulty channels relative to the other channels; NaN elsewhere; shape (T, K).
+    #: Protection level of the remaining ranges (`raim.reliability`), shape (T,); infinite where a fault of one range
+    #: cannot be detected; NaN without a position, with a remaining fault, or with the level or RAIM switched off.
     protection_level_m: Floats
 
     @property
     def faulty(self) -> Masks:
-        """Epochs with a remaining fault in the position, shape (T,)."""
+        """True for epochs whose position still contains a detected fault, shape (T,)."""
         return np.asarray((self.outcome == int(Outcome.INSEPARABLE)) | (self.outcome == int(Outcome.UNRESOLVED)))
 
 
 def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
-    """Return the statistic of the residuals and its threshold (P4) without a test: every outcome is UNTESTABLE."""
+    """Return the statistic of the residuals and its threshold (P4) untested, with every outcome UNTESTABLE."""
     return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
 
 
 def _untested(found: Detection, shape: tuple[int, ...], scale: ArrayLike) -> RaimResult:
-    """Return the statistic of T epochs by K channels without an outcome."""
+    """Return a result for T epochs and K channels with every outcome UNTESTABLE and no exclusion."""
     return RaimResult(
         outcome=np.full(shape[0], int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
         threshold=found.threshold, scale=np.broadcast_to(np.asarray(scale, dtype=np.float64), shape[:1]),
@@ -81,13 +81,13 @@ def exclude_faults(
     limits: RaimLimits | None = None,
     fix_limits: FixLimits | None = None,
 ) -> tuple[Ranges, LineFix, RaimResult]:
-    """Return ranges and positions without up to two faulty satellites, and the verdict on each epoch (P1 2.3(4), P4).
+    """Exclude up to two faulty satellites per epoch and return the ranges, re-solved positions and test results.
 
     The sum of squared residuals is tested against chi-square (P4, false alarm 1e-3), or against 100 m^2 (P1 table 6,
-    mode "fixed"). Every satellite, then every pair is left out in turn; a set is excluded where the remaining ranges
-    pass and each range of the set has an error over the limit. If two satellites disagree with the others, the others
-    may be faulty instead: a pair is not excluded if the epoch's robust fit keeps a range of it. Where a fault stays
-    unresolved, the position is computed from the ranges that the robust fit keeps (`RaimResult.faulty`).
+    mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4)). A set is excluded if the
+    remaining ranges pass and the error of each range of the set exceeds the limit. A pair is not excluded if the robust
+    fit of the epoch keeps a range of the pair, because the remaining satellites may then be the faulty ones. Where a
+    fault remains unresolved, the position is computed from the ranges kept by the robust fit (`RaimResult.faulty`).
 
     Parameters
     ----------
@@ -97,9 +97,10 @@ def exclude_faults(
     fix : LineFix
         Positions computed from these ranges (`fix_on_line`).
     scale : array_like, shape (T,) or ()
-        Ratio of the receiver's range standard deviation to the one assumed by the weights (`noise_scale`).
+        Ratio of the receiver's range standard deviation to the sigmas of the weights (`noise_scale`); ValueError unless
+        positive or NaN.
     agreeing : ndarray of bool, shape (T, M), optional
-        Ranges that a robust fit on the line keeps (`robust_fit`); computed here by default.
+        Ranges kept by a robust fit on the line (`robust_fit`); computed here by default.
     model : LinearModel, optional
         Linear model of the positions (`linear_model`); computed here by default.
     limits, fix_limits : RaimLimits, FixLimits, optional
@@ -130,21 +131,24 @@ def exclude_faults(
         return ranges, fix, raim
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
-    # Without the fault another section can fit best; the remaining ranges must be consistent on that section, too.
+    # Without the fault, another section may fit best; the remaining ranges must be consistent on that section, too.
     still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
     raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim
 
 
 def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices | slice = slice(None)) -> None:
-    """Write some rows of an exclusion of `epochs` into a result."""
+    """Copy the selected rows of an exclusion, computed for `epochs`, into the result."""
     at = epochs[rows]
     for name in ("outcome", "excluded", "own_error_m"):
         getattr(raim, name)[at] = getattr(exclusion, name)[rows]
 
 
 def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
-    """Exclude the ranges that the robust fit rejects where no exclusion is accepted."""
+    """Exclude the ranges rejected by the robust fit at epochs whose fault is unresolved or whose pair is contradicted.
+
+    An epoch keeps all its ranges if fewer than `min_redundancy` redundant ranges would remain.
+    """
     pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
     contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
     unresolved = contradicted | (raim.outcome[failing] == Outcome.UNRESOLVED)
@@ -167,10 +171,10 @@ def _second_attempt(
     limits: RaimLimits,
     fix_limits: FixLimits,
 ) -> Exclusion:
-    """Return the exclusion of unresolved epochs, linearised at their position without the worst satellite.
+    """Repeat the exclusion of unresolved epochs, linearised at the positions without the worst satellite.
 
-    A large fault on a curve moves the position to a part of the line with another direction, where the
-    linear model does not hold for the true position.
+    On a curve, a large fault moves the position to a part of the line with another direction, where the
+    linear model is not valid for the true position.
     """
     worst = np.zeros((len(epochs), ranges.code_m.shape[1]), dtype=bool)
     worst[np.arange(len(epochs)), worst_channel(model)] = True

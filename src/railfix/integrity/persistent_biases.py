@@ -1,4 +1,4 @@
-"""Detection of satellites with persistent code errors by the mean of their clipped residuals."""
+"""Detection of satellites with persistent code errors, by the time average of their clipped residuals."""
 
 from __future__ import annotations
 
@@ -19,55 +19,56 @@ from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 
-#: Smallest fraction of a range error that must appear in its residual; below it the error is not detectable.
+#: Smallest redundancy number of a range (fraction of its error that appears in its residual) for the test.
 _LEAST_REDUNDANCY: Final = 0.1
-#: Smaller means are discarded.
+#: Mean residuals up to this size are dropped from the state.
 _FORGOTTEN: Final = 1e-12
-#: Minimum remaining degrees of freedom, so that the other ranges are still checked.
+#: Minimum degrees of freedom after a rejection, so that the remaining ranges can still be tested.
 _LEAST_FREEDOM: Final = 2
 
 
 class LastingErrorLimits(Settings):
     """Limits of the test for persistent range errors."""
 
-    #: Time constant of the mean residual: one minute, because reflections at a moving train are shorter.
+    #: Time constant of the mean residual. The default is a minute because reflections last less on a moving train.
     memory_s: float = Field(default=60.0, gt=0)
-    #: Clipping limit of a residual in standard deviations, of the weights or of the receiver's noise if larger.
+    #: Clipping limit of a residual, in standard deviations of the weights or, if larger, of the receiver's noise.
     clipped: float = Field(default=2.0, gt=0)
-    #: Mean, as a fraction of `clipped`, from which on a satellite is left out. On fault-free city recordings the
-    #: largest mean is 0.59, except for satellites received by reflection only; an error of 20 m on one satellite
+    #: Mean residual, as a fraction of `clipped`, above which a satellite is left out. On fault-free city recordings the
+    #: largest mean is 0.59, except for satellites received by reflection only. An error of 20 m on one satellite
     #: reaches the limit after 75 to 115 s.
     share: float = Field(default=0.62, gt=0, le=1)
-    #: Largest number of satellites left out at a time; 0 switches the test off.
+    #: Largest number of satellites left out at an epoch; 0 disables the test.
     most_satellites: int = Field(default=2, ge=0, le=4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LastingErrorState:
-    """Mean residuals after the last epoch."""
+    """Mean residuals of one antenna after the last epoch."""
 
+    #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age, in windows.
+    age: float = 0.0  #: Age of the means at the last epoch, in units of `memory_s` (`Windows`).
     channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
-    #: Sums for the noise of the ranges, faulty ranges included (`NoiseState`); shape (2,).
+    #: Sums for the noise scale of all ranges, faulty ranges included (`NoiseState`); shape (2,).
     noise: Floats = field(default_factory=lambda: np.zeros(2))
-    #: Mean residuals of all ranges, then without the worst satellite, and so on; shape (S, P).
+    #: Mean residuals as fractions of `clipped`, shape (S, P); column p is computed without the p worst satellites.
     sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
 class BiasLimits(NamedTuple):
-    """Limits of the means, and of the re-solved positions."""
+    """Limits of the test for persistent errors, and limits of the re-solved positions."""
 
     lasting: LastingErrorLimits = LastingErrorLimits()
     fix: FixLimits = FixLimits()
 
 
 class PersistentBiases(NamedTuple):
-    """Positions of T epochs without satellites with persistent errors."""
+    """Positions of T epochs, computed without the satellites that have persistent errors."""
 
     fix: LineFix
     model: LinearModel  #: Linear model of the positions.
-    rejected: Masks  #: Shape (T, K).
+    rejected: Masks  #: True for channels with a persistent error, shape (T, K).
 
 
 def reject_persistent_biases(
@@ -80,10 +81,10 @@ def reject_persistent_biases(
     states: Sequence[LastingErrorState],
     limits: BiasLimits,
 ) -> tuple[Ranges, PersistentBiases, list[LastingErrorState]]:
-    """Return ranges, positions and model without satellites with persistent code errors, and the new states.
+    """Reject satellites with persistent code errors, and return the other ranges, their positions and the new states.
 
-    P4 tests single epochs, which an error of twice the noise passes; here the clipped residuals are averaged over time.
-    The worst satellite is left out, then the worst of the remaining ones, by the residuals without the first.
+    An error of twice the noise passes the single-epoch test of P4, so the clipped residuals are averaged over time. The
+    worst satellite is left out first, then the worst of the remaining satellites by the residuals of the second fit.
 
     Parameters
     ----------
@@ -93,11 +94,11 @@ def reject_persistent_biases(
     ranges, line, fix
         As for `exclude_faults`.
     noise : ndarray, shape (T,)
-        Noise scale of the receiver.
+        Noise scale of the receiver; values below 1 count as 1.
     states : sequence of LastingErrorState
-        Of each antenna after the previous chunk; `LastingErrorState()` at the start.
+        State of each antenna after the previous chunk; `LastingErrorState()` at the start.
     limits : BiasLimits
-        With `LastingErrorLimits.most_satellites` 0 nothing is rejected.
+        No satellite is rejected if `LastingErrorLimits.most_satellites` is 0.
     """
     antennas, (lasting, fix_limits) = AntennaRows.on(line), limits
     model = linear_model(ranges, antennas, fix.constrained.arc_m, section=fix.constrained.section)
@@ -135,7 +136,7 @@ def reject_persistent_biases(
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
-    """Return the used range with the largest mean of each epoch, if beyond the limit, as a mask of shape (T, K)."""
+    """Return the mask (T, K) of each epoch's used range with the largest absolute mean, if it exceeds the limit."""
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)
@@ -144,12 +145,12 @@ def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
 
 
 def _is_remembered(state: LastingErrorState) -> Masks:
-    """Return the channels whose means are kept, shape (S,)."""
+    """Return the mask of channels whose means are kept, shape (S,)."""
     return np.asarray((np.abs(state.sums) > _FORGOTTEN).any(axis=1))
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
-    """Return the normalised, clipped residuals as fractions of `clipped`; 0 for unchecked ranges."""
+    """Return the normalised residuals, clipped and divided by `clipped`, shape (T, K); 0 for unchecked ranges."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
     own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]

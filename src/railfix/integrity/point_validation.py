@@ -17,13 +17,13 @@ from railfix.positioning.range_arrays import Ranges
 class PointStatus(IntEnum):
     """Result of the validation of a conventional position."""
 
-    #: Both checks passed; without a redundant range the residuals pass.
+    #: Both checks passed. Without a redundant range the residuals are not tested.
     VALID = 0
     #: No position.
     NO_POSITION = 1
     #: The residuals exceed the noise.
     RESIDUALS = 2
-    #: The dilution of precision is over its limit.
+    #: The dilution of precision exceeds its limit, or the geometry is singular.
     DILUTION = 3
 
 
@@ -33,10 +33,10 @@ def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
 
 
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
-    """Return the `PointStatus` of conventional positions with one clock per constellation (RTKLIB: `valsol`), shape
-    (T,).
+    """Return the `PointStatus` of each conventional position, shape (T,); one clock per constellation is estimated.
 
-    `noise_scale` is the ratio of the receiver's range standard deviation to the sigmas of the weights, shape (T,).
+    `noise_scale`, shape (T,), is the ratio of the receiver's range standard deviation to the sigmas of the weights. The
+    checks follow RTKLIB (`valsol`).
     """
     test = detect(
         point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,
@@ -50,8 +50,9 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
 
 
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
-    """Return the position dilution of precision with one clock per constellation (RTKLIB: `dops`), shape (T,).
+    """Return the position dilution of precision (PDOP) with one clock per constellation, shape (T,).
 
-    It is the root of the trace of the position covariance for ranges of unit sigma; NaN where the geometry is singular.
+    PDOP is the square root of the trace of the position covariance for ranges of unit sigma (RTKLIB: `dops`); NaN where
+    the geometry is singular.
     """
     return kernels.ranges.dilutions(ranges.arrays, kernel_array(ecef_m))

@@ -1,9 +1,9 @@
 """Stanford diagram along the track: position error against protection level.
 
-Every epoch belongs to one region, defined by the alarm limit AL, the level PL and the absolute error:
+Every epoch belongs to one region, defined by the alarm limit AL, the protection level PL and the absolute error:
 
-- no position: neither is there;
-- unjudged: a level, but no reference to take an error from;
+- no position: both the level and the error are missing;
+- unjudged: the level is known, but the error is not, for lack of a reference;
 - nominal: error <= PL <= AL;
 - misleading: PL < error <= AL;
 - hazardously misleading: PL <= AL < error;
@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
-_BINS: Final = 100  #: Bins of an axis, up to twice the alarm limit.
-_GAP: Final = 1.5  #: Number of usual intervals from which on two epochs are separated by a gap.
+_BINS: Final = 100  #: Number of bins per axis, which extends to twice the alarm limit.
+_GAP: Final = 1.5  #: Two epochs are separated by a gap if their interval exceeds the median interval times this.
 
 
 class Region(IntEnum):
@@ -41,12 +41,12 @@ class Region(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuity:
-    """Continuity: fraction of the windows starting at an available epoch that stay available."""
+    """Continuity over windows of one length that start at an available epoch."""
 
-    window_s: float
-    windows: int  #: Number of complete windows.
-    kept: int  #: Number of windows in which every epoch is available and none is missing.
-    probability: float  #: Fraction kept / windows; NaN without windows.
+    window_s: float  #: Length of the windows.
+    windows: int  #: Number of windows that end within the run.
+    kept: int  #: Number of windows without an unavailable epoch and without a gap.
+    probability: float  #: Ratio kept / windows; NaN without windows.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,17 +55,17 @@ class Stanford:
 
     alarm_limit_m: float
     region: Codes  #: `Region`, shape (T,).
-    counts: dict[Region, int]  #: Number of epochs in each region; the sum is T.
-    available_rate: float  #: Fraction of the T epochs with a level within the alarm limit, with or without a reference.
-    beyond: Indices  #: Indices of the epochs whose error is over the level, the largest excess first.
+    counts: dict[Region, int]  #: Number of epochs in each region; the counts add up to T.
+    available_rate: float  #: Fraction of the T epochs with a level within the alarm limit; NaN without epochs.
+    beyond: Indices  #: Indices of the epochs whose error exceeds the level, the largest excess first.
     continuity: tuple[Continuity, ...]  #: One entry per window length.
-    #: Number of time blocks with epochs, and of blocks with an error over the level. Errors are correlated over tens of
-    #: seconds, so that a block counts as one independent sample.
+    #: Number of time blocks with epochs, and number of blocks with an error above the level. A block counts as one
+    #: independent sample because errors are correlated over tens of seconds.
     blocks: int
     misleading_blocks: int
-    #: Edges of the bins of error and level; the upper edge of the last one is infinite; shape (N + 1,).
+    #: Edges of the bins of error and level, shape (N + 1,); the last edge is infinite.
     edges_m: Floats
-    histogram: Integers  #: Epochs by bin of the absolute error (axis 0) and of the level (axis 1), shape (N, N).
+    histogram: Integers  #: Number of epochs by bins of the absolute error (axis 0) and the level (axis 1); (N, N).
 
 
 def stanford(
@@ -77,21 +77,22 @@ def stanford(
     windows_s: Sequence[float] = (15.0, 60.0),
     block_s: float = 60.0,
 ) -> Stanford:
-    """Assign epochs to the regions of the diagram.
+    """Assign each epoch to a region of the Stanford diagram, and compute availability and continuity.
 
     Parameters
     ----------
     time : ndarray of datetime64, shape (T,)
-        Ascending times of every epoch of the run, with or without a position.
+        Ascending times of all epochs of the run, with or without a position.
     error_m : array_like, shape (T,) [m]
         Error along the track, signed or absolute; NaN without a position or without a reference.
     level_m : array_like, shape (T,) [m]
-        Protection level, infinite where no error can be excluded, NaN without a position. An error without a level
-        counts as having an infinite level.
+        Protection level; infinite where no error can be excluded, NaN without a position. Where an error is known but
+        no level, the level counts as infinite.
     windows_s : sequence of float [s]
-        Lengths of the continuity windows: 15 s as for an approach in aviation; one minute from one station to the next.
+        Lengths of the continuity windows. The default of 15 s is taken from aviation approaches, 60 s from the travel
+        time between two stations.
     block_s : float [s]
-        Length of the blocks, from the first epoch.
+        Length of the time blocks, counted from the first epoch.
     """
     time = time.astype("datetime64[ns]")
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
@@ -142,9 +143,7 @@ def _nanoseconds(value_s: float) -> np.timedelta64:
 
 
 def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuity:
-    """Return the continuity of windows ``[t, t + window]`` from each available epoch; a gap in the times breaks a
-    window.
-    """
+    """Return the continuity over windows ``[t, t + window]`` from each available epoch t; a gap interrupts a window."""
     if len(time) < 2:
         return Continuity(window_s=window_s, windows=0, kept=0, probability=np.nan)
     step = np.diff(time)
@@ -153,7 +152,7 @@ def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuit
     until = time + _nanoseconds(window_s)
     started = available & (until <= time[-1])
     last = np.searchsorted(time, until, side="right") - 1
-    # A window that ends inside a gap is broken too, because the next epoch is after the gap.
+    # A window that ends inside a gap is interrupted, too, because the next epoch is after the gap.
     ends = np.append(across, False)[last] & (until > time[last])
     kept = started & (broken[last] == broken) & ~ends
     windows = int(started.sum())

@@ -1,4 +1,4 @@
-"""Suspicion of jamming and spoofing from observations, positions and the receiver's own indicators."""
+"""Detection of suspected jamming and spoofing from observations, positions and the receiver's own indicators."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Causes of suspected interference, limits of their tests, and signs in C/N0 and front-end gain."""
+"""Suspicions of interference, the limits of their tests, and the signs in C/N0 and front-end gain."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from railfix.core.timescale import GPS_EPOCH, seconds
 
 
 class Suspicion(IntEnum):
-    """Likely cause of signs common to all satellites of an epoch, as decided by `suspicion`."""
+    """Likely cause of the signs of an epoch that concern all satellites, as decided by `suspicion`."""
 
     NONE = 0
     JAMMING_SUSPECTED = 1
     SPOOFING_SUSPECTED = 2
     #: All satellites are consistent with one error of the time tags.
     TIME_TAGS = 3
-    #: The 3-D positions have left the map, and there is no other sign.
+    #: The 3-D positions have left the map, without a sign of spoofing or of a time-tag error.
     LEFT_MAP = 4
     #: All positions of the last minute failed a check for an unknown cause.
     CONTRADICTED = 5
@@ -36,7 +36,7 @@ class Sign(IntFlag):
     NONE = 0
     #: The receiver reports jamming: UBX MON-RF, MON-HW and SEC-SIG (critical), SBF RFStatus (not cancelled).
     RECEIVER_JAMMING = 1 << 0
-    #: C/N0 of all satellites has fallen by nearly the same amount.
+    #: The C/N0 of all satellites has fallen by nearly the same amount.
     CN0_FALL = 1 << 1
     #: The front-end gain of the receiver has fallen.
     GAIN_FALL = 1 << 2
@@ -50,13 +50,13 @@ class Sign(IntFlag):
     SPEED_JUMP = 1 << 6
     #: The 3-D position moves farther than a train can.
     POSITION_JUMP = 1 << 7
-    #: Constellations give different positions or clocks of the antenna.
+    #: Two constellations give different positions or receiver clocks.
     CONSTELLATIONS_PART = 1 << 8
-    #: Consistent 3-D positions have left the map sideways.
+    #: Consistent 3-D positions have left the map laterally.
     LEFT_MAP = 1 << 9
-    #: The satellite distance deviates from the wheel distance.
+    #: The distance travelled by satellite positions deviates from the wheel distance.
     WHEEL_PARTS = 1 << 10
-    #: One error of the time tags explains the ranges.
+    #: One common error of the time tags explains the ranges.
     TIME_TAGS = 1 << 11
     #: All positions of the last minute failed a check.
     CONTRADICTED = 1 << 12
@@ -67,88 +67,89 @@ _SPOOFING: Final = (
     | Sign.CONSTELLATIONS_PART | Sign.WHEEL_PARTS
 )  # fmt: skip
 _JAMMING: Final = Sign.RECEIVER_JAMMING | Sign.CN0_FALL | Sign.GAIN_FALL
-CAUSES: Final = tuple(cause for cause in Sign if cause)  #: Causes in the order of their bits.
+CAUSES: Final = tuple(cause for cause in Sign if cause)  #: All signs but NONE, in the order of their bits.
 
 
 class InterferenceLimits(Settings):
     """Limits of the signs of interference.
 
-    On the recordings no sign occurs; their largest statistics are in ``tests/references/results/interference.txt``.
+    No sign occurs on the recordings. Their largest statistics are in ``tests/references/results/interference.txt``.
     """
 
     use: Literal["on", "off"] = "on"
     least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test over all satellites.
     fall_db: float = Field(default=5.0, gt=0)  #: Median fall of C/N0 below its recent peak.
-    #: Largest standard deviation of the falls: a jammer raises the noise of all channels alike, walls and roofs do not.
+    #: Largest standard deviation of the falls; a jammer raises the noise of all channels alike, walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
-    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay of a peak [dB/min].
-    known_after_s: float = Field(default=10.0, ge=0)  #: A satellite is compared once it has been tracked for this time.
-    #: Fall of the front-end gain as a fraction of its recent peak; up to 14 % during a start without interference.
+    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
+    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time after which a satellite's C/N0 is compared.
+    #: Fall of the front-end gain as a fraction of its recent peak. It reaches 14 % during a start without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
-    #: Largest standard deviation of equal C/N0; in open sky 1.2 dB and more.
+    #: Standard deviation of C/N0 over the satellites up to which it counts as equal; in open sky it is 1.2 dB or more.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Step of the codes against the Dopplers, without whole milliseconds. Phone clocks step by 30 m.
+    #: Step of the codes relative to the Dopplers, less whole milliseconds. Phone clocks step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
-    #: Minimum jumps and minimum distance from the line. A yard is some 100 m wide.
+    #: Minimum jumps of clock drift, 3-D velocity and 3-D position, and minimum distance from the line. A yard is some
+    #: 100 m wide.
     drift_jump_mps: float = Field(default=10.0, gt=0)
     speed_jump_mps: float = Field(default=5.0, gt=0)
     position_jump_m: float = Field(default=30.0, gt=0)
     off_map_m: float = Field(default=100.0, gt=0)
-    #: Minimum error of the time tags, in seconds and in standard deviations. Estimated errors of correct tags reach
+    #: Minimum error of the time tags, in seconds and in standard deviations. Errors estimated for correct tags reach
     #: 0.05 s in towns, and 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
     tag_sigmas: float = Field(default=6.0, gt=0)
-    #: Time for which all positions fail a check before positions are considered unreliable.
+    #: Time for which all positions must fail a check before positions are considered unreliable.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Limits in standard deviations, in general and for the difference of two constellations.
+    #: Limits of jumps and distances in standard deviations, and of the difference between two constellations.
     jump_sigmas: float = Field(default=10.0, gt=0)
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Limits of a train's motion; position jumps exceed these.
+    #: Largest acceleration and speed of a train; a jump is the part of a change that they do not explain.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)
-    longest_gap_s: float = Field(default=10.0, gt=0)  #: Epochs farther apart are not compared.
-    #: Velocities and positions with larger standard deviations are not compared.
+    longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.
+    #: Largest standard deviations of velocities and positions that are compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
     largest_sigma_m: float = Field(default=30.0, gt=0)
-    #: Holding times: of a fall, of equal C/N0 and of a distance from the map; and of separated constellations.
+    #: Holding times of a C/N0 or gain fall, equal C/N0 and a distance from the map, and of differing constellations.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)
-    #: Time over which satellites and wheel are compared, and its minimum.
+    #: Length of the window over which satellite and wheel distances are compared, and its minimum.
     wheel_window_s: float = Field(default=120.0, gt=0)
     wheel_least_s: float = Field(default=60.0, gt=0)
-    #: Minimum difference [m], and minimum difference in standard deviations.
+    #: Minimum difference between satellite and wheel distance, in metres and in standard deviations.
     wheel_m: float = Field(default=20.0, gt=0)
     wheel_sigmas: float = Field(default=6.0, gt=0)
-    #: Whether the filter's protection level covers a pull that the wheel has not shown yet; the level is then two to
-    #: four times as large.
+    #: Whether the filter's protection level covers a pull along the track that the comparison with the wheel has not
+    #: detected yet. The level is then two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
-    #: Standard deviations of the difference in that level: 2.1 for a probability of 1e-7 that a pull has begun within
-    #: the window, and a risk of 1e-9.
+    #: Number of standard deviations of the distance difference that `wheel_level` adds to the level. The default of 2.1
+    #: assumes a probability of 1e-7 that a pull has begun within the window, and a risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
-    #: Relative standard deviation of the wheel's circumference before positions determine it, and of its later change
+    #: Relative standard deviation of the wheel circumference before positions determine it, and of its later change
     #: (creep).
     wheel_scale: float = Field(default=0.01, gt=0)
     wheel_change: float = Field(default=0.001, gt=0)
-    #: Acceleration above which the wheel has slipped and the comparison restarts. Adhesion allows 1 to 1.5.
+    #: Acceleration above which the wheel has slipped and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Time for which a suspicion remains after its last sign: a jump takes one epoch, but its cause persists.
+    #: Time for which a suspicion remains after its last sign; a jump takes one epoch, but its cause persists.
     jamming_release_s: float = Field(default=10.0, ge=0)
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
 
 def cause_text(causes: Bits) -> Strings:
-    """Return the causes of each epoch joined by ``+``, blank without a cause, same shape."""
+    """Return the lower-case names of each epoch's signs joined by ``+``, same shape; empty without a sign."""
     words, which = np.unique(causes, return_inverse=True)
     texts = ["+".join(str(cause.name).lower() for cause in CAUSES if cause & word) for word in words.tolist()]
     return np.array(texts, dtype=np.str_)[which.reshape(causes.shape)] if texts else np.zeros(causes.shape, "<U1")
 
 
 def suspicion(causes: Bits) -> Codes:
-    """Return the `Suspicion` of epochs from their signs, same shape; the only function that decides between causes.
+    """Return the `Suspicion` of each epoch from its signs, same shape.
 
-    The cause that explains most signs comes first. A common time-tag error, fitted to all ranges, moves positions and
-    clocks as a spoofer would. Leaving the map does not cause jumps, equal C/N0 or different constellations; a train off
-    its map, and jamming, show no further sign. Satellites with separate errors are excluded beforehand.
+    If several suspicions are possible, the one that explains most signs is returned. A common time-tag error comes
+    first because it moves positions and clocks as a spoofer would. Spoofing precedes leaving the map, which explains
+    neither jumps nor equal C/N0 nor differing constellations. Satellites with separate errors are excluded beforehand.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -165,7 +166,7 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class HeldState:
-    """State of C conditions after a chunk."""
+    """State of C held conditions after a chunk."""
 
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
     #: Time for which each condition has been true, shape (C,).
@@ -177,12 +178,11 @@ class HeldState:
 def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Return which conditions have been true for their holding time, which are within their release time, and the
-    state.
+    """Return masks of the conditions held for their holding time and of those within their release time, and the state.
 
     An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
-    sufficient. Signs and results have the shape (T, C), the holding and release times (C,) [s]; a condition with a
-    holding time of 0 counts at once.
+    sufficient. Signs and masks have the shape (T, C), holding and release times the shape (C,) [s]. A condition with a
+    holding time of 0 is active at once.
     """
     conditions = signs.shape[1]
     run, last = state.run_ns, state.last
@@ -199,45 +199,46 @@ def hold_signs(
 
 
 _MINUTE_S: Final = 60.0
-_GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain's peak per minute.
-_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is below every C/N0.
-_LONGEST_SILENCE_S: Final = 60.0  #: Satellites that were absent for longer are not compared with earlier values [s].
+_GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain peak per minute.
+_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is below every possible C/N0.
+_LONGEST_SILENCE_S: Final = 60.0  #: Longest absence of a satellite after which its earlier C/N0 is still used [s].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerState:
-    """State of C/N0 and gain after a chunk, by channel ("G01" + "1C")."""
+    """State of C/N0 and front-end gain after a chunk."""
 
-    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
-    #: Peak of C/N0 plus the decay since the GPS epoch; -inf before the first; shape (K,).
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: "G01" + "1C", shape (K,).
+    #: Peak of C/N0 plus the decay since the GPS epoch, shape (K,); -inf before the first observation.
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Start of the current tracking of each channel, and its last observation, since the GPS epoch; NaN before; shape
-    #: (K,).
+    #: Times since the GPS epoch at which the current tracking of each channel began and at which the channel was last
+    #: observed, shape (K,); NaN before the first observation.
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
-    gain: float = -np.inf  #: Peak of the gain's logarithm plus the decay since the GPS epoch.
+    gain: float = -np.inf  #: Peak of the natural logarithm of the gain, plus the decay since the GPS epoch.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerSigns:
-    """C/N0 and gain statistics of T epochs; NaN where too few satellites are compared."""
+    """C/N0 and gain statistics of T epochs; the C/N0 statistics are NaN where too few satellites are compared."""
 
-    #: Median and standard deviation of the falls of C/N0 below the recent peak of each satellite, shape (T,).
+    #: Median and standard deviation of the falls of C/N0 below each satellite's recent peak, shape (T,).
     fall_db: Floats
     spread_db: Floats
     difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
-    #: Fall of the gain as a fraction of its recent peak; NaN where the receiver does not give it; shape (T,).
+    #: Fall of the gain as a fraction of its recent peak, shape (T,); NaN where the receiver does not report the gain.
     gain_fall: Floats
 
 
 def power_signs(
     time: Datetimes, channel: Strings, cn0_dbhz: Floats, gain: Floats, state: PowerState, limits: InterferenceLimits
 ) -> tuple[PowerSigns, PowerState]:
-    """Return the statistics of C/N0, shape (T, K), and gain, shape (T,), and the state to pass on.
+    """Return the C/N0 and gain statistics of T epochs, and the state for the next chunk.
 
-    The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky does not raise a sign, a
-    constant jammer is detected for minutes. `channel` names satellite and signal, one signal of each satellite at an
-    epoch. The gain is in the receiver's unit, rising with gain; NaN where unknown.
+    `cn0_dbhz` has the shape (T, K), with one signal per satellite at an epoch; `channel` names satellite and signal.
+    `gain`, shape (T,), is in any unit that increases with the gain; NaN where unknown. The recent peak of a satellite
+    decays by `peak_decay_db_per_min`, so that a slow change of the sky is no sign, and a constant jammer is detected
+    for minutes.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

@@ -1,4 +1,4 @@
-"""Signs of interference in clock, velocity and position: steps beyond the limits of trains and oscillators."""
+"""Signs of interference in clock, velocity and position: steps that exceed the limits of trains and oscillators."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from railfix.integrity.interference.limits import InterferenceLimits
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_time_tags, median_tag_error
 
-#: Steps of receiver clocks by whole milliseconds are not signs of interference [m].
+#: Range step of a receiver clock step of 1 ms [m]; steps by whole milliseconds are not signs of interference.
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-#: Minimum redundancy for a noise estimate of ranges or Dopplers: with less they can agree by chance.
+#: Minimum redundancy for a noise estimate, because fewer redundant ranges or Dopplers can agree by chance.
 _LEAST_FREEDOM: Final = 3
 _LEAST_MPS: Final = 0.05  #: Minimum noise of Dopplers [m/s].
-_SIZE: Final = 4  #: Unknowns that two constellations determine separately: position and clock.
+_SIZE: Final = 4  #: Number of unknowns per constellation: position and clock.
 
 
 class Fix(NamedTuple):
-    """Positions and velocities of T epochs, each with its standard deviation; NaN where missing."""
+    """Positions and velocities of T epochs with their 3-D standard deviations; NaN where missing."""
 
     time: Datetimes
     ecef_m: Floats  # (T, 3)
     sigma_m: Floats
-    velocity_mps: Floats  # (T, 4), with the clock drift
+    velocity_mps: Floats  # (T, 4), clock drift last
     velocity_sigma_mps: Floats
 
     def take(self, rows: Indices | slice) -> Fix:
-        """Return the fits of a selection of epochs."""
+        """Return the positions and velocities of selected epochs."""
         time, ecef, sigma, velocity, velocity_sigma = self
         return Fix(time[rows], ecef[rows], sigma[rows], velocity[rows], velocity_sigma[rows])
 
@@ -48,62 +48,62 @@ def _no_fix() -> Fix:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSignState:
-    """State after a chunk."""
+    """State of the motion tests after a chunk."""
 
-    #: Last epoch; NaT before the first.
+    #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
-    #: Last codes and Dopplers of each channel, shape (K,).
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Satellite and signal, shape (K,).
+    #: Last code and last range rate (``-lambda D``) of each channel, shape (K,).
     code_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Time of these observations, shape (K,).
+    #: Time of the last code and range rate, shape (K,).
     since: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
-    #: Last position and velocity accurate enough for a comparison, one epoch each.
+    #: Last position and last velocity that were accurate enough for a comparison, one epoch each.
     position: Fix = field(default_factory=_no_fix)
     velocity: Fix = field(default_factory=_no_fix)
     on_map: bool = False  #: True once a position has been on the map.
-    tags: TagErrors = NO_TAGS  #: Fits of the last epochs.
+    tags: TagErrors = NO_TAGS  #: Time-tag errors fitted at the last epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSigns:
     """Motion statistics of T epochs; NaN where a comparison is not possible."""
 
-    clock_jump_m: Floats  #: Median change of the codes against the Dopplers, less whole milliseconds; shape (T,).
-    #: Changes beyond the limits of train and oscillator, in physical units and in standard deviations; shape (T,).
+    clock_jump_m: Floats  #: Median change of codes relative to Dopplers, less whole milliseconds; shape (T,).
+    #: Changes in excess of the limits of train and oscillator, in physical units and in standard deviations; (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
     speed_jump_sigmas: Floats
     position_jump_m: Floats
     position_jump_sigmas: Floats
-    #: Largest difference between the separate positions and clocks of two constellations, in standard deviations; shape
-    #: (T,).
+    #: Largest difference between the positions and clocks of any two constellations, in standard deviations; (T,).
     part_sigmas: Floats
-    #: Distance of the 3-D position from the line, once a position has been on it; shape (T,).
+    #: Distance of the 3-D position from the line, NaN until a position has been on the line, shape (T,); and the excess
+    #: of the distance over `InterferenceLimits.position_jump_m` in standard deviations.
     off_line_m: Floats
     off_line_sigmas: Floats
-    #: Median error of the time tags over the last epochs, positive for late tags; also in standard deviations; (T,).
+    #: Median time-tag error over the last epochs, positive for late tags, and its ratio to its sigma; (T,).
     tag_error_s: Floats
     tag_error_sigmas: Floats
 
 
 class MotionFit(NamedTuple):
-    """Fits of the ranges of T epochs, whatever their antenna, without other data."""
+    """Single-epoch fits of the ranges of T epochs, of one or several antennas."""
 
     fixes: Fix
-    part_sigmas: Floats  #: Field of `MotionSigns`.
-    #: Error of the time tags, positive for late tags, and its standard deviation; NaN without redundancy; shape (T,).
+    part_sigmas: Floats  #: As in `MotionSigns`.
+    #: Time-tag error, positive for late tags, and its standard deviation, shape (T,); NaN without redundancy.
     tag_error_s: Floats
     tag_sigma_s: Floats
 
     def take(self, rows: slice) -> MotionFit:
-        """Return the fits of a selection of epochs."""
+        """Return the fits of selected epochs."""
         return MotionFit(self.fixes.take(rows), self.part_sigmas[rows], self.tag_error_s[rows], self.tag_sigma_s[rows])
 
 
 def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
-    """Return positions and velocities, and the differences between constellations."""
+    """Fit positions, velocities, constellation differences and time-tag errors to the ranges of each epoch."""
     linear = misfit_at(inputs)
     parts = _parts(inputs, linear, limits.least_satellites - 1)
     return MotionFit(fit_motion_fixes(inputs, linear), parts, *fit_time_tags(inputs))
@@ -112,7 +112,10 @@ def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
 def motion_signs(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits, fitted: MotionFit | None = None
 ) -> tuple[MotionSigns, MotionSignState]:
-    """Return the statistics of clock, velocity and position of T epochs, and the state for the next chunk."""
+    """Return the clock, velocity and position statistics of T epochs, and the state for the next chunk.
+
+    `fitted` is the result of `fit_motion` for the same inputs; computed here by default.
+    """
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
     fixes, part_sigmas, tag_error, tag_sigma = fitted or fit_motion(inputs, limits)
@@ -142,7 +145,7 @@ def motion_signs(
 
 
 def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix:
-    """Return positions and velocities by least squares from all ranges together, no satellite excluded."""
+    """Compute positions and velocities by least squares from the used ranges and Dopplers of all constellations."""
     near, sight, misfit = linear
     clocks = clock_columns(inputs)
     design = np.concatenate([-sight, np.broadcast_to(clocks, (len(near), *clocks.shape))], axis=2)
@@ -163,12 +166,12 @@ def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]
 
 
 def _length(covariance: Floats) -> Floats:
-    """Return the square root of the sum of the first three variances, shape (T,)."""
+    """Return the 3-D standard deviation, the square root of the sum of the first three variances, shape (T,)."""
     return np.asarray(np.sqrt(covariance[:, :3, :3].trace(axis1=1, axis2=2)))
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
-    """Return the last accurate fix before each epoch, and the last accurate fix of all."""
+    """Return the last accurate fix before each epoch, and the last accurate fix of the chunk (or else `start`)."""
     if len(good) == 1:
         return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))
@@ -179,7 +182,7 @@ def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
 
 
 def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return changes of velocity and clock drift beyond the physical limits, each also in standard deviations."""
+    """Return the excess changes of velocity and clock drift over the physical limits, in m/s and in sigmas, (T,)."""
     dt = seconds(now.time - before.time)
     near = np.where(dt <= limits.longest_gap_s, 1.0, np.nan)
     sigma = np.hypot(now.velocity_sigma_mps, before.velocity_sigma_mps)
@@ -192,8 +195,10 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return the distance to the position extrapolated by the last velocity, less a train's largest deviation; also in
-    sigmas.
+    """Return the distance from the extrapolated position, less a train's largest deviation, in metres and in sigmas.
+
+    The extrapolation uses the velocity at the previous position. Without that velocity, the train may have moved in any
+    direction at its largest speed.
     """
     dt = seconds(now.time - before.time)
     velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
@@ -209,7 +214,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Strings, Floats, Floats, Datetimes]]:
-    """Return the median change of codes against Dopplers, less whole milliseconds (T,) [m], and the new state."""
+    """Return the median change of codes relative to Dopplers, less whole milliseconds (T,) [m], and the new state."""
     young = seconds(inputs.time[0] - state.since) <= limits.longest_gap_s
     joined = join_channels(inputs.channel, [state.channel], [young])
     code, rate = (joined.arrange(values, np.nan) for values in (state.code_m, state.rate_mps))
@@ -224,7 +229,7 @@ def _clock_jump(
 
 
 def _parts(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats], least: int) -> Floats:
-    """Return the largest difference of two constellations' positions and clocks, in standard deviations, shape (T,)."""
+    """Return the largest position and clock difference between two constellations, in standard deviations, (T,)."""
     near, sight, misfit = linear
     design = np.concatenate([-sight, np.ones((*sight.shape[:2], 1))], axis=2)
     epochs, clocks = len(near), int(inputs.group.max(initial=-1)) + 1

@@ -1,4 +1,4 @@
-"""Ranges for the interference tests, and least-squares fits of these ranges."""
+"""Input ranges of the interference tests, and least-squares fits of the ranges."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Prior weight of the unknowns, for unknowns that too few satellites determine.
+_RIDGE: Final = 1e-9  #: Prior weight of the unknowns, for conditioning with too few satellites.
 
 
 class MotionInputs(NamedTuple):
-    """Ranges of one antenna: T epochs by K channels."""
+    """Ranges of T epochs by K channels, with the lines of their antennas."""
 
     time: Datetimes  #: Shape (T,).
-    break_before: Masks  #: Shape (T,).
-    channel: Strings  #: Shape (K,).
+    break_before: Masks  #: True where an epoch is not compared with the previous epoch, shape (T,).
+    channel: Strings  #: Satellite and signal, shape (K,).
     group: Indices  #: Receiver clock of each channel, shape (K,).
-    near_ecef_m: Floats  #: Position accurate to some kilometres; NaN if unknown; shape (T, 3).
-    #: Shape (T, K, 3).
+    near_ecef_m: Floats  #: Position accurate to some kilometres, shape (T, 3); NaN if unknown.
+    #: Satellite positions and velocities, shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
     code_m: Floats  #: Observed pseudoranges, shape (T, K).
-    rate_mps: Floats  #: ``-lambda D``, shape (T, K).
-    #: Shape (T, K).
+    rate_mps: Floats  #: Range rates from Dopplers, ``-lambda D``, shape (T, K).
+    #: Corrected pseudoranges and their standard deviations, shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
     used: Masks  #: Channels without a rejection reason, shape (T, K).
-    named: Masks  #: Channels with separate errors, which would be used otherwise; shape (T, K).
-    noise_scale: Floats  #: Shape (T,).
-    #: Known offsets between the receiver clocks and their sigmas; shape (T, G).
+    named: Masks  #: Channels rejected for a separate error only, shape (T, K).
+    noise_scale: Floats  #: Ratio of the receiver's range standard deviation to `sigma_m`, shape (T,).
+    #: Known offsets between the receiver clocks, and their standard deviations, shape (T, G).
     clock_offset_m: Floats
     clock_sigma_m: Floats
-    off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
-    #: True where codes are grossly wrong or flagged as wrong, or the position failed a check; shape (T,).
+    off_line_m: Floats  #: Distance of the 3-D position across from the line, shape (T,); NaN beyond an end.
+    #: True where codes are grossly wrong or flagged as wrong, or the position failed a check, shape (T,).
     doubted: Masks
-    antenna: Indices  #: Index of the antenna's line in `lines`, shape (T,).
+    antenna: Indices  #: Index of each epoch's antenna in `lines`, shape (T,).
     lines: tuple[SearchIndex, ...]  #: Line of each antenna.
 
     def take(self, rows: slice | Indices) -> MotionInputs:
-        """Return the inputs of a selection of epochs."""
+        """Return the inputs of selected epochs."""
         own = {
             n: values if n in ("channel", "group", "lines") else values[rows] for n, values in self._asdict().items()
         }
         return MotionInputs(**own)
 
     def nearest_on_lines(self) -> tuple[Floats, Floats]:
-        """Return the nearest vertices of the lines to `near_ecef_m`, (T, 3), and axes across and up, (T, 2, 3)."""
+        """Return the line vertices nearest to `near_ecef_m`, (T, 3), and the axes across and up there, (T, 2, 3)."""
         point, axes = np.full(self.near_ecef_m.shape, np.nan), np.full((len(self.time), 2, 3), np.nan)
         for number, line in enumerate(self.lines):
             rows = np.flatnonzero((self.antenna == number) & np.isfinite(self.near_ecef_m[:, 0]))
@@ -61,12 +61,12 @@ class MotionInputs(NamedTuple):
 
 
 def clock_columns(inputs: MotionInputs) -> Floats:
-    """Return the columns of the receiver clocks, shape (K, G)."""
+    """Return the design columns of the receiver clocks, shape (K, G)."""
     return np.asarray(inputs.group[:, None] == np.arange(inputs.group.max(initial=-1) + 1), dtype=np.float64)
 
 
 def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
-    """Return positions (T, 3), unit vectors to the satellites (T, K, 3) and codes less ranges (T, K)."""
+    """Return approximate positions (T, 3), unit vectors to the satellites (T, K, 3) and codes less ranges (T, K)."""
     near = inputs.near_ecef_m
     to_satellite = inputs.sat_ecef_m - near[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2)
@@ -75,7 +75,10 @@ def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
 
 
 def fit_epochs(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
-    """Return solutions, covariances and noise scales of weighted least squares; NaN with a redundancy below `least`."""
+    """Return solutions, covariances and noise scales of weighted least squares, epoch by epoch.
+
+    Solutions and noise scales are NaN where the redundancy is below `least`, or where the position is undetermined.
+    """
     has = (weight > 0) & np.isfinite(value) & np.isfinite(design).all(axis=2)
     rows = np.where(has[..., None], design, 0.0)
     y, w = np.where(has, value, 0.0), np.where(has, weight, 0.0)

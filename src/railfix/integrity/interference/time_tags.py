@@ -1,8 +1,8 @@
-"""A common error of the time tags as a hypothesis: position, receiver clocks and the error fitted together.
+"""Test of the hypothesis of a common time-tag error, fitted together with position and receiver clocks.
 
-With wrong tags the satellite positions are computed for the wrong time, so that the design column of the error is the
-negative range rate. Bad codes and a train off its map are the alternative hypotheses: the error must explain clearly
-more.
+With wrong time tags, satellite positions are computed for the wrong time; the design column of the error is thus the
+negative range rate. The alternative hypotheses are bad codes and a train off its map. A time-tag error is accepted only
+if it explains the residuals clearly better.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ from railfix.core.arrays import Datetimes, Floats, Masks, masked_median
 from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 
-#: Order of magnitude of a satellite's range rate, the unit of the error's design column [m/s].
+#: Order of magnitude of a satellite's range rate, by which the design column of the error is divided [m/s].
 _RATE_MPS: Final = 500.0
-#: Largest and smallest number of epochs for the median error; none is older than the window.
+#: Largest and smallest number of epochs for the median error, and the largest age of an epoch.
 _TAG_EPOCHS: Final = 10
 _TAG_LEAST: Final = 3
 _TAG_WINDOW: Final = np.timedelta64(60, "s")
-_STEPS: Final = 6  #: Largest number of steps of a fit, and convergence limits of the error [s] and the position [m].
+_STEPS: Final = 6  #: Largest number of steps of a fit; its convergence limits of error [s] and position [m] follow.
 _SETTLED_S: Final = 0.05
 _SETTLED_M: Final = 100.0
 _ROUNDS: Final = 2  #: Reweighted fits per step.
 _FITS_WELL: Final = 3.0  #: Multiple of the median up to which residuals have full weight.
-_SHOWN: Final = 3.0  #: Errors from this many standard deviations on are tested against the other hypotheses.
-_NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's position across and above its line.
+_SHOWN: Final = 3.0  #: Errors above this many standard deviations are tested against the alternative hypotheses.
+_NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's distance from its line, across and up.
 _LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree on an error.
-#: Residuals up to this many standard deviations agree; larger ones cost no more. A time-tag error can absorb one bad
-#: code, so that it must reduce the cost by more than one of these squared.
+#: Residual limit for agreement, in standard deviations; residuals are clipped at this limit in the cost.
 _AGREES: Final = 5.0
+#: Minimum reduction of the cost. It exceeds the cost of one clipped residual because a time-tag error can absorb one
+#: bad code.
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
@@ -60,11 +61,11 @@ class _TagFit(NamedTuple):
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     """Return the common time-tag error, positive for late tags, and its standard deviation, shape (T,) [s].
 
-    Satellites flagged as wrong are fitted too, since a time-tag error makes satellites appear wrong. Where the error is
-    significant, or a position is in doubt, the line is used as a constraint. The standard deviation is infinite unless
-    redundant rows agree and the cost is clearly lower than without a time-tag error and without the flagged satellites.
-    The cost is the sum of squares of the normalised residuals of all codes and of the line, each residual clipped at
-    `_AGREES`.
+    Satellites flagged as wrong are fitted, too, since a time-tag error makes satellites appear wrong. Where the error
+    is significant, or a position is in doubt, the line is used as a constraint. The standard deviation is then infinite
+    unless redundant rows agree and the cost is clearly lower than without a time-tag error and without the flagged
+    satellites. The cost is the sum of the squared normalised residuals of all codes and of the line, clipped at
+    `_AGREES`. Error and standard deviation are NaN where they cannot be determined.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
@@ -79,12 +80,12 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
 
 
 def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) -> Masks:
-    """Return whether a time-tag error explains clearly more than bad codes do, from both sets of residuals; (T,)."""
+    """Return whether a time-tag error explains the residuals clearly better than bad codes, shape (T,)."""
     every = inputs.used | inputs.named
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
-    # without a redundant range the remaining ranges fit in any case, and the flagged ranges do not
+    # without a redundant range, the unflagged ranges fit exactly and the flagged ranges count as wrong
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise of this fit, at most the receiver's noise, which would include a time-tag error
+    # noise of this fit, limited to the receiver's noise, which would include a time-tag error
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -94,9 +95,7 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
 def _fit(
     inputs: MotionInputs, counted: Masks, late_s: Floats, place_ecef_m: Floats, *, tags: bool, line: bool
 ) -> _TagFit:
-    """Return positions from the `counted` codes (T, K), with a time-tag error if `tags`, and near the line if
-    `line`.
-    """
+    """Fit positions to the `counted` codes (T, K), with a time-tag error if `tags`, and near the line if `line`."""
     rows, late, place = np.arange(len(late_s)), late_s.copy(), place_ecef_m.copy()
     sigma, residual = np.full(len(rows), np.nan), np.full((len(rows), counted.shape[1] + 2), np.nan)
     for _ in range(_STEPS):
@@ -122,14 +121,15 @@ def _fit(
 
 
 def _with_line(channels: Masks, line: bool) -> Masks:
-    """Return a mask of channels, shape (T, K), and of the two rows of the line, shape (T, K + 2)."""
+    """Append the two rows of the line constraint to a mask of channels (T, K); shape (T, K + 2)."""
     return np.concatenate([channels, np.full((len(channels), 2), line)], axis=1)
 
 
 def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
-    """Return solutions, standard deviations of the fourth unknown, and residuals over their standard deviations.
+    """Return solutions, standard deviations of the fourth unknown, and absolute residuals in standard deviations.
 
-    The `counted` rows are fitted, with lower weight for large residuals; for other rows only residuals are computed.
+    The `counted` rows are fitted, with lower weights for large residuals. For the remaining rows only residuals are
+    computed.
     """
     now = full = np.where(counted, weight, 0.0)
     for _ in range(_ROUNDS):
@@ -141,7 +141,7 @@ def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks)
 
 
 def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
-    """Return the ranges with satellite positions `late_s`, shape (T,), earlier."""
+    """Return the inputs with satellite positions and velocities moved back in time by `late_s`, shape (T,)."""
     place, velocity, before = inputs.sat_ecef_m, inputs.sat_velocity_mps, -late_s[:, None, None]
     gravity = -GM_GPS / np.linalg.norm(place, axis=2, keepdims=True) ** 3 + EARTH_ROTATION_RATE**2 * _ACROSS_AXIS
     coriolis = 2.0 * EARTH_ROTATION_RATE * np.stack([velocity[..., 1], -velocity[..., 0], 0.0 * velocity[..., 0]], 2)
@@ -153,10 +153,10 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 
 
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median time-tag error over the last epochs, also in standard deviations, and the errors to keep.
+    """Return the median time-tag error over the last epochs, its ratio to its standard deviation, and the new state.
 
-    The standard deviation is the median over the epochs, or their spread where it is larger. NaN for fewer than
-    `_TAG_LEAST` epochs.
+    The standard deviation is the median of the epochs' standard deviations, or the spread of their errors if larger.
+    The results are NaN for fewer than `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
     lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))

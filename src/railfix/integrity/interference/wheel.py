@@ -1,8 +1,8 @@
-"""Satellite distance against wheel distance: detects a slow pull along the track that no other test detects.
+"""Comparison of satellite and wheel distances, which detects a slow pull of the positions along the track.
 
-Over a window the two distances differ by the noise of two positions and by the wheel's scale-factor error, which is
-estimated before the window. A pull from the start of the run, or within the uncertainty of the diameter, is not
-detected.
+Over a window, the two distances differ by the noise of two positions and by the wheel scale-factor error, which is
+estimated before the window. A pull that exists from the start of the run, or is within the uncertainty of the wheel
+diameter, is not detected.
 """
 
 from __future__ import annotations
@@ -16,44 +16,45 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Minimum standard deviation of a position: satellite and atmospheric errors that change over minutes [m].
+#: Standard deviation added to positions for satellite and atmospheric errors that change over minutes [m].
 _LEAST_M: Final = 1.0
-#: Speed up to which a wheel may creep while its tachometer has no output [m/s].
+#: Largest speed at which a tachometer may have no output [m/s].
 _SLOW_MPS: Final = 0.5
-#: Positions are used at this interval; tags may precede the whole second by this time.
+#: Interval of the positions used, and time by which a tag may precede the whole second.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSamples(RowArrays):
-    """Positions and distances once per second, shape (N,)."""
+    """Satellite positions and wheel distances, at most once per second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Position along the line by satellites.
+    #: Satellite position along the line, and its standard deviation.
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
     distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start.
-    #: Largest distance that the wheel may have rolled below its minimum speed.
+    #: Largest distance since the start that the wheel may have rolled undetected, below its minimum speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Number of the part, a distance rolled without slip or gap.
+    #: Number of the part; a part is a stretch without slip and without a gap in the wheel data.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelState:
-    """State after a chunk."""
+    """State of the comparison after a chunk."""
 
     #: First sample of the current part, and the samples of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
-    #: Wheel distance at the last epoch; the speed is NaN where unknown.
+    #: `WheelSamples.distance_m` and `doubt_m` at the last epoch, and the last known wheel speed (NaN before).
     distance_m: float = 0.0
     doubt_m: float = 0.0
     speed_mps: float = float("nan")
-
+    #: Number of the current part, and GPS second of the last epoch.
     part: int = 0
     second: int = -1
     held: HeldState = field(default_factory=HeldState)
+    #: Fields of `WheelSigns` at the last sample, and whether the difference is excessive there.
     difference_m: float = float("nan")
     bound_m: float = float("nan")
     beyond: bool = False
@@ -61,15 +62,15 @@ class WheelState:
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSigns:
-    """Comparison of T epochs."""
+    """Differences between satellite and wheel distances at T epochs."""
 
-    #: Satellite distance over the window less wheel distance; NaN where not compared; shape (T,).
+    #: Satellite distance less scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
-    #: Bound of the position error for a pull that began within the window, even if it is shorter than `wheel_least_s`:
-    #: the difference plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since
-    #: then; shape (T,).
+    #: Bound of the position error for a pull that began within the window, shape (T,). It is the absolute difference
+    #: plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since then. It is also
+    #: given for windows shorter than `wheel_least_s`.
     bound_m: Floats
-    #: True where the difference exceeds noise and diameter error, or did so within the release time; shape (T,).
+    #: True where the difference exceeds noise and diameter error, or has done so within the release time; shape (T,).
     parted: Masks
 
 
@@ -83,11 +84,11 @@ def wheel_signs(
     *,
     signed: bool,
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare satellite and wheel distances, shapes (T,), and return the state for the next chunk.
+    """Compare satellite and wheel distances of T epochs, and return the signs and the state for the next chunk.
 
-    `arc_m` and `sigma_m` are positions along the line, single-epoch or filtered, NaN if missing; `wheel_m` is the wheel
-    distance since the previous epoch, NaN if unknown; `signed` tells whether it has the sign of the motion along the
-    line.
+    `arc_m` and `sigma_m` are single-epoch or filtered positions along the line and their standard deviations, NaN if
+    missing. `wheel_m` is the wheel distance since the previous epoch, NaN if unknown. `signed` is True if the wheel
+    distance has the sign of the motion along the line. The arrays have the shape (T,).
     """
     if not len(time):
         return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
@@ -118,7 +119,7 @@ def wheel_signs(
 def _wheel_distances(
     time: Datetimes, wheel_m: Floats, state: WheelState, limits: InterferenceLimits
 ) -> tuple[WheelSamples, WheelState]:
-    """Return the wheel distance at epochs, and the state; a new part begins after a slip or an unknown distance."""
+    """Accumulate the wheel distance; a new part begins after a slip, a long interval or an unknown distance."""
     span = seconds(np.diff(np.concatenate([[time[0] if np.isnat(state.time) else state.time], time])))
     known = np.isfinite(wheel_m) & (span > 0.0)
     speed = np.where(known, wheel_m / np.where(span > 0.0, span, 1.0), np.nan)
@@ -141,8 +142,9 @@ def _wheel_distances(
 def _compare(
     samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
 ) -> tuple[Floats, Floats, Masks]:
-    """Return the differences over the window ending at each sample from `first` on, their bounds, and the mask of
-    excessive ones.
+    """Return differences, bounds and the mask of excessive differences over the window before each sample from `first`.
+
+    The wheel scale factor is estimated from the part before each window and applied to the wheel distance.
     """
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))
@@ -152,7 +154,7 @@ def _compare(
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Satellite less wheel distance, wheel distance, and the variance without the second position."""
+        """Return satellite less wheel distance, wheel distance, and the variance without the second position."""
         arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
             arc, distance = np.abs(arc), np.abs(distance)

@@ -1,6 +1,6 @@
-"""Protection level along the track (P1 2.4): the largest error at a stated risk.
+"""Protection level along the track (P1 2.4): bound that the position error exceeds with at most the stated risk.
 
-From the model of `railfix.integrity.raim`::
+Levels are computed from a model of `railfix.integrity.raim`::
 
     risk = RiskBudget()
     model = linear_model(ranges, trajectory, arc_m)

@@ -1,14 +1,16 @@
 """ARAIM: multiple-hypothesis solution separation with an integrity support message, along the track and in 3-D.
 
-The algorithm of the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0): for each fault mode k, the position
-without its satellites is used, with `S_k = (G' W_k G)^-1 G' W_k`, W of the integrity sigmas,
+The algorithm is that of the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0). For each fault mode k, the
+position is computed without the satellites of the mode, by `S_k = (G' W_k G)^-1 G' W_k` with the weights W of the
+integrity sigmas. For the component q of the position,
 
-- `sigma_k^2 = [(G' W_k G)^-1]_qq`, bias `b_k = sum_i |S_k,qi| b_i`,
-- threshold `T_k = K_fa sqrt(sum_i (S_k,qi - S_0,qi)^2 sigma_acc,i^2)` with the accuracy sigmas,
-- level L: `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
+- the variance is `sigma_k^2 = [(G' W_k G)^-1]_qq`, and the bias `b_k = sum_i |S_k,qi| b_i`;
+- the threshold is `T_k = K_fa sqrt(sum_i (S_k,qi - S_0,qi)^2 sigma_acc,i^2)` with the accuracy sigmas;
+- the level L satisfies
+  `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
 
-A map is a further constraint (Wenz 2024): two observations of the offsets across and up, with the sigmas of the map,
-which are faulty together if the map is wrong. The component of interest is then the position along the track.
+A map is a further constraint (Wenz 2024) by two observations, the offsets across and up, with the sigmas of the map.
+The two observations are faulty together if the map is wrong. The component q is then the position along the track.
 """
 
 from __future__ import annotations
@@ -31,20 +33,21 @@ from railfix.core.settings_files import read_toml
 from railfix.core.staged_files import FilePath
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
-#: Number of bisections of the level's interval, from 1e4 m to less than a tenth of a micrometre.
+#: Number of bisections for a level, which reduce its interval from 1e4 m to less than a tenth of a micrometre.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
-_BLOCK_SIZE: Final = 4_000_000  #: Number of elements of the largest array of a block of epochs.
+_BLOCK_SIZE: Final = 4_000_000  #: Number of elements of the largest array for a block of epochs.
 #: A matrix is singular if its determinant is below this fraction of the product of its diagonal.
 _SINGULAR: Final = 1e-12
 
 
 class AraimBudget(Settings):
-    """Allocation of integrity and continuity risk; defaults of ADD 3.0 for LPV-200, with its vertical budget along the
-    track.
+    """Allocation of integrity and continuity risk.
+
+    The defaults are the LPV-200 values of ADD 3.0, with the vertical budget also used along the track.
     """
 
-    #: Probability of hazardously misleading information in an approach or a sample.
+    #: Probability of hazardously misleading information per approach (or per sample).
     phmi_along: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_vertical: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_horizontal: float = Field(default=2e-9, gt=0, lt=1)
@@ -52,63 +55,65 @@ class AraimBudget(Settings):
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
-    #: Probability up to which fault modes may be omitted; modes of more satellites are added until it is met.
+    #: Largest total probability of faults that are not modes. Modes of more faults, up to `most_faults`, are added
+    #: until this limit is met.
     unmonitored: float = Field(default=8e-8, gt=0, lt=1)
     most_faults: int = Field(default=2, ge=1, le=3)  #: Largest number of simultaneous faults in a mode.
-    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0 for no such mode.
+    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0 omits this fault mode.
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimGeometry:
-    """Observations of T epochs, N of them: ranges, and with a map its two constraints."""
+    """N observations at each of T epochs: the ranges and, with a map, its two constraints."""
 
-    #: Partial derivatives of each observation by the P unknowns: position, then one clock per constellation; shape (T,
-    #: N, P). Any value where not used.
+    #: Partial derivatives of each observation by the P unknowns (position, then one clock per constellation), shape
+    #: (T, N, P). Values of unused observations are ignored.
     design: Floats
-    #: Standard deviations for integrity and accuracy; NaN where not used; shape (T, N).
+    #: Standard deviations for integrity and for accuracy, shape (T, N); NaN for unused observations.
     sigma_int_m: Floats
     sigma_acc_m: Floats
-    bias_m: Floats  #: Shape (T, N).
-    prior: Floats  #: Prior probability of a fault of the observation alone; shape (N,).
-    together: Masks  #: Observations that are faulty together, by constellation or by the map; shape (C, N).
-    together_prior: Floats  #: Shape (C,).
+    bias_m: Floats  #: Largest nominal bias of each observation, shape (T, N).
+    prior: Floats  #: Prior probability of a fault of a single observation, shape (N,).
+    together: Masks  #: Sets of observations that are faulty together, by constellation or for the map, shape (C, N).
+    together_prior: Floats  #: Prior probability of a fault of each set, shape (C,).
 
     @property
     def used(self) -> Masks:
-        """Observations with both sigmas, shape (T, N)."""
+        """True for observations with both sigmas, shape (T, N)."""
         return np.asarray(np.isfinite(self.sigma_int_m) & np.isfinite(self.sigma_acc_m))
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimLevels:
-    """Levels of T epochs, for Q components of the position."""
+    """Protection levels of T epochs for Q components of the position."""
 
-    #: Levels, NaN without a position, infinite where unchecked faults are likelier than the risk; shape (T, Q).
+    #: Protection levels, shape (T, Q); infinite where unmonitored faults are likelier than the risk, NaN without a
+    #: position.
     level_m: Floats
-    #: Standard deviations of the position with all observations, for integrity and for accuracy; shape (T, Q).
+    #: Standard deviations of the position from all observations, for integrity and for accuracy, shape (T, Q).
     sigma_int_m: Floats
     sigma_acc_m: Floats
     modes: Integers  #: Number of fault modes, shape (T,).
-    unmonitored: Floats  #: Probability of faults that are not modes, or leave no position; shape (T,).
+    unmonitored: Floats  #: Probability of faults that are not modes, or that leave no position, shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class AraimResult(NotebookTable):
-    """ARAIM of T epochs; NaN without a position."""
+    """ARAIM protection levels of T epochs; NaN without a position."""
 
     along: AraimLevels  #: Level along the track, with the map as a constraint.
     space: AraimLevels  #: Levels east, north and up, without the map.
 
     @property
     def horizontal_m(self) -> Floats:
-        """Horizontal level of the 3-D position, shape (T,) [m]."""
+        """Horizontal protection level of the 3-D position, shape (T,) [m]."""
         return np.asarray(np.hypot(self.space.level_m[:, 0], self.space.level_m[:, 1]))
 
 
 def araim_levels(
     geometry: AraimGeometry, phmi: Sequence[float], false_alarm: Sequence[float], budget: AraimBudget
 ) -> AraimLevels:
-    """Return the levels of the first Q unknowns; `phmi` and `false_alarm` apply to each component."""
+    """Compute the protection levels of the first Q unknowns; `phmi` and `false_alarm` have one value per unknown."""
     epochs, count = geometry.sigma_int_m.shape
     events = np.concatenate([np.eye(count, dtype=bool), geometry.together])  # single faults, then common faults; (E, N)
     sets = [list(s) for size in range(1, budget.most_faults + 1) for s in combinations(range(len(events)), size)]
@@ -131,7 +136,7 @@ def _block(
     risks: Floats,
     budget: AraimBudget,
 ) -> AraimLevels:
-    """Return the levels of a block of epochs."""
+    """Compute the levels of a block of epochs."""
     used = geometry.used[rows]
     design = np.where(used[..., None], geometry.design[rows], 0.0)
     components = risks.shape[1]
@@ -141,7 +146,7 @@ def _block(
     probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
     out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
     kept = used[:, None, :] & ~out
-    # a mode that removes no more observations than a smaller one has the position of the smaller one
+    # a mode that removes the same used observations as a smaller mode has the same position
     weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
     gain, sigma = _gains(design, weight, components)
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
@@ -177,7 +182,7 @@ def _event_priors(geometry: AraimGeometry, used: Masks) -> Floats:
 
 
 def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
-    """Return the number of simultaneous events in the modes (T,), and a bound of the probability of more events."""
+    """Return the largest number of simultaneous events in a mode and a bound of the probability of more, shape (T,)."""
     more = set_sums(prior, budget.most_faults + 1)[:, 2:]
     enough = more <= budget.unmonitored
     order = np.where(enough.any(axis=1), np.argmax(enough, axis=1) + 1, budget.most_faults)
@@ -185,10 +190,10 @@ def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
 
 
 def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Floats]:
-    """Return rows of S (T, F, Q, N) and sigmas (T, F, Q) of each mode; NaN sigmas without a position."""
+    """Return the rows of S (T, F, Q, N) and the sigmas (T, F, Q) of each mode; NaN sigmas without a position."""
     normal = np.einsum("tnp,tfn,tnr->tfpr", design, weight, design, optimize=True)
     diagonal = np.diagonal(normal, axis1=2, axis2=3)
-    # a clock without observations is left out, as if it were known
+    # a clock without observations is treated as known
     free = diagonal > 0.0
     normal = normal + np.where(free, 0.0, 1.0)[..., None] * np.eye(design.shape[2])
     scale = np.sqrt(np.where(free, diagonal, 1.0))
@@ -202,7 +207,7 @@ def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Flo
 
 
 def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Floats:
-    """Return the levels (T, Q) at which the tails (T, F, Q) use the risk, from above, by bisection."""
+    """Find by bisection the levels (T, Q) at which the tails (T, F, Q) add up to the risk; infinite beyond 1e4 m."""
     low, high = np.zeros(risk.shape), np.full(risk.shape, _LONGEST_M)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -221,7 +226,7 @@ Satellite = Annotated[str, Field(pattern=r"^[GJECR][0-9]{2}$")]
 class SatelliteSupport(Settings):
     """Integrity support of a satellite."""
 
-    #: Standard deviation of the orbit and clock error in the range: for integrity, and for accuracy and continuity.
+    #: Standard deviations of the range error due to orbit and clock, for integrity and for accuracy and continuity.
     sigma_ura_m: float = Field(gt=0)
     sigma_ure_m: float = Field(gt=0)
     bias_m: float = Field(ge=0)  #: Largest nominal bias of the range (b_nom).
@@ -236,7 +241,7 @@ class ConstellationSupport(SatelliteSupport):
 
 
 class SupportArrays(NamedTuple):
-    """Integrity support by channel, shape (M,); `constellation_prior` by letter."""
+    """Integrity support by channel, shape (M,), and fault probabilities by constellation letter."""
 
     sigma_ura_m: Floats
     sigma_ure_m: Floats
@@ -249,12 +254,12 @@ class IntegritySupport(Settings):
     """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
-    #: Validity period of the message [GPS time]; None if not stated. Epochs outside have no ARAIM level.
+    #: Validity period of the message [GPS time]; None if not stated. Epochs outside the period have no ARAIM level.
     valid_from: datetime | None = None
     valid_until: datetime | None = None
     #: Support by constellation letter; a constellation without support is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
-    #: Satellites with their own support.
+    #: Support of single satellites, which replaces the support by constellation.
     satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -286,7 +291,7 @@ class IntegritySupport(Settings):
         )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
-        """Return the support of each channel; NaN for constellations without support."""
+        """Return the support of each channel from the names of its satellites ("G07"); NaN without support."""
         of_each = [self.satellite.get(name) or self.constellation.get(name[0]) for name in satellites]
         ura, ure, bias, prior = (
             np.array([np.nan if each is None else getattr(each, name) for each in of_each], dtype=np.float64)
@@ -296,7 +301,7 @@ class IntegritySupport(Settings):
 
 
 def read_integrity_support(path: FilePath) -> IntegritySupport:
-    """Read an integrity support message from TOML."""
+    """Read an integrity support message from a TOML file; InputFileError if it is not such a message."""
     values = read_toml(path, what="an integrity support message")
     if values.get("format") != FORMAT:
         raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")

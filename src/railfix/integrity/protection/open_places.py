@@ -1,8 +1,8 @@
-"""Other positions on the line that are possible under the hypotheses of a level.
+"""Positions on the line off the tangent that are possible under the fault hypotheses of a protection level.
 
 A level bounds the error along the tangent. Where the line bends, passes itself or branches, leaving out a satellite can
-move the position to a point off the tangent. Under each hypothesis of the level the sum of squared residuals, a
-quadratic form of the position, is evaluated along the line unless a bound excludes such positions.
+move the position to a point off the tangent. Under each hypothesis of the level, the sum of squared residuals is a
+quadratic form of the position. It is evaluated along the line unless a bound excludes positions off the tangent.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from railfix.positioning.search_index import SearchIndex
 
 #: Largest distance searched [m], at which the linear model of a range has an error of 0.7 m.
 _FURTHEST_M: Final = 5000.0
-_NEGLIGIBLE: Final = 0.01  #: Fraction of the risk of a sample below which no search is made.
+_NEGLIGIBLE: Final = 0.01  #: Fraction of the risk of a sample that positions outside the search radius may have.
 
 
 class Forms(NamedTuple):
-    """Sum of squared residuals in variances, over the offset d from the position, under K hypotheses, T epochs.
+    """Sums of squared residuals under K hypotheses of T epochs, as quadratic forms of the offset d from the position.
 
-    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position. The map error is assumed
-    equal in all horizontal directions: another position has another tangent.
+    ``q(d) = constant - 2 d . slope + d^T matrix d`` in noise variances, with d along, across and up at the position.
+    The map error is assumed to be equal in all horizontal directions, because the tangent changes with the position.
     """
 
-    prior: Floats  # (T, K), 0 for unused entries
-    form: Floats  # (T, K, 10): constant, slope [1/m], upper triangle of the matrix [1/m^2]
-    lowest_m: Floats  # (T, K) distance to the minimum of each form; NaN where singular
+    prior: Floats  # (T, K) probability of the hypothesis, 0 for unused entries
+    form: Floats  # (T, K, 10) constant, slope [1/m], upper triangle of the matrix [1/m^2]
+    lowest_m: Floats  # (T, K) distance to the minimum of the form; NaN where singular
     depth: Floats  # (T, K) depth of the minimum
-    widest_m2: Floats  # (T, K) trace of the inverse of the matrix, which is above its largest eigenvalue
+    widest_m2: Floats  # (T, K) trace of the inverse matrix, a bound of its largest eigenvalue
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the distance within which the possible positions of each hypothesis lie, shape (T, K); 0 without a
-        prior.
+        """Return the search radius of each hypothesis, shape (T, K); 0 for a hypothesis without a prior.
 
-        Positions beyond this distance have 1 % of the risk in total, equally for each hypothesis.
+        Positions outside the radii have at most 1 % of the risk in total, divided equally among the hypotheses. The
+        radius is at most 5 km.
         """
         possible = self.prior > 0
         each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(possible, axis=1, keepdims=True), 1)
@@ -52,7 +52,7 @@ class Forms(NamedTuple):
         return np.where(possible, np.fmin(radius, _FURTHEST_M), 0.0)
 
 
-_BOUND_SIZE: Final = 200_000  #: Number of elements of a block of epochs by squared channels.
+_BOUND_SIZE: Final = 200_000  #: Number of epochs of a block times its squared number of channels.
 
 
 def places_beyond_the_level(
@@ -65,12 +65,12 @@ def places_beyond_the_level(
     risk: RiskBudget,
     sides: Masks,
 ) -> Masks:
-    """Return the epochs with possible positions on the line beyond the level, shape (T,).
+    """Return the mask of epochs whose level does not cover a possible position on the line, shape (T,).
 
-    Under a hypothesis J, a position that fits worse than the best by x variances is the true one with a probability of
-    at most ``Q(sqrt(x))``. An epoch is returned where these probabilities, of the best position beyond the level, times
-    the prior of J, sum to more than the risk of a sample. `scale` counts as at least 1; `sides`, shape (T, S, M), are
-    the low satellites of each side.
+    Under a hypothesis J, a position that fits worse than the best position by x variances is true with a probability of
+    at most ``Q(sqrt(x))``. This probability is computed for the best position beyond the level under each hypothesis
+    and multiplied by the prior of J. An epoch is marked where the sum exceeds the risk of a sample. Values of `scale`
+    below 1 count as 1. `sides`, shape (T, S, M), marks the low satellites of each side.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]
@@ -104,7 +104,7 @@ def places_beyond_the_level(
 
 
 def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Forms, risk: RiskBudget) -> Floats:
-    """Return the probability that the true position lies beyond the level off the tangent, shape (T,)."""
+    """Return a bound of the probability that the true position is beyond the level off the tangent, shape (T,)."""
     radius = forms.radius_m(risk.risk_per_sample)
     sections = _around(index, arc_m, level_m, radius.max(axis=1))
     return kernels.off_tangent.risk_beyond(forms.prior, forms.form, radius, *sections)
@@ -113,17 +113,17 @@ def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Fo
 def _around(
     index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
 ) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the sections within a radius of each position, divided at its level, epoch after epoch.
+    """Return the line sections within a radius of each position, divided at the level, in the order of the epochs.
 
     Returns
     -------
     first : ndarray of int, shape (T + 1,)
-        First section of each epoch, then their number P.
+        Index of the first section of each epoch, followed by the total number P.
     start_m, tangent : ndarray, shape (P, 3)
-        Offsets along, across and up from the position.
+        Start point and unit vector of each section, along, across and up relative to the position.
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of sections beyond the level and off the tangent; infinite for other sections.
+        Distance of sections beyond the level and off the tangent from the position; infinite for other sections.
     """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)

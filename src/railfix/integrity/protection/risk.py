@@ -1,9 +1,9 @@
 """Integrity risk of a protection level, and its allocation to fault hypotheses.
 
-The risk of the hour (P1 2.4: 1e-7, RTCA DO-229D) is divided by the number of independent samples in it, and that of an
-epoch is allocated to its hypotheses; the rest is subtracted beforehand. A hypothesis is a set of faults: shared ones (a
-constellation, the low satellites of a side, a wrong map) and single satellites; those with equal shared faults and
-number of satellites are a class.
+The risk per hour (P1 2.4: 1e-7, RTCA DO-229D) is divided by the number of independent samples in an hour. The risk of a
+sample, less the probability of faults that are not hypotheses, is allocated to the hypotheses of the epoch. A
+hypothesis is a set of shared faults (of a constellation, of the low satellites of a side, of the map) and of faulty
+single satellites. Hypotheses with equal shared faults and equal numbers of single satellites form a class.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
-#: Probability that a satellite is faulty at a time: 1e-5 per hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
-#: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
-#: other constellations are treated as Galileo, because their commitments are more recent.
+#: Probability that a satellite is faulty at a given time: 1e-5 for GPS (1e-5 per hour, lasting an hour), 3e-5 for
+#: Galileo (EU-U.S. Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the later Galileo service
+#: definition). Other constellations get the value of Galileo, because their commitments are more recent.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
-MOST_EXCLUDED: Final = 2  #: Largest number of exclusions with a level (P1 2.3(4) excludes up to two satellites).
-MOST_TOGETHER: Final = 4  #: Largest number of simultaneously faulty satellites in a hypothesis.
+MOST_EXCLUDED: Final = 2  #: Largest number of excluded satellites with which a level is computed (P1 2.3(4)).
+MOST_TOGETHER: Final = 4  #: Largest number of faulty single satellites in a hypothesis.
 
 
 def k_factor(risk: float) -> float:
-    """Return the two-sided normal quantile: the sigmas that a one-dimensional error exceeds with this probability per
-    sample.
+    """Return K such that a one-dimensional error exceeds K sigma, on either side, with probability `risk`.
 
-    Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a horizontal position.
+    A risk of 1e-7 gives 5.33, 1e-8 gives 5.73. The Rayleigh factor of a horizontal position is larger. ValueError: the
+    risk is not in (0, 1].
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
@@ -49,11 +49,11 @@ def k_factor(risk: float) -> float:
 
 
 def one_sided_k(probability: Floats) -> Floats:
-    """Return the one-sided normal quantile of this probability; -inf from 1 on, inf at 0 and below."""
+    """Return the one-sided normal quantile of each probability; -inf for 1 and above, inf for 0 and below."""
     return np.asarray(-scipy.special.ndtri(np.clip(probability, 0.0, 1.0)))
 
 
-Probability = Annotated[float, Field(ge=0, lt=1)]  #: Probability below 1.
+Probability = Annotated[float, Field(ge=0, lt=1)]  #: Probability from 0 to below 1.
 
 
 class RiskBudget(Settings):
@@ -61,48 +61,47 @@ class RiskBudget(Settings):
 
     #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 per hour.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
-    #: Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s: multipath of a
-    #: moving train changes within seconds, that of a standing one within tens of seconds, SBAS corrections within
-    #: minutes (DO-229D appendix J counts 10 samples per hour). A larger number is conservative; from 10 to 3600 the
-    #: fault-free K grows by 0.9.
+    #: Number of independent samples in an hour, 3600 s divided by the correlation time of the errors. The default
+    #: assumes 10 s: multipath changes within seconds on a moving train, within tens of seconds on a standing train,
+    #: and SBAS corrections change within minutes (DO-229D appendix J counts 10 samples per hour). A larger number is
+    #: conservative. From 10 to 3600 samples, the fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
-    #: Fractions of the risk of an epoch, with a sum of at most 1. They determine the three parts of the level, from the
-    #: largest of which the level is lowered until the sum of all tails equals the sum of the fractions. Doubling a
-    #: fraction lowers a K of 6 by only 0.1, and a K of 3 by 0.2, so the default is thirds.
+    #: Fractions of the risk of an epoch for the three parts of the level, with a sum of at most 1. The level is lowered
+    #: from the largest part until the sum of all tails equals the sum of the fractions. Doubling a fraction lowers a K
+    #: of 6 by only 0.1, and a K of 3 by 0.2, so the default is thirds.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that are not hypotheses. If their probability exceeds this fraction, further
-    #: faults become hypotheses, up to four satellites at a time and three shared faults (constellation, side, map).
+    #: Fraction of the risk for faults that are not hypotheses. If the faults exceed this fraction, further faults
+    #: become hypotheses, up to four simultaneous satellites and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
     #: Fraction of the risk for epochs with one excluded satellite, and the same fraction for two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
-    #: Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
+    #: Probability per epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
-    #: Probability that a satellite is faulty, by constellation: its own signal.
+    #: Probability that the signal of a satellite is faulty, by constellation.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    #: Additional probability of a local fault (multipath, interference): an assumption until measured on the line (P1
-    #: 7).
+    #: Additional probability of a local fault (multipath, interference) of a satellite. It is an assumption until
+    #: measured on the line (P1 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
-    #: Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
-    #: another reference frame. This is an assumption; 0 for no such hypothesis.
+    #: Probability that the map is wrong by more than its stated error, for example by a parallel track, heights without
+    #: the geoid, or a different reference frame. It is an assumption. With 0, a wrong map is no hypothesis.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
-    #: Probability that low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No data
-    #: supports a smaller value, and every output of the levels says so if a smaller one is set; 0 for no such
-    #: hypothesis.
+    #: Probability that the low satellites of one side of the track are faulty together (`SUPPORTED_SIDE_PRIOR`). No
+    #: data supports a smaller value, and every output of the levels reports a smaller setting. With 0, a faulty side is
+    #: no hypothesis.
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Elevation up to which satellites count as low: the top of a wall whose height equals its distance.
+    #: Elevation up to which satellites count as low. 45 deg is the top of a wall whose height equals its distance.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
-    #: Satellites that are faulty together: the low ones left of the track, or right of it ("beside"); also all
-    #: satellites ahead, or behind, as in the filter ("all"). A single epoch without these satellites has a weak
-    #: geometry along the track, so that the levels become up to three times as large.
+    #: Satellites that are faulty together: the low satellites left or right of the track ("beside"), or in addition all
+    #: satellites ahead or behind, as in the filter ("all"). Without the satellites ahead or behind, a single epoch has
+    #: a weak geometry along the track, so that the levels become up to three times as large.
     late_sides: Literal["beside", "all"] = "beside"
     #: Whether the priors were measured on this line (``railfix error-model``). Levels with assumed priors are called
-    #: indicative in every output, and no hourly risk is claimed. "measured" needs `local_prior` and `side_prior` to be
-    #: given.
+    #: indicative in every output, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.
     priors: Literal["assumed", "measured"] = "assumed"
-    #: Probability of a fault that many satellites of a constellation share; an unnamed constellation has none, and the
-    #: level does not cover it.
+    #: Probability of a fault shared by many satellites of a constellation, by constellation. The level does not cover
+    #: such faults of constellations without a value.
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -124,18 +123,18 @@ class RiskBudget(Settings):
 
     @property
     def risk_per_sample(self) -> float:
-        """Risk of an epoch, exclusions and unchecked faults included."""
+        """Integrity risk of an epoch, including the parts for exclusions and unchecked faults."""
         return self.risk_per_hour / self.samples_per_hour
 
     @property
     def sample_k(self) -> float:
-        """K of a level without fault hypotheses: the whole risk of a sample, two-sided."""
+        """Two-sided factor K of a level without fault hypotheses, which uses the whole risk of a sample."""
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Return the fault probability of each channel, shape (M,), for the satellite and the antenna's surroundings.
+        """Return the fault probability of each channel, the sum of satellite prior and local prior, shape (M,).
 
-        ValueError: a constellation has no prior.
+        ValueError: a constellation has no satellite prior.
         """
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
@@ -143,11 +142,11 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """Return the risk of an epoch for the set that remains after exclusions, any shape.
+        """Return the risk of an epoch for the satellites that remain after exclusions, any shape.
 
-        The probability of faults beyond the checked ones, `beyond`, is subtracted once. Every set that exclusion could
-        have left is a possible failure, so the part of the risk for e exclusions is divided by the number of sets of e
-        among all satellites. 0 beyond `MOST_EXCLUDED`, and where nothing remains.
+        `beyond` is the probability of unchecked faults, which is subtracted first. Any e satellites could have been
+        excluded, so the part of the risk for e exclusions is divided by the number of sets of e among all satellites.
+        The result is 0 for more than `MOST_EXCLUDED` exclusions, and where `beyond` exceeds the risk.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -162,9 +161,10 @@ class RiskBudget(Settings):
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
-    """Return sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
+    """Return the sums over all sets of 0, 1, ..., `most` faults of the products of their priors, shape (T, most + 1).
 
-    Bounds of the probability of as many faults or more (Newton's identities).
+    `prior` has the shape (T, M). Column k bounds the probability of k or more faults. The sums are computed by Newton's
+    identities.
     """
     power, powers = prior, []
     for _ in range(most):
@@ -177,19 +177,19 @@ def set_sums(prior: Floats, most: int) -> Floats:
     return np.stack(sums, axis=1)
 
 
-#: Largest number of simultaneous shared faults in a hypothesis; the probability of more is subtracted from the risk.
+#: Largest number of shared faults in a hypothesis; the probability of more shared faults is subtracted from the risk.
 _MOST_SHARED: Final = 3
-FEW: Final = 2  #: Epochs per chunk (two antennas, live) up to which the allocation is cached.
-REMEMBERED: Final = 512  #: Number of cached allocations, as satellites come and go behind obstacles.
-_MOST_SETS: Final = 46_376  #: Largest number of sets in a class that are left out individually: four of 34 satellites.
+FEW: Final = 2  #: Largest number of epochs in a chunk for which the allocation is cached (two antennas live).
+REMEMBERED: Final = 512  #: Number of cached allocations, since satellites disappear and reappear behind obstacles.
+_MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class, the number of sets of four of 34 satellites.
 
 
 class Shared(NamedTuple):
     """Simultaneous shared faults."""
 
-    events: tuple[int, ...]  # constellations, then sets that fail together
+    events: tuple[int, ...]  # indices of constellations, then of sides
     wrong_map: bool
-    kind: int  # number of faults; two sides count as one
+    kind: int  # number of faults; two sides count as one fault
 
     @property
     def size(self) -> int:
@@ -201,36 +201,37 @@ class Shared(NamedTuple):
 class Allocation:
     """Allocation of the risk of T epochs; compared by identity."""
 
-    prior: Floats  # (T, M), 0 where not used
-    groups: tuple[str, ...]  # letters of the C constellations with a prior of their own
+    prior: Floats  # (T, M) fault probability of each satellite, 0 for unused channels
+    groups: tuple[str, ...]  # letters of the C constellations with a `constellation_prior`
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
-    members: Masks  # (T, B, M) satellites of these
-    shared_prior: Floats  # (T, B) of these, 0 where absent
-    order: Indices  # (T, B) largest number of satellites left out with each; -1 if not a hypothesis
-    beyond: Floats  # probability of the classes that are no hypotheses
-    fault_free: Floats  # risk of each part
+    members: Masks  # (T, B, M) satellites affected by each set of shared faults
+    shared_prior: Floats  # (T, B) probability of each set of shared faults, 0 where absent
+    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if it is no hypothesis
+    beyond: Floats  # (T,) probability of the classes that are not hypotheses
+    fault_free: Floats  # (T,) risk for no fault; `one`, `two` and `more` for one, two and three or more faults
     one: Floats
     two: Floats
-    more: Floats  # 0 where three faults are no hypotheses
-    reserved: Floats  # probability of satellite pairs where they fit into their allocation unchecked
-    k_false_alarm: Floats
+    more: Floats  # 0 where three faults are not hypotheses
+    reserved: Floats  # (T,) probability of satellite pairs where they are within their allocation unchecked, else 0
+    k_false_alarm: Floats  # (T,) factor K of the thresholds
 
 
 def allocate(
     model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers, sides: Masks, *, wrong_map: bool
 ) -> Allocation:
-    """Divide the risk of each epoch.
+    """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    Satellites alone, in pairs (where these are likelier than their allocation) and with a wrong map, constellations
-    with one satellite, and sides are always hypotheses, as are classes likelier than the unchecked part. `out`, shape
-    (T,): satellites excluded; `sides`, shape (T, S, M): sets of satellites that fail together.
+    Hypotheses are always: single satellites, alone and with a wrong map; pairs of satellites, where they are likelier
+    than their allocation; constellations, alone and with one satellite; sides; and every class that is likelier than
+    the risk for unchecked faults. `out`, shape (T,), is the number of excluded satellites; `sides`, shape (T, S, M),
+    are the sets of satellites that are faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
-    if len(used) <= FEW:  # live operation uses the same satellites epoch after epoch
+    if len(used) <= FEW:  # in live operation, successive epochs mostly have the same satellites
         given = (used.tobytes(), out.tobytes(), sides.tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    # Most epochs of a chunk share their satellites with others: each set is computed once.
+    # Many epochs of a chunk have the same satellites; the allocation is computed once per set of satellites.
     bits = np.packbits(np.concatenate([used, sides.reshape(len(used), -1)], axis=1), axis=1)
     keys = np.concatenate([bits, np.ascontiguousarray(out)[:, None].view(np.uint8)], axis=1)
     _, first, which = np.unique(keys.view(f"V{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
@@ -240,7 +241,7 @@ def allocate(
 
 
 class _Same:
-    """Budget that is compared by identity, so that its contents are not hashed."""
+    """Risk budget compared by identity, so that a cache does not hash its contents."""
 
     def __init__(self, risk: RiskBudget) -> None:
         self.risk = risk
@@ -256,7 +257,7 @@ class _Same:
 def _of_few_epochs(
     risk: _Same, systems: tuple[str, ...], used: bytes, out: bytes, sides: bytes, count: int, wrong_map: bool
 ) -> Allocation:
-    """Return the cached allocation of few epochs, which must not be changed."""
+    """Return the cached allocation of up to `FEW` epochs; its arrays must not be changed."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocate(
         np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(), systems, risk.risk, excluded,
@@ -269,12 +270,12 @@ def _allocate(
 ) -> Allocation:
     of_channel = risk.prior(systems)
     prior = used * of_channel
-    # Excluded satellites count among those that may be faulty, with the largest prior.
+    # Excluded satellites count among the satellites that may be faulty, with the largest prior.
     everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * of_channel.max(initial=0.0)], axis=1)
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
     members = np.concatenate([used[:, None] & of_letter, sides], axis=1)
-    # A constellation has a satellite at least, a side two.
+    # A constellation needs at least one used satellite to be a shared fault, a side two.
     nominal = np.array([risk.constellation_prior[s] for s in letters] + [risk.side_prior] * sides.shape[1])
     least = np.array([1] * len(letters) + [2] * sides.shape[1])
     event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)
@@ -295,7 +296,7 @@ def _allocate(
     )
     beyond = classes.rest(order)
     left = risk.sample_risk(n, out, beyond)
-    # Hypotheses of three faults take a quarter of every part.
+    # Hypotheses of three or more faults get a quarter of the risk of every part.
     more = (order + [s.kind for s in shared] >= 3).any(axis=1, where=order >= 0)
     left = np.where(more, 0.75, 1.0) * left
     parts = [s * left for s in (risk.fault_free_share, risk.one_fault_share, risk.two_fault_share)]
@@ -318,8 +319,8 @@ def _allocate(
 
 @lru_cache(maxsize=64)
 def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
-    """Return the B sets of up to three shared faults, smaller sets first, and the mask of sets with one fault less (B,
-    B).
+    """Return the B sets of up to three shared faults, smaller sets first, and for each the mask (B, B) of its subsets
+    with one fault less.
     """
     sets = []
     for size in range(_MOST_SHARED + 1):
@@ -335,29 +336,33 @@ def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool
 
 @dataclass(frozen=True)
 class _Classes:
-    """Classes of hypotheses: T epochs, B sets of shared faults, 0 to `MOST_TOGETHER` satellites with each."""
+    """Classes of hypotheses of T epochs: B sets of shared faults, each with 0 to `MOST_TOGETHER` single satellites."""
 
-    each: Floats  # (T, B) prior of the shared faults
-    within: Masks  # (B, B) sets of one fault less
-    sums: Floats  # (T, MOST_TOGETHER + 2) over sets of satellites of 0, 1, 2, ...
-    further: Floats  # (T,) probability of more shared faults than may be hypotheses
-    least: Sequence[int]  # length B, satellites always left out with each; -1 if not a hypothesis
+    each: Floats  # (T, B) prior of each set of shared faults
+    within: Masks  # (B, B) subsets with one fault less
+    sums: Floats  # (T, MOST_TOGETHER + 2) `set_sums` of the satellite priors
+    further: Floats  # (T,) probability of more than `_MOST_SHARED` shared faults
+    least: Sequence[int]  # length B, number of single satellites always left out with each set; -1 for no hypothesis
 
     def _take(self, rows: Indices) -> _Classes:
         return replace(self, each=self.each[rows], sums=self.sums[rows], further=self.further[rows])
 
     def rest(self, order: Indices) -> Floats:
-        """Return the probability of faults that are not hypotheses, shape (T,); unchosen shared sets count in full."""
+        """Return the probability of faults that are not hypotheses, shape (T,).
+
+        A set of shared faults that is no hypothesis includes all its supersets.
+        """
         whole = (order < 0) & (self.each > 0.0)
         covered = whole.astype(np.float64) @ self.within.T > 0.0
         each = np.where(covered, 0.0, self.each * np.take_along_axis(self.sums, order + 1, axis=1))
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Choose the largest number of satellites left out with each set of shared faults, shape (T, B).
+        """Choose the largest number of single satellites left out with each set of shared faults, shape (T, B).
 
-        The probability `share` may stay unchecked; `likely`, length B, are the priors of the shared faults, `satellite`
-        is the prior of a satellite.
+        Faults with a total probability of `share` may remain unchecked. `likely`, length B, are the nominal priors of
+        the sets of shared faults, and `satellite` is the mean prior of a satellite. The likeliest classes are chosen
+        first.
         """
         sizes = np.arange(MOST_TOGETHER + 1)
         feasible = scipy.special.comb(used[:, None], sizes) <= _MOST_SETS

@@ -1,13 +1,12 @@
-"""Protection level along the track with fault hypotheses: solution separation over sets of faults.
+"""Protection level along the track by solution separation over fault hypotheses.
 
-While ``|x_J - x| <= T_J``, the position x is within T_J of the position x_J, which a fault of the subset J does not
-affect. The level L is reached where the tails of all hypotheses use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+While ``|x_J - x| <= T_J``, the position x is within T_J of the position x_J, which is not affected by a fault of the
+subset J. At the level L, the tails of all hypotheses add up to the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
-The thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. The level is found from above: from the
-largest of ``K_ff sigma_0 + b_0`` without fault and, for one fault and for two and more, the largest ``T_J + K sigma_J +
-b_J``.
+The thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false-alarm probability evenly. The search for the level starts
+at an upper bound, the largest of ``K_ff sigma_0 + b_0`` (no fault) and of ``T_J + K sigma_J + b_J`` over all J.
 """
 
 from __future__ import annotations
@@ -29,83 +28,87 @@ from railfix.core.notebook import NotebookTable
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 
-_BLOCK_SIZE: Final = 200_000  #: Number of elements of a pair array of a block of epochs.
-_OF_MORE: Final = 3  #: Index of the tails of three and more faults among all kinds.
-_SAME: Final = 1e-9  #: Separation, over the sigma of the position, below which the two positions are the same.
+_BLOCK_SIZE: Final = 200_000  #: Number of elements of a block's array of hypotheses.
+_OF_MORE: Final = 3  #: Index of the tails of three or more faults among the kinds of hypotheses.
+_SAME: Final = 1e-9  #: Separation in position sigmas below which two positions are the same.
 
 
 class Cause(IntEnum):
-    """Hypothesis that uses most of the risk of an epoch at its level, or the reason for a missing level."""
+    """Hypothesis that uses most of the risk of an epoch at its level, or the reason for an infinite or missing level.
+
+    The faults are those of a satellite, of a constellation, of a side of the track (or both sides), or of the map.
+    """
 
     #: Fault-free noise of the position.
     FAULT_FREE = 0
-    #: A fault of one satellite, of a constellation, of a side of the track (or of both), or of the map.
+    #: A single fault.
     ONE_FAULT = 1
-    #: Two simultaneous faults of these.
+    #: Two simultaneous faults.
     TWO_FAULTS = 2
-    #: Infinite: undetectable satellite faults are likelier than their part of the risk.
+    #: Infinite level: undetectable satellite faults are likelier than their part of the risk.
     UNCHECKED = 3
-    #: Infinite: more faults than can be hypotheses are likelier than the risk allows, or too many satellites excluded.
+    #: Infinite level: faults that are not hypotheses exceed the risk, or too many satellites are excluded.
     BUDGET = 4
     #: No position.
     NO_POSITION = 5
-    #: Three or more simultaneous faults of these.
+    #: Three or more simultaneous faults.
     THREE_FAULTS = 6
-    #: Infinite: local faults cannot be bounded on this part of the line.
+    #: Infinite level: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
-    #: Infinite as `UNCHECKED`, mostly by faults of a constellation, alone or with satellites.
+    #: Infinite level as `UNCHECKED`, mostly by faults of a constellation, alone or with satellites.
     UNCHECKED_CONSTELLATION = 8
-    #: Infinite as `UNCHECKED`, by faults of one or both sides of the track.
+    #: Infinite level as `UNCHECKED`, mostly by faults of one or both sides of the track.
     UNCHECKED_SIDE = 9
-    #: Infinite as `UNCHECKED`, by faults of the map.
+    #: Infinite level as `UNCHECKED`, mostly by faults of the map.
     UNCHECKED_MAP = 10
-    #: Infinite as `UNCHECKED`, by several of these three together.
+    #: Infinite level as `UNCHECKED`, mostly by simultaneous faults of constellations, sides or the map.
     UNCHECKED_TOGETHER = 11
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ProtectionLevel(NotebookTable):
-    """Levels along the track of T epochs; NaN without a position."""
+    """Protection levels along the track of T epochs; NaN without a position."""
 
-    #: Level at which the sum of all tails is within the risk; at most the largest of the three parts, whose risk
-    #: allocations need not be fully used. Infinite for the reason in `cause`; shape (T,).
+    #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. At most
+    #: the largest part, since the parts need not use their risk allocations fully.
     level_m: Floats
-    #: Parts of the level. 0 where the part's hypotheses fit into its allocation of the risk unchecked; shape (T,).
+    #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the hypotheses of a part are
+    #: within its risk allocation unchecked.
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
-    sigma_m: Floats  #: Standard deviation of the position along the track, without a fault; shape (T,).
-    #: Factors K of each part; -inf where not required; shape (T,).
+    sigma_m: Floats  #: Standard deviation of the position along the track without a fault, shape (T,).
+    #: Factor K of each part, shape (T,); -inf where not required.
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
     k_false_alarm: Floats  #: Factor K of the thresholds, shape (T,).
-    separation: Floats  #: Largest ``|x_J - x|/T_J``; 0 where no satellite can be left out; shape (T,).
-    #: True where the separation is at most 1. Otherwise the level is invalid. False without a position; shape (T,).
+    separation: Floats  #: Largest ``|x_J - x|/T_J``, shape (T,); 0 where no satellite can be left out.
+    #: True where the separation is at most 1, shape (T,). Otherwise the level is invalid. False without a position.
     consistent: Masks
-    #: Channel that determines `one_fault_m`; -1 if it is not a channel (`worst_constellation`, a side, the map); shape
-    #: (T,).
+    #: Channel that determines `one_fault_m`, shape (T,); -1 if a constellation, a side or the map determines it.
     worst_one: Indices
-    worst_two: Indices  #: Channels that determine `two_fault_m`; -1 for none; shape (T, 2).
-    #: Letter of the constellation that determines `one_fault_m`; empty for none; shape (T,).
+    worst_two: Indices  #: Pair of channels that determines `two_fault_m`, shape (T, 2); -1 if it is no such pair.
+    #: Letter of the constellation that determines `one_fault_m`, shape (T,); else empty.
     worst_constellation: Strings
-    unchecked_risk: Floats  #: Probability of the faults that are not hypotheses, subtracted from the risk; shape (T,).
+    unchecked_risk: Floats  #: Probability of faults that are not hypotheses, subtracted from the risk, shape (T,).
     cause: Codes  #: `Cause`, shape (T,).
 
 
 class RangeBounds(NamedTuple):
-    """Paired overbound of each range, shapes (T, M) or (M,) [m]: least standard deviation, and largest nominal bias."""
+    """Paired overbound of each range, shapes (T, M) or (M,) [m]: smallest standard deviation, largest nominal bias."""
 
     sigma_m: ArrayLike | None = None
     bias_m: ArrayLike | None = None
 
 
 class MapDeviation(NamedTuple):
-    """Information on the map error across and up in addition to its sigmas."""
+    """Information on the map error across and up in addition to the map sigmas."""
 
-    bias_m: ArrayLike = 0.0  #: Offset not covered by the sigma, shape (T, 2) or (2,).
-    #: Antenna position without the map, and its inverse covariance (0 if unknown). If given, a wrong map is a
-    #: hypothesis with the prior `RiskBudget.map_prior`; shapes (T, 2) [m] [1/m^2].
+    bias_m: ArrayLike = 0.0  #: Map offset not covered by the sigmas, shape (T, 2) or (2,).
+    #: Offset across and up of the antenna position computed without the map, shape (T, 2) [m], and its inverse
+    #: covariance, shape (T, 2, 2) [1/m^2] (0 if unknown). If given, a wrong map is a hypothesis with the prior
+    #: `RiskBudget.map_prior`.
     seen: tuple[Floats, Floats] | None = None
 
 
@@ -120,29 +123,29 @@ def protection_level(
     sides: Masks | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
-    """Return the protection level along the track (P1 2.4; WG-C ARAIM in one dimension).
+    """Compute the protection level along the track (P1 2.4; WG-C ARAIM in one dimension).
 
     Parameters
     ----------
     model : LinearModel
-        T epochs on the line (`linear_model`), after exclusions; 1/weight is the variance of the range.
+        Model of T epochs on the line (`linear_model`), after exclusions.
     systems : sequence of str, length M
         Constellation letter of each channel.
     scale : array_like, shape (T,) or ()
-        Noise scale: multiplies the sigmas of the ranges, not the map error.
+        Noise scale, which multiplies the sigmas of the ranges but not the map error.
     overbound : RangeBounds, optional
-        By default the sigma of each range follows from its weight and the scale, without bias.
+        By default, the sigma of each range follows from its weight and the scale, and the bias is 0.
     sides : ndarray of bool, shape (T, S, M), optional
-        Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
+        Sets of satellites that reflections can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or (), or ndarray of bool, shape (T, M)
-        Satellites excluded by fault detection at this epoch (without those that the screens rejected), as their number
-        or as `RaimResult.excluded`.
+        Number of satellites excluded by RAIM, or `RaimResult.excluded`; satellites rejected by the screens do not
+        count.
 
     Raises
     ------
     ValueError
-        The noise scale is not positive, `systems` does not name each channel, or the model contains an excluded
-        satellite: solve again without it, as `exclude_faults` does.
+        The model is not on the line, the noise scale is not positive, `systems` does not name each channel, or the
+        model contains an excluded satellite (`exclude_faults` returns ranges and positions without them).
     """
     if model.interest != 1:
         raise ValueError("a level along the track needs a model on the line (linear_model)")
@@ -183,7 +186,7 @@ def protection_level(
 
 
 def _by_epoch(values: ArrayLike | None, epochs: int, width: int) -> Floats:
-    """Return values for each epoch, shape (T, width); (T, 0) for none."""
+    """Return the values of each epoch, shape (T, width); shape (T, 0) for None."""
     if values is None:
         return np.zeros((epochs, 0))
     return _broadcast(np.asarray(values, dtype=np.float64), (epochs, width))
@@ -194,7 +197,7 @@ def _broadcast(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
-    """Return a result without positions."""
+    """Return the result of epochs that all lack a position."""
     floats = "level_m fault_free_m one_fault_m two_fault_m sigma_m k_fault_free k_one_fault k_two_faults k_false_alarm"
     return ProtectionLevel(
         **{name: np.full(epochs, np.nan) for name in (*floats.split(), "separation")},
@@ -205,7 +208,7 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
-    """Group the epochs by number of hypotheses, so that no block is wider than necessary."""
+    """Return blocks of epochs with similar numbers of hypotheses, so that no block is wider than necessary."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
@@ -219,7 +222,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
 
 
 class Errors(NamedTuple):
-    """Range and map errors given to `protection_level`; shape (T, 0) for none."""
+    """Range and map errors given to `protection_level`; shape (T, 0) where not given."""
 
     scale: Floats
     least_sigma_m: Floats
@@ -230,7 +233,7 @@ class Errors(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """Hypotheses of a block of epochs: fields of `Allocation`, and their offsets in the arrays of all hypotheses."""
+    """Hypotheses of a block of epochs: fields of `Allocation`, and indices into the arrays of all hypotheses."""
 
     prior: Floats  # (T, M)
     members: Masks  # (T, B, M) satellites of each set of shared faults
@@ -238,24 +241,24 @@ class Asked(NamedTuple):
     shared_prior: Floats  # (T, B)
     order: Indices  # (T, B)
     k_false_alarm: Floats  # (T,)
-    first: Indices  # (B, MOST_TOGETHER + 1) index of the first hypothesis with this many satellites; -1 for none
-    bounds: Indices  # (5,) first index of no fault, one fault, two, more; total number
+    first: Indices  # (B, MOST_TOGETHER + 1) first hypothesis with 0, 1, ... single satellites; -1 for none
+    bounds: Indices  # (5,) first hypothesis with no fault, one, two, and more faults; total number
 
 
 class _Names(NamedTuple):
-    """Faults outside the hypotheses of a block, and the risk of each part."""
+    """Hypotheses of a block, the risk of each part, and the names of the faults."""
 
     asked: Asked
-    share: Floats  # (T, 4)
-    letters: Strings  # after the channels: constellations, then the sides, a wrong map, and none
-    pairs: Indices  # (K, 2), the last entry for none
+    share: Floats  # (T, 4) risk for no fault, one, two, and more faults
+    letters: Strings  # single faults after the n channels: constellation letters, then empty
+    pairs: Indices  # (K, 2) pairs of channels; the last entry is (-1, -1)
 
 
 def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: Errors) -> dict[str, NDArray[Any]]:
-    """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
+    """Compute the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(model.used.sum(axis=1).max())
-    # the allocation of few epochs is cached, with the data derived from it
+    # the allocation of few epochs is cached, and so are the data derived from it
     every = len(rows) == len(plan.beyond) <= FEW
     asked, share, letters, pairs = _names_of_few(plan, n) if every else _names(plan, rows, n)
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(model.arrays, of_block, asked)
@@ -288,7 +291,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
 
 
 def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:
-    """Return the cause (T,): the shared faults with most of the unchecked probability (T, K)."""
+    """Return the `Cause` (T,) of the shared faults that have most of the unchecked probability (T, K)."""
     spent, causes = [], []
     for shared, first in zip(plan.shared, asked.first.tolist(), strict=True):
         classes = [open_to_faults[:, at : at + math.comb(n, k)].sum(axis=1) for k, at in enumerate(first) if at >= 0]
@@ -305,7 +308,7 @@ def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: i
 
 @lru_cache(maxsize=256)
 def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indices, Indices]:
-    """Return `Asked.first` and `Asked.bounds` for sets of shared faults with at most this many of n satellites."""
+    """Return `Asked.first` and `Asked.bounds` for sets of shared faults with up to `most` of n satellites each."""
     bounds, place = [], 0
     first = np.full((len(kinds), MOST_TOGETHER + 1), -1, dtype=np.intp)
     for kind in range(_OF_MORE + 1):
@@ -323,7 +326,7 @@ def _names_of_few(plan: Allocation, n: int) -> _Names:
 
 
 def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
-    """Return the hypotheses of epochs with at most n used channels: no fault, one fault, two, more."""
+    """Return the hypotheses of epochs with at most n used channels, ordered by the number of faults."""
     order = plan.order[rows]
     kinds = tuple(shared.kind for shared in plan.shared)
     first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
@@ -339,7 +342,7 @@ def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
-    """Return the channels at compact indices, shape (T, k); -1 for -1."""
+    """Return the channels at compact indices, shape (T, k); -1 where the index is -1."""
     return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 
@@ -350,22 +353,21 @@ def _pairs(n: int) -> Indices:
 
 
 class LevelStatus(IntEnum):
-    """Level status of an epoch, against an alarm limit."""
+    """Status of an epoch's protection level relative to the alarm limit."""
 
     #: The level is within the alarm limit.
     AVAILABLE = 0
-    #: The level is above the alarm limit or infinite, or the position is missing.
+    #: The level exceeds the alarm limit, or the position is missing.
     UNAVAILABLE = 1
     #: The ranges are inconsistent, so that the level is invalid.
     ALARM = 2
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """Return the `LevelStatus` of epochs by their levels and an alarm limit (P1 2.4), int8 of shape (T,).
+    """Return the `LevelStatus` of each epoch from its level [m] and the alarm limit (P1 2.4), int8, same shape.
 
-    Levels [m] are NaN without a position.
-
-    An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
+    A level of NaN means that there is no position. The status of an inconsistent epoch with a position is ALARM
+    (`ProtectionLevel.consistent`). ValueError: the alarm limit is not positive.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")

@@ -1,16 +1,16 @@
-"""RAIM: fault detection, exclusion of up to two satellites, reliability (P1 2.3(4); P4).
+"""RAIM: fault detection, exclusion of up to two satellites, and reliability (P1 2.3(4); P4).
 
-One `LinearModel` is used for the position on the line and the one in space::
+The functions take a `LinearModel` of the position, on the line or in space::
 
     detection = detect(constrained.wsse, constrained.residual_m, ranges.n_used - ranges.n_clocks - 1, scale=scale)
     failing = np.flatnonzero(detection.detected)
     model = linear_model(ranges.take(failing), trajectory, constrained.arc_m[failing])
     exclusion = exclude(model, scale=scale[failing])
-    # solve again without what `exclusion.excluded` marks, then
+    # solve again without the channels in `exclusion.excluded`, then
     level = reliability(linear_model(ranges, trajectory, constrained.arc_m), scale=scale).protection_level_m
 
-The noise scale multiplies the sigmas of the ranges after the fit: the fit itself, and with it the balance between
-ranges and map error, uses the weights.
+The noise scale multiplies the sigmas of the ranges after the fit. The fit uses the unscaled weights, so that the scale
+does not change the balance between ranges and map error.
 """
 
 import lazy_loader

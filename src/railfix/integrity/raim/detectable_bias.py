@@ -1,9 +1,9 @@
-"""Reliability: size of undetectable faults, and their effect on the position.
+"""Reliability: minimal detectable biases, and the effect of undetected biases on the position.
 
-With noncentrality lambda the test misses a fault with the stated probability (P4). For the range of satellite i this is
-a bias of ``sigma_i sqrt(lambda / r_ii)``, because only the fraction r_ii of its square enters the statistic.
-``slope_i`` is the change of the position per unit of the statistic's root; the level is the largest slope times
-``sigma0 sqrt(lambda)`` (P4), and K sigma for the noise of the position.
+A fault of noncentrality lambda is missed by the test with the stated probability (P4). It corresponds to a bias of
+``sigma_i sqrt(lambda / r_ii)`` in the range of satellite i, because only the fraction r_ii of the squared bias enters
+the statistic. ``slope_i`` is the position change per unit of the statistic's square root. The protection level is the
+largest slope times ``sigma0 sqrt(lambda)`` (P4), plus K sigma for the noise of the position.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.position_model import LinearModel, compact
 
-#: Smallest effect of a satellite on the position, in position sigmas; a smaller effect counts as zero.
+#: Effect of a range on the position, in position sigmas, up to which it counts as zero.
 _NO_EFFECT: Final = 1e-6
-_BLOCK_SIZE: Final = 40_000  #: Number of elements of a pair array of a block of epochs.
+_BLOCK_SIZE: Final = 40_000  #: Number of elements of a block's array of channel pairs.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
-    """Reliability of T epochs by M channels, for the chi-square test."""
+    """Reliability of T epochs by M channels for the chi-square test."""
 
-    noncentrality: Floats  #: lambda of the epoch's degrees of freedom; NaN where not testable; shape (T,).
-    #: Range error missed with the stated probability; infinite if unchecked, NaN if unused; shape (T, M).
+    noncentrality: Floats  #: Noncentrality lambda for the epoch's degrees of freedom, shape (T,); NaN if not testable.
+    #: Range error missed with the stated probability, shape (T, M); infinite for unchecked, NaN for unused channels.
     minimal_detectable_bias_m: Floats
-    #: Position error per unit of the statistic's root; NaN where not used; shape (T, M).
+    #: Position error per unit of the statistic's square root, shape (T, M); NaN for unused channels.
     slope_m: Floats
-    #: Largest slope for errors of two satellites; NaN unless two faults are requested; shape (T,).
+    #: Largest slope for errors of two satellites, shape (T,); NaN unless `RaimLimits.faults` is 2.
     pair_slope_m: Floats
-    worst: Indices  #: Channel of the largest slope; -1 without one; shape (T,).
-    #: Standard deviation along the line; in space along the longest axis of the horizontal ellipse; shape (T,).
+    worst: Indices  #: Channel of the largest single slope, shape (T,); -1 if no channel has a slope.
+    #: Standard deviation along the line, or in space along the longest axis of the horizontal ellipse, shape (T,).
     position_sigma_m: Floats
-    #: Position error by a fault that the test misses with the stated probability: slope sqrt(lambda); shape (T,).
+    #: Position error due to a fault that is missed with the stated probability, slope sqrt(lambda), shape (T,).
     fault_level_m: Floats
-    noise_level_m: Floats  #: Noise part, K sigma, shape (T,).
-    #: Sum of the two; infinite where a satellite is unchecked; NaN without a position; shape (T,).
+    noise_level_m: Floats  #: Noise part of the level, K sigma, shape (T,).
+    #: Sum of fault and noise level, shape (T,); infinite where a fault cannot be detected; NaN without a position.
     protection_level_m: Floats
     available: Masks  #: True where the protection level is finite, shape (T,).
-    alarm: Masks  #: True where the level is not known to be within the alarm limit, shape (T,).
+    alarm: Masks  #: True where the level exceeds the alarm limit or is NaN, shape (T,).
 
 
 def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
-    """Compute detectable biases, slopes and protection levels of the used satellites of a model after exclusions.
+    """Compute minimal detectable biases, slopes and protection levels from a model after exclusions.
 
-    The limits of the chi-square test are used in every mode. The noise scale, shape (T,) or (), is the argument of
+    The limits of the chi-square test are used in every mode. `scale`, shape (T,) or (), is the noise scale as for
     `detect`; it does not affect the map error in `position_sigma_m`.
     """
     limits = limits or RaimLimits()
@@ -77,7 +77,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
     if limits.faults == 2:
         pair = _pair_slopes(model, scale, sigma)
         largest = np.fmax(largest, pair)
-    # Without redundancy no fault of any size is detected.
+    # Without redundancy, a fault of any size is undetected.
     fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
     # K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane
     risk = limits.noise_risk
@@ -101,7 +101,10 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Noncentrality that the chi-square test misses with `missed_detection` (P4); NaN below 1 degree of freedom."""
+    """Return the noncentrality that the chi-square test misses with probability `missed_detection` (P4), same shape.
+
+    It is NaN below 1 degree of freedom.
+    """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
     values, which = np.unique(freedom, return_inverse=True)
@@ -111,24 +114,24 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
 
 @lru_cache(maxsize=1024)
 def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
-    """Return the lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
+    """Return lambda such that ``P(noncentral chi-square(lambda) < T_CS) = missed_detection``."""
     return float(scipy.special.chndtrinc(scipy.special.chdtri(freedom, false_alarm), freedom, missed_detection))
 
 
 def _longest_axis(covariance: Floats) -> Floats:
-    """Return the root of the largest eigenvalue of 1 x 1 or 2 x 2 matrices, shape (T,)."""
+    """Return the square root of the largest eigenvalue of 1 x 1 or 2 x 2 covariances, shape (T,)."""
     if covariance.shape[1] == 1:
         return np.asarray(np.sqrt(covariance[:, 0, 0]))
     return np.asarray(np.sqrt(_largest_eigenvalue(covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1])))
 
 
 def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Return the largest eigenvalue of symmetric matrices ((a, b), (b, c))."""
+    """Return the largest eigenvalue of the symmetric matrices ((a, b), (b, c))."""
     return np.asarray((a + c) / 2.0 + np.hypot((a - c) / 2.0, b))
 
 
 def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floats) -> Floats:
-    """Return the slopes of single satellites, shape (T, M) [m]."""
+    """Return the slopes for errors of single satellites, shape (T, M) [m]; infinite for unchecked channels."""
     effect = np.sqrt((model.gain_m**2).sum(axis=2))
     checked = share > LEAST_REDUNDANCY
     unchecked = np.where(effect > _NO_EFFECT * sigma[:, None], np.inf, 0.0)
@@ -138,10 +141,10 @@ def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floa
 
 
 def _pair_slopes(model: LinearModel, scale: Floats, sigma: Floats) -> Floats:
-    """Return the largest slope by errors of any two satellites, shape (T,) [m]; NaN where fewer than two are used.
+    """Return the largest slope for errors of any two satellites, shape (T,) [m]; NaN where fewer than two are used.
 
-    The largest ``|G^T b|^2 / (b^T S_EE b)`` over errors b of the pair: the largest eigenvalue of
-    ``G^T S_EE^-1 G`` with the gains G of the two (2 x k).
+    The squared slope is the largest ``|G^T b|^2 / (b^T S_EE b)`` over errors b of the pair, i.e. the largest eigenvalue
+    of ``G^T S_EE^-1 G`` with the gains G of the pair (2 x k).
     """
     result = np.full(len(model), np.nan)
     rows = np.flatnonzero(np.isfinite(sigma) & (np.count_nonzero(model.used, axis=1) >= 2))
@@ -168,7 +171,7 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     regular = both & (np.minimum(a, c) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
     first, second = parts.gain_m[:, i], parts.gain_m[:, j]
 
-    # Entries of G^T adj(S_EE) G, over the determinant.
+    # Entries of G^T adj(S_EE) G, to be divided by the determinant.
     def entry(k: int, m: int) -> Floats:
         cross = first[..., k] * second[..., m] + second[..., k] * first[..., m]
         return np.asarray(c * first[..., k] * first[..., m] - b * cross + a * second[..., k] * second[..., m])
@@ -177,8 +180,8 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
     squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
-    # Errors invisible in the residuals: (sqrt c, -+ sqrt a). Without effect on the position the pair adds nothing to
-    # its single satellites.
+    # Errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If they do not move the position, the
+    # slope of the pair is not larger than the single slopes.
     x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
     hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)
     blind = both & ~regular & (hidden > _NO_EFFECT * sigma[:, None] * np.hypot(x, y))

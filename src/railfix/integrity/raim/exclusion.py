@@ -1,8 +1,8 @@
 """Fault detection by the sum of squared residuals (P4: chi-square; P1 2.3(4): 100 m^2), and fault exclusion.
 
-Leaving out the satellites E is equivalent to an unknown bias for each: their errors are ``b_E = S_EE^-1 nu_E``, the
-WSSE falls by ``nu_E^T b_E``, the position moves by ``-Q B_E^T b_E``. Every satellite and pair is thus tested without
-solving again.
+Leaving out the satellites E is equivalent to estimating a bias for each satellite of E. The estimated biases are
+``b_E = S_EE^-1 nu_E``, the WSSE falls by ``nu_E^T b_E``, and the position moves by ``-Q B_E^T b_E``. Every satellite
+and every pair is thus tested without solving again.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.core.settings import Settings
 from railfix.integrity.raim.position_model import Compact, LinearModel, compact
 
-_TABLE_STEP: Final = 64  #: Degrees of freedom are tabulated in steps of this many.
+_TABLE_STEP: Final = 64  #: The size of a table of thresholds is a multiple of this number.
 
 
 class RaimLimits(Settings):
-    """Limits of detection, exclusion and reliability."""
+    """Limits of fault detection, fault exclusion and reliability."""
 
-    mode: Literal["chi_square", "fixed"] = "chi_square"  #: False-alarm rate (P4), or P1's fixed limit.
+    mode: Literal["chi_square", "fixed"] = "chi_square"  #: Threshold from a false-alarm rate (P4), or fixed (P1).
     #: Probability that noise alone is detected as a fault; P4: 0.001. The error of an excluded satellite must exceed
     #: the noise at this probability (chi-square mode).
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing a fault of the minimal detectable size. P4 gives no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
-    #: Mode "fixed": limit on the sum of squared residuals, and on the square of an excluded satellite's error; P1 table
-    #: 6 ("FDE 2 SAT, 100 m2").
+    #: Limit of mode "fixed" for the sum of squared residuals, and for the squared error of an excluded satellite; P1
+    #: table 6 ("FDE 2 SAT, 100 m2").
     fixed_limit_m2: float = Field(default=100.0, gt=0)
     #: Largest number of satellites excluded at an epoch: 0, 1 or 2 (P1 2.3(4): 2).
     max_excluded: int = Field(default=2, ge=0, le=2)
     min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
-    #: Probability that noise makes the true exclusion fit worse than another one by the separation (chi-square, one
-    #: degree of freedom). If another exclusion of as many satellites passes and fits nearly as well, the epoch is
-    #: inseparable.
+    #: Probability that noise makes the true exclusion fit worse than a competing exclusion by the separation
+    #: (chi-square, one degree of freedom). If another exclusion of as many satellites passes and fits worse by less
+    #: than the separation, the epoch is inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: Exclusions whose positions are closer than this do not compete, as the position is the same in either case (for
-    #: example the two satellites of a separate clock). With 0 they always compete.
+    #: Distance of two positions below which their exclusions do not compete because the position hardly changes (for
+    #: example the two satellites of a separate clock). With 0, exclusions always compete.
     same_position_m: float = Field(default=0.0, ge=0)
     #: Two-sided probability of noise beyond K sigma in the protection level; 1 gives K = 0, which is P4's ``HSlope
     #: sigma0 sqrt(lambda)``.
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
     #: Alarm limit of the protection level. P4 accepts an error within a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0)
-    faults: int = Field(default=1, ge=1, le=2)  #: Simultaneous faults that the protection level covers: 1 (P4) or 2.
+    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults that the level covers; P4: 1.
 
     @model_validator(mode="after")
     def _rates_below_one(self) -> Self:
@@ -62,7 +62,7 @@ class RaimLimits(Settings):
 
     @cached_property
     def separation(self) -> float:
-        """Minimum WSSE difference to another exclusion, in noise variances."""
+        """Minimum WSSE difference from a competing exclusion, in noise variances."""
         return float(scipy.special.chdtri(1, self.separation_risk))
 
     @cached_property
@@ -75,11 +75,12 @@ class RaimLimits(Settings):
 class Detection:
     """Result of fault detection for T epochs."""
 
-    #: WSSE over the noise scale squared; fixed mode: sum of squares [m^2]; NaN without a position; shape (T,).
+    #: WSSE divided by the squared noise scale, or in fixed mode the sum of squared residuals [m^2], shape (T,); NaN
+    #: without a position.
     statistic: Floats
-    threshold: Floats  #: Threshold of the statistic; NaN where not testable; shape (T,).
+    threshold: Floats  #: Threshold of the statistic, shape (T,); NaN where not testable.
     freedom: Integers  #: Degrees of freedom, shape (T,).
-    detected: Masks  #: The statistic is at or over the threshold, shape (T,).
+    detected: Masks  #: True where the statistic reaches or exceeds the threshold, shape (T,).
     testable: Masks  #: True where at least one range is redundant, shape (T,).
 
 
@@ -91,20 +92,20 @@ def detect(
     limits: RaimLimits | None = None,
     scale: ArrayLike = 1.0,
 ) -> Detection:
-    """Test the residuals of positions (P4: ``T >= T_D`` accepts that there is a fault).
+    """Test the residuals of positions for a fault (P4: ``T >= T_D``).
 
-    Accepts results of the solvers, or the attributes of these names of a `LinearModel`.
+    The arguments are results of the solvers, or the attributes of the same names of a `LinearModel`.
 
     Parameters
     ----------
     wsse : array_like, shape (T,)
         Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
-        Residuals, 0 (or NaN) where not used; required in fixed mode only. Residuals of a `LinearModel` include the map
-        error, residuals of a `Constrained` position do not; they are equal only for an exact map, as in P1 (a sigma of
-        a millimetre).
+        Residuals, 0 or NaN for unused channels; used in fixed mode only. Residuals of a `LinearModel` include the map
+        error, residuals of a `Constrained` position do not. The two are equal only for an exact map, as in P1 (a sigma
+        of a millimetre).
     freedom : array_like of int, shape (T,)
-        Ranges beyond the unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space - 3.
+        Number of ranges less unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space ``- 3`` instead.
     scale : array_like, shape (T,) or ()
         Ratio of the receiver's range standard deviation to the sigmas of the weights. Not used in fixed mode.
     """
@@ -123,9 +124,9 @@ def detect(
 
 
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Return the threshold of the statistic for degrees of freedom of any shape; NaN below 1.
+    """Return the threshold of the statistic for the given degrees of freedom, same shape; NaN below 1.
 
-    P4: false alarm 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
+    Example from P4: a false-alarm rate of 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -137,7 +138,7 @@ def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats
 
 @lru_cache(maxsize=64)
 def _chi_square_table(false_alarm: float, size: int) -> Floats:
-    """Return the chi-square thresholds for 0 (NaN) to size - 1 degrees of freedom."""
+    """Return the chi-square thresholds for 0 to size - 1 degrees of freedom, NaN for 0."""
     table = np.full(size, np.nan)
     table[1:] = scipy.special.chdtri(np.arange(1, size), false_alarm)
     table.flags.writeable = False
@@ -145,7 +146,7 @@ def _chi_square_table(false_alarm: float, size: int) -> Floats:
 
 
 _ROUNDING: Final = 1e-9  #: Relative difference within which two WSSE count as equal.
-#: Number of elements of a subset array of a block of epochs: about the size of a core's cache.
+#: Number of elements of a block's array of subsets, which about fits into the cache of a core.
 _BLOCK_SIZE: Final = 40_000
 
 
@@ -154,11 +155,11 @@ class Outcome(IntEnum):
 
     #: The residuals are within the noise.
     PASSED = 0
-    #: One satellite is excluded, and the others pass.
+    #: One satellite is excluded, and the remaining satellites pass.
     EXCLUDED_ONE = 1
-    #: Two satellites are excluded, and the others pass.
+    #: Two satellites are excluded, and the remaining satellites pass.
     EXCLUDED_TWO = 2
-    #: A fault is detected, but another exclusion of as many satellites explains it as well, so that none is made.
+    #: A fault is detected, but no satellite is excluded because two exclusions explain the fault about equally well.
     INSEPARABLE = 3
     #: A fault is detected, and no permitted exclusion passes.
     UNRESOLVED = 4
@@ -171,42 +172,42 @@ class Exclusion:
     """Exclusions of T epochs by M channels."""
 
     outcome: Codes  #: `Outcome`, shape (T,).
-    excluded: Masks  #: Channels to leave out; only with the outcomes EXCLUDED_ONE and EXCLUDED_TWO; shape (T, M).
-    #: Channels of the passing subset with the smallest statistic, also if INSEPARABLE; -1 for none; shape (T, 2).
+    excluded: Masks  #: True for excluded channels, only with the outcomes EXCLUDED_ONE and EXCLUDED_TWO; (T, M).
+    #: Channels of the passing subset with the smallest statistic, also if INSEPARABLE, shape (T, 2); -1 for none.
     best: Indices
-    #: Closest competing exclusion: the next passing subset of as many channels; -1 for none; shape (T, 2).
+    #: Channels of the closest competing exclusion, the next passing subset of as many channels, (T, 2); -1 for none.
     alternative: Indices
-    #: Error of the channels of `best` relative to the others, positive for a long range; NaN elsewhere; shape (T, M).
+    #: Error of the channels of `best` relative to the others, positive for a long range, shape (T, M); else NaN.
     own_error_m: Floats
-    #: Statistic without `best`; the original statistic where no subset exists; shape (T,).
+    #: Statistic without the channels of `best`, shape (T,); the original statistic where no subset passes.
     statistic_after: Floats
-    #: Position change by leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 for none; shape (T,
-    #: k).
+    #: Position change when `best` is left out, shape (T, k): along the line (k = 1), or east and north (k = 2); 0 if no
+    #: subset passes.
     position_change_m: Floats
-    #: Distance between the positions without `best` and without `alternative`; NaN where either is missing; shape (T,).
+    #: Distance between the positions without `best` and without `alternative`, shape (T,); NaN if either is missing.
     alternative_shift_m: Floats
     detection: Detection  #: Detection before any exclusion.
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """Every subset of one size left out, T epochs by K subsets."""
+    """Results of leaving out each of the K subsets of one size, T epochs."""
 
     members: Indices  # (K, 1 or 2), indices in the compact arrays
-    statistic: Floats
-    wsse_drop: Floats
-    own: tuple[Floats, ...]  # errors of the members [sigma]
-    allowed: Masks  # all members are used, checked by the others, and each error is over its limit
+    statistic: Floats  # (T, K) of the remaining channels
+    wsse_drop: Floats  # (T, K)
+    own: tuple[Floats, ...]  # (T, K) error of each member [sigma]
+    allowed: Masks  # (T, K) all members are used, checked by other channels, and have errors above the limit
 
 
 def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Exclusion:
-    """Detect faults, and try the exclusion of every single satellite, then of every pair.
+    """Detect faults, and exclude a single satellite or a pair from each faulty epoch.
 
-    A subset is excluded if the other ranges pass with at least `min_redundancy` degrees of freedom, and if the error of
-    each of its satellites exceeds its noise (chi-square mode) or the square root of the limit (fixed mode). A single
-    exclusion is preferred to a pair, and of several exclusions the one with the smallest statistic. Where another
-    subset of the same size would be excluded as well and fits worse by no more than noise explains (`separation_risk`),
-    the epoch is inseparable. The noise scale, shape (T,) or (), is the argument of `detect`.
+    A subset can be excluded if the remaining ranges pass with at least `min_redundancy` degrees of freedom, and if the
+    error of each satellite of the subset exceeds the noise (chi-square mode) or the square root of the limit (fixed
+    mode). Single satellites are preferred to pairs. Of several subsets, the subset with the smallest statistic is
+    excluded. The epoch is inseparable if another subset of the same size can be excluded, too, and fits worse only
+    within the noise (`separation_risk`). `scale`, shape (T,) or (), is the noise scale as for `detect`.
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -237,9 +238,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
 
 
 def _exclude_block(result: Exclusion, epochs: Indices, model: LinearModel, scale: Floats, limits: RaimLimits) -> None:
-    """Write into `result` the single exclusions of a block's epochs, and the pairs of epochs that no single exclusion
-    resolves.
-    """
+    """Write the exclusions of a block of epochs into `result`; pairs are tried where no single satellite passes."""
     parts, wsse, freedom = compact(model), model.wsse, model.freedom
     for size in range(1, limits.max_excluded + 1):
         going = np.flatnonzero(
@@ -256,7 +255,7 @@ def _exclude_block(result: Exclusion, epochs: Indices, model: LinearModel, scale
 
 
 def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _Trial:
-    """Return the trials that leave out one channel each."""
+    """Return the results of leaving out each single channel."""
     n = parts.channel.shape[1]
     share = np.einsum("tii->ti", parts.projector)
     checked = parts.used & (share > LEAST_REDUNDANCY)
@@ -274,7 +273,7 @@ def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) ->
 
 
 def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _Trial:
-    """Return the trials that leave out each pair of channels."""
+    """Return the results of leaving out each pair of channels."""
     n = parts.channel.shape[1]
     i, j = np.triu_indices(n, 1)
     flat = parts.projector.reshape(len(parts.projector), n * n)
@@ -306,9 +305,9 @@ def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _
 
 
 def _sum_squares(parts: Compact) -> tuple[Floats, Floats, Floats]:
-    """``|V nu|^2``, ``S V^2 nu`` and ``S V^2 S`` with V the sigmas: sums of squares in m^2 after any exclusion.
+    """Return ``|V nu|^2``, ``S V^2 nu`` and ``S V^2 S`` with the sigmas V, for sums of squares [m^2] after exclusions.
 
-    The whitened residuals without E are ``nu - S_E b_E``.
+    The whitened residuals without the channels E are ``nu - S_E b_E``.
     """
     metres = parts.residual * parts.sigma_m
     weighted = parts.projector * parts.sigma_m[:, None, :]
@@ -319,7 +318,7 @@ def _sum_squares(parts: Compact) -> tuple[Floats, Floats, Floats]:
 def _choose(
     result: Exclusion, epochs: Indices, parts: Compact, trial: _Trial, after: Floats, scale: Floats, limits: RaimLimits
 ) -> None:
-    """Write the best subset of each epoch that has one, and the closest competing exclusion."""
+    """Write the best passing subset of each epoch and the closest competing subset into `result`."""
     passing = trial.allowed & (trial.statistic < after[:, None])
     rows = np.flatnonzero(passing.any(axis=1))
     if not len(rows):
@@ -354,7 +353,7 @@ def _choose(
 
 
 def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
-    """Return the position change by each subset, shape (rows, K, k) [m]."""
+    """Return the position change when each subset is left out, shape (rows, K, k) [m]."""
     moves = np.zeros((len(rows), len(trial.members), parts.gain_m.shape[2]))
     for k, own in enumerate(trial.own):
         moves -= parts.gain_m[rows][:, trial.members[:, k]] * own[rows][..., None]
@@ -362,9 +361,7 @@ def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
 
 
 def worst_channel(model: LinearModel) -> Indices:
-    """Return the channel whose removal lowers the weighted sum of squared residuals most, shape (T,); 0 where none is
-    checked.
-    """
+    """Return the channel whose removal lowers the WSSE most, shape (T,); 0 where all channels are unchecked."""
     share = model.redundancy
     checked = model.used & (share > LEAST_REDUNDANCY)
     drop = np.where(checked, model.residual**2 / np.where(checked, share, 1.0), 0.0)

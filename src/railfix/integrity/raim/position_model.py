@@ -1,10 +1,10 @@
 """Linear model for RAIM on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks, and the map error
-across and up as unknowns with a prior, are eliminated beforehand. The remainder is a residual projector ``S = I - R K
-R^T - B Q B^T`` (R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known position, B:
-design with the clocks eliminated, Q: its covariance), with ``nu = S y`` and ``WSSE = y^T S y``, chi-square distributed
-with `LinearModel.freedom` degrees of freedom.
+P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks are eliminated, and
+so is the map error across and up, which is an unknown with a prior. The result is the residual projector ``S = I - R K
+R^T - B Q B^T``, where R has 1/sigma in the column of the satellite's clock, K is the covariance of the clocks at a
+known position, B is the design with the clocks eliminated, and Q is the covariance of the position. The residuals are
+``nu = S y``, and ``WSSE = y^T S y`` is chi-square distributed with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -40,34 +40,34 @@ _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_
 
 @dataclass(frozen=True, kw_only=True)
 class LinearModel:
-    """Ranges linearised at a position, whitened, T epochs by M channels.
+    """Whitened ranges of T epochs by M channels, linearised at a position.
 
-    The three unknowns of the position are, on the line, along, across and up; in space, east, north and up. The first
-    `interest` of them are the position components of interest.
+    The three unknowns of the position are along, across and up on the line, and east, north and up in space. The first
+    `interest` unknowns are the position components of interest.
     """
 
-    root_weight: Floats  #: 1/sigma of each range, 0 for unused ones; shape (T, M) [1/m].
-    clock: Indices  #: Clock of each channel: index into the groups of the ranges; shape (M,).
+    root_weight: Floats  #: 1/sigma of each range, shape (T, M) [1/m]; 0 for unused ranges.
+    clock: Indices  #: Receiver clock of each channel as an index into the groups of the ranges, shape (M,).
     clock_covariance_m2: Floats  #: Covariance of the clocks at a known position (K), shape (T, G, G).
-    #: Derivative of the whitened range by the position, clocks eliminated (B); 0 for unused ones; shape (T, M, 3)
-    #: [1/m].
+    #: Derivative of the whitened range by the position, clocks eliminated (B), shape (T, M, 3) [1/m]; 0 for unused
+    #: ranges.
     design: Floats
-    #: Covariance of the position, prior included (Q); NaN where the ranges do not determine it; shape (T, 3, 3).
+    #: Covariance of the position, prior included (Q), shape (T, 3, 3); NaN where the ranges do not determine it.
     covariance_m2: Floats
-    prior: Floats  #: Prior information on the position: the map error across and up; shape (3, 3) [1/m^2].
-    misfit: Floats  #: Whitened code - range at the position, up to a clock (y); 0 where not used; shape (T, M).
-    freedom: Integers  #: Degrees of freedom: ranges less unknowns; may be negative; shape (T,).
+    prior: Floats  #: Prior information on the position, from the map sigmas across and up, shape (3, 3) [1/m^2].
+    misfit: Floats  #: Whitened code less range at the position (y), up to a clock, shape (T, M); 0 for unused ranges.
+    freedom: Integers  #: Degrees of freedom, the number of ranges less unknowns, shape (T,); may be negative.
     interest: int  #: Number of components of interest: 1 on the line, 2 (horizontal) in space.
 
     def __len__(self) -> int:
         return len(self.root_weight)
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
-        """Return the model of selected epochs, by mask or index."""
+        """Return the model of the epochs selected by a mask or by indices."""
         return replace(self, **{name: getattr(self, name)[epochs] for name in _BY_EPOCH})
 
     def patch(self, epochs: Indices, part: LinearModel) -> LinearModel:
-        """Return the model with selected epochs, by index, replaced from another model."""
+        """Return the model with the epochs at these indices replaced by the epochs of `part`."""
         if len(epochs) == len(self):
             return part
         changed = {}
@@ -83,12 +83,12 @@ class LinearModel:
 
     @property
     def used(self) -> Masks:
-        """Channels with weight, shape (T, M)."""
+        """True for channels with a weight above 0, shape (T, M)."""
         return self.root_weight > 0
 
     @property
     def sigma_m(self) -> Floats:
-        """Standard deviation of each range, shape (T, M) [m]; NaN where not used."""
+        """Standard deviation of each range, shape (T, M) [m]; NaN for unused ranges."""
         return np.asarray(1.0 / np.where(self.used, self.root_weight, np.nan))
 
     @cached_property
@@ -97,7 +97,7 @@ class LinearModel:
 
     @property
     def step_m(self) -> Floats:
-        """The best-fitting position, relative to the model's position, shape (T, 3) [m]; near 0 at a solution."""
+        """Best-fitting position relative to the position of linearisation, shape (T, 3) [m]; near 0 at a solution."""
         return self._fitted[0]
 
     @property
@@ -107,35 +107,32 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Redundancy numbers, the diagonal of S: fraction of a range's error that appears in its residual, shape (T,
-        M).
+        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused and for unchecked ranges.
 
-        0 for unused and for unchecked ranges.
+        A redundancy number is the fraction of a range error that appears in the residual of the same range.
         """
         return self._fitted[2]
 
     @cached_property
     def residual_m(self) -> Floats:
-        """Residuals of the fit with the map error included, shape (T, M) [m]; 0 where not used."""
+        """Residuals of the fit with the map error estimated, shape (T, M) [m]; 0 for unused ranges."""
         return np.where(self.used, self.residual / np.where(self.used, self.root_weight, 1.0), 0.0)
 
     @cached_property
     def wsse(self) -> Floats:
-        """Weighted sum of squared residuals ``y^T S y``, with map error and known clock offsets included, shape
-        (T,).
-        """
+        """Weighted sum of squared residuals ``y^T S y``, map error and known clock offsets included, shape (T,)."""
         return np.asarray(np.einsum("tm,tm->t", self.misfit, self.residual))
 
     @cached_property
     def gain_m(self) -> Floats:
-        """Derivative of the position by a whitened range, shape (T, M, interest) [m]."""
+        """Derivative of the position by each whitened range, shape (T, M, interest) [m]."""
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
         """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
-        `scale` multiplies the sigmas of the ranges and clock offsets, not the map error: in the covariance Q, the part
-        ``Q P Q`` comes from the prior P, and ``Q - Q P Q`` from the ranges.
+        `scale` multiplies the sigmas of the ranges and clock offsets, but not the map error. The part ``Q P Q`` of the
+        covariance Q is due to the prior P, and ``Q - Q P Q`` to the ranges.
         """
         k = self.interest
         covariance = self.covariance_m2
@@ -145,18 +142,18 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and projector of the used channels only, contiguous: T epochs by n."""
+    """Residuals and projector of the used channels of each epoch, which come first; T epochs by n."""
 
     channel: Indices  #: Channel of the model at each index, shape (T, n).
-    used: Masks  #: False at indices beyond the epoch's channels, shape (T, n).
-    projector: Floats  #: Projector S; 0 beyond the epoch's channels; shape (T, n, n).
-    residual: Floats  #: Shape (T, n).
-    sigma_m: Floats  #: 0 beyond the epoch's channels, shape (T, n).
-    gain_m: Floats  #: Shape (T, n, interest).
+    used: Masks  #: False beyond the used channels of an epoch, shape (T, n).
+    projector: Floats  #: Residual projector S, shape (T, n, n); 0 beyond the used channels.
+    residual: Floats  #: Whitened residuals, shape (T, n).
+    sigma_m: Floats  #: Standard deviations of the ranges, shape (T, n); 0 beyond the used channels.
+    gain_m: Floats  #: `LinearModel.gain_m`, shape (T, n, interest).
 
 
 def compact(model: LinearModel) -> Compact:
-    """Return the residual projector of the used channels, in their order; it uses memory of (T, n, n)."""
+    """Return the residuals and the residual projector (T, n, n) of the used channels, in channel order."""
     n = int(model.used.sum(axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(model.used, channel, axis=1)
@@ -176,8 +173,7 @@ def compact(model: LinearModel) -> Compact:
 
 
 def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices | None = None) -> LinearModel:
-    """Return the model of positions on the line: unknown distance d, map error as a prior across and up (P1 2.2(3),
-    P4).
+    """Linearise ranges at positions on the line, with the map error across and up as a prior (P1 2.2(3), P4).
 
     The prior uses `sigma_plan_m` and `sigma_height_m` of the trajectory. The model is NaN at epochs without a position.
 
@@ -189,7 +185,7 @@ def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices 
     arc_m : ndarray, shape (T,) [m]
         Positions from these ranges (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
     section : ndarray of int, shape (T,), optional
-        Sections of the positions (`Constrained.section`), needed at points shared by two sections.
+        Sections of the positions (`Constrained.section`), required where a position is at the joint of two sections.
     """
     antennas = AntennaRows.on(line)
     at = antennas.segment_at(arc_m) if section is None else np.maximum(section, 0)
@@ -200,7 +196,7 @@ def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices 
 def update_model(
     model: LinearModel, ranges: Ranges, antennas: AntennaRows, position: Constrained, epochs: Indices
 ) -> LinearModel:
-    """Return the model with some epochs, in ascending order, recomputed from other ranges and positions."""
+    """Return the model with `epochs`, in ascending order, recomputed from the given ranges and positions."""
     for index, own in antennas.split(epochs):
         model = model.patch(
             own, linear_model(ranges.take(own), index, position.arc_m[own], section=position.section[own])
@@ -209,10 +205,10 @@ def update_model(
 
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
-    """Whiten the ranges, eliminate the clocks, and invert.
+    """Whiten the ranges, eliminate the clocks, and invert the normal matrix.
 
-    `axes`, shape (T, 3, 3): unit vectors of the unknowns at positions (T, 3), NaN without; `prior`, shape (3, 3)
-    [1/m^2].
+    `axes`, shape (T, 3, 3), are the unit vectors of the unknowns at the positions (T, 3), NaN without a position;
+    `prior`, shape (3, 3) [1/m^2], is `LinearModel.prior`.
     """
     arrays = ranges.arrays
     root, clocks, design, covariance, misfit = kernels.model.linearise_ranges(
