@@ -25,12 +25,12 @@ State = TypeVar("State")
 class AntennaRows:
     """Assignment of rows to antennas."""
 
-    indices: tuple[SearchIndex, ...]  #: Trajectory of each antenna; their maps have the same sigmas.
-    parts: tuple[slice, ...]  #: Rows of each antenna, concatenated; `EVERY` for a single antenna.
+    indices: tuple[SearchIndex, ...]  #: Search index of each antenna's trajectory; all maps have the same sigmas.
+    parts: tuple[slice, ...]  #: Rows of each antenna, in the order of `indices`; `EVERY` for a single antenna.
 
     @classmethod
     def on(cls, line: Trajectory | SearchIndex | AntennaRows) -> AntennaRows:
-        """Return the rows of one antenna on a line; rows of several antennas unchanged."""
+        """Return `line` if it already is an `AntennaRows`, else the assignment of all rows to one antenna on it."""
         if isinstance(line, AntennaRows):
             return line
         return cls((line if isinstance(line, SearchIndex) else SearchIndex(line),), (EVERY,))
@@ -47,26 +47,26 @@ class AntennaRows:
 
     @property
     def lines(self) -> list[tuple[Trajectory, slice]]:
-        """The trajectory of each antenna, and its rows."""
+        """Trajectory and rows of each antenna."""
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function for each antenna with its search index, rows, and one item of each list; join the results."""
+        """Call a function with the search index, rows and one item of each list of each antenna; return all results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
-        """Return the rows of several antennas, joined."""
+        """Call a function for each antenna as `apart` does, and return its results joined along the rows."""
         return join_epochs(self.apart(function, *of_antennas))
 
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
-        """Return the joined first results of a function for each antenna, and a list of its second ones."""
+        """Call a function for each antenna; return its first results joined along the rows, and the list of states."""
         found = self.apart(function, *of_antennas)
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
-        """Yield the search index and the rows of each antenna that has any of some rising rows."""
+        """Yield the search index of each antenna with its part of `rows`, which ascend; skip antennas without a row."""
         if len(self.parts) == 1:
             if len(rows):
                 yield self.indices[0], rows
@@ -77,11 +77,11 @@ class AntennaRows:
                 yield index, own
 
     def at_arc(self, arc_m: Floats) -> Floats:
-        """Return the points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
+        """Return the positions on the lines at arc lengths, ECEF, shape (T, 3) [m]; NaN where the arc length is NaN."""
         return self.each(lambda index, rows: index.trajectory.at_arc(arc_m[rows]))
 
     def chainage_at(self, arc_m: Floats) -> Floats:
-        """Return chainages at arc lengths, shape (T,) [m]; NaN for NaN."""
+        """Return the chainages at arc lengths, shape (T,) [m]; NaN where the arc length is NaN."""
         return self.each(lambda index, rows: index.trajectory.chainage_at(arc_m[rows]))
 
     def segment_at(self, arc_m: Floats) -> Indices:
@@ -93,12 +93,12 @@ class AntennaRows:
         return self.each(lambda index, rows: index.trajectory.get_axes(section[rows]))
 
 
-#: Line of a stage: the trajectory of one antenna, its search structures, or epochs of several antennas.
+#: Line of a stage: the trajectory of one antenna, its search index, or the rows of several antennas.
 Line = Trajectory | SearchIndex | AntennaRows
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
-    """Return the observations of several antennas, with all their channels, as rows; and the rows of each."""
+    """Return the observations of several antennas stacked as rows, with all channels, and the rows of each antenna."""
     first, *others = observations
     if not others:
         return first, (EVERY,)
@@ -107,6 +107,6 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
         for each in observations
     }
-    same = len(keys) == 1  # channels in the same order, and frequencies of GLONASS
+    same = len(keys) == 1  # the same channels in the same order, and the same GLONASS frequencies
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))

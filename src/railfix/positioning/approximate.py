@@ -1,4 +1,4 @@
-"""Approximate positions of an antenna from raw ranges: points at which directions and delays are computed."""
+"""Approximate antenna positions from raw ranges, at which satellite directions and delays are computed."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from railfix.positioning.section_search import SectionLimits, find_section
 
 #: Standard deviation of raw ranges for the approximate position of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: A last step of this length leaves a range error of 25 m, which changes no direction by over 2e-6 rad [m].
+#: Largest last step: after a step of this length the error of a range is 0.03 m [m].
 _TOLERANCE_M: Final = 1000.0
-#: A raw 3-D position farther from the line than this is not on the line, however bad the ranges [m].
+#: Largest distance of a raw 3-D position from the line at which it is moved to the line [m].
 MAX_FROM_LINE_M: Final = 1e5
 
 
 class ApproximatePosition(NamedTuple):
-    """Antenna positions good to some hundred metres, and grossly wrong raw codes, T epochs by K channels."""
+    """Antenna positions accurate to a few hundred metres, and gross errors of raw codes, T epochs by K channels."""
 
     ecef_m: Floats  #: Shape (T, 3).
     arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
@@ -34,11 +34,12 @@ class ApproximatePosition(NamedTuple):
 def approximate_position(
     ranges: Ranges, line: Line, *, limits: SinglePointLimits | None = None, section: SectionLimits | None = None
 ) -> ApproximatePosition:
-    """Return approximate positions by the raw codes that are not grossly wrong (P1 2.2(2): delays are predicted there).
+    """Estimate approximate positions from the raw codes without gross errors (P1 2.2(2): to predict delays).
 
-    The point of the line nearest to a 3-D position from raw ranges of equal weight, iterated from the middle of the
-    line at every epoch so that epochs are independent; the 3-D position itself where it is far from the line; the
-    best-fitting point of the line where there is no 3-D position.
+    A 3-D position is estimated from raw ranges of equal weight, at every epoch from the middle of the line, so that
+    epochs are independent. It is moved to the nearest trajectory point unless it is far from the line. Without a 3-D
+    position, or with a gross error that cannot be identified, the best-fitting point of the line is returned, or the
+    middle of the line where there is none.
 
     Parameters
     ----------
@@ -47,6 +48,7 @@ def approximate_position(
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna.
     limits, section : SinglePointLimits, SectionLimits, optional
+        Limits of the 3-D position and of the search for the best-fitting point.
     """
     antennas = AntennaRows.on(line)
     middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))

@@ -1,13 +1,14 @@
 r"""Speed along the track from carrier Dopplers.
 
-The range ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)`` with the satellite s at ``t - rho / c`` has the derivative
-``rho' = (A + g . v) / (1 + A / c)`` with A the part of the satellite's velocity and ``g = d rho / d r``. A receiver at
+The range ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)``, with the satellite s at ``t - rho / c``, has the derivative
+``rho' = (A + g . v) / (1 + A / c)``, where A is due to the satellite's velocity and ``g = d rho / d r``. A receiver at
 speed v along the unit tangent e of its path measures
 
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
 
-with the drifts of both clocks in m/s and the change of the tropospheric delay. Unknown are v and d_r, whatever the
-number of constellations. The ionosphere's change (millimetres per second) is neglected.
+where d_r and d_s are the drifts of the receiver and satellite clocks [m/s], and T' is the rate of the tropospheric
+delay. The unknowns are v and d_r, for any number of constellations. The rate of the ionospheric delay (millimetres per
+second) is neglected.
 """
 
 from __future__ import annotations
@@ -31,23 +32,23 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_avail
 
 _STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_PASSES: Final = 3  #: Fits with the scale of the previous fit; the first uses the limits' own noise.
+_PASSES: Final = 3  #: Number of outlier rejections, with the noise scale estimated from the fit before.
 _TELLING: Final = 2.0  #: Mean squares of residuals within this many standard deviations of 1 are within the noise.
-_FLOOR_MPS: Final = 0.02
+_FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
 
 
 class DopplerSpeedLimits(Settings):
     """Limits and weights of the Doppler speed."""
 
     mask_deg: float = 10.0  #: Elevation mask.
-    #: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2`` of a Doppler. Only ratios matter to the speed:
-    #: the receiver's own scale is estimated from the residuals of the log.
+    #: Noise of a Doppler at 45 dB-Hz: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2``. Only ratios
+    #: between Dopplers affect the speed, because the receiver's noise scale is estimated from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
-    #: A Doppler is rejected if its residual exceeds this many of its own standard deviations (the w-test of W. Baarda,
-    #: 1968), the largest first.
+    #: Largest normalised residual of a Doppler that is not rejected (w-test of Baarda, 1968). The largest residual is
+    #: rejected first.
     outlier: float = Field(default=3.5, gt=0)
     most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
-    min_satellites: int = Field(default=4, ge=3)  #: Fewest satellites that must remain; 2 unknowns are solved for.
+    min_satellites: int = Field(default=4, ge=3)  #: Fewest Dopplers that must remain per epoch; there are 2 unknowns.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,14 +56,14 @@ class Dopplers(FrozenArrays):
     """Dopplers of one receiver with their satellites, T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
-    #: A satellite with several signals has several channels, of which one an epoch has a number; shape (K,).
+    #: Satellite of each channel, shape (K,). Of several channels of one satellite, only one per epoch has values.
     satellite: Strings
     rate_mps: Floats  #: ``-lambda D``: positive when the satellite recedes; NaN where absent; shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
-    #: At the time of transmission, and a second earlier; shape (T, K, 3).
+    #: Satellite position at the time of transmission, and a second earlier; shape (T, K, 3).
     sat_ecef_m: Floats
     earlier_ecef_m: Floats
-    sat_velocity_mps: Floats  #: Shape (T, K, 3).
+    sat_velocity_mps: Floats  #: Satellite velocity at the time of transmission, ECEF, shape (T, K, 3).
     clock_rate_mps: Floats  #: c times the drift of the satellite clock, relativity included; shape (T, K).
 
     def __len__(self) -> int:
@@ -73,25 +74,25 @@ class Dopplers(FrozenArrays):
 class DopplerSpeed:
     """Speed along the track, T epochs."""
 
-    #: + along the tangent; NaN where too few satellites are left; shape (T,).
+    #: Positive along the tangent; NaN with too few satellites or singular geometry; shape (T,).
     speed_mps: Floats
     sigma_mps: Floats
     clock_drift_mps: Floats  #: c times the drift of the receiver clock, shape (T,).
     residual_mps: Floats  #: Measured less fitted, of used and rejected Dopplers; NaN elsewhere; shape (T, K).
-    #: Shape (T, K).
+    #: Dopplers used in the fit, and Dopplers rejected as outliers; shape (T, K).
     used: Masks
     rejected: Masks
-    n_used: Integers  #: Shape (T,).
+    n_used: Integers  #: Number of Dopplers used, shape (T,).
     scale: float  #: Standard deviation of the receiver's Dopplers relative to the limits, over the whole log.
 
 
 def dopplers_of_log(
     obs: Observations, navigation: Navigation, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
 ) -> Dopplers:
-    """Return the Dopplers of a log with their satellites; one signal per satellite and epoch.
+    """Return the Dopplers of a log with their satellite positions; one signal per satellite and epoch.
 
-    Unhealthy satellites, unknown carriers, and channels without a code, from which the time of transmission is
-    computed, are left out.
+    Unhealthy satellites, satellites without navigation records, unknown carrier frequencies, and channels without a
+    plausible code, from which the time of transmission is computed, are left out.
     """
     columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
     satellite, signal = obs.satellite[columns], obs.signal[columns]
@@ -101,7 +102,7 @@ def dopplers_of_log(
     known = np.isfinite(doppler) & np.isfinite(wavelength) & (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
     code = np.where(first_available(satellite, known), code, np.nan)
     now = satellite_states(obs.time, satellite, signal, code, navigation)
-    # The same records one second earlier along the same orbit and clock.
+    # the same orbit and clock, evaluated one second earlier
     before = satellite_states(obs.time, satellite, signal, code + SPEED_OF_LIGHT * _STEP_S, navigation)
     usable = np.isfinite(now.clock_m) & np.isfinite(before.clock_m) & ~now.unhealthy
     return Dopplers(
@@ -121,9 +122,9 @@ def doppler_speed(
 ) -> DopplerSpeed:
     """Estimate speed along the track and clock drift by weighted least squares, all epochs at once.
 
-    Outliers are removed one by one, the largest first, while enough satellites are left; the median of the log's
-    residuals is the scale. `ecef_m`, shape (T, 3): 10 m off change a range rate by 2 mm/s; NaN: no speed. `tangent`:
-    unit vectors.
+    Outliers are removed one by one, the largest first, while enough satellites remain. The noise scale is estimated
+    from the median of the log's normalised residuals. `ecef_m`, shape (T, 3), are antenna positions, NaN for epochs
+    without a speed; an error of 10 m changes a range rate by 2 mm/s. `tangent`, shape (T, 3), are unit vectors.
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)
@@ -161,7 +162,7 @@ def doppler_speed(
 
 
 def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the measured ``slope v + drift``, the slope, and elevations, shapes (T, K)."""
+    """Return measured range rates ``slope v + drift`` [m/s], their slopes, and elevations [deg], shapes (T, K)."""
     receiver, along = ecef_m[:, None, :], tangent[:, None, :]
     sat, velocity = dopplers.sat_ecef_m, dopplers.sat_velocity_mps
     _, sight = range_with_rotation(sat, receiver)
@@ -198,7 +199,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
         channel_sums(values)
         for values in (weight, weight * slope, weight * slope**2, weight * measured, weight * slope * measured)
     )
-    # Neither several satellites in one direction nor a single satellite determine the speed.
+    # Neither several satellites in one direction nor a single satellite determines the speed.
     determinant = one * hh - h * h
     determinant = np.where((used.sum(axis=1) >= 2) & (determinant > 1e-9 * one * hh), determinant, np.nan)
     speed, drift = (one * hy - h * y) / determinant, (hh * y - h * hy) / determinant
@@ -220,7 +221,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
 def _reject_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
 ) -> tuple[Masks, _SpeedFit]:
-    """Reject the worst Doppler of every epoch with an outlier, until no outlier remains."""
+    """Return the Dopplers that remain after the worst outlier of each epoch is repeatedly rejected, and their fit."""
     used = offered.copy()
     fit = _fit(measured, slope, sigma, used)
     for _ in range(limits.most_rejected):

@@ -1,8 +1,8 @@
 """Detect grossly wrong codes before any fit to all codes.
 
-A least-squares position absorbs part of every error: one code that is 10 km off moves it by kilometres, where no
-atmospheric model and no map is valid, and its residuals point to other satellites. The position with the least sum of
-absolute residuals does not move further when an error grows: the sum is convex, and each outlying range has the same
+A least-squares position absorbs part of every error: a code error of 10 km moves it by kilometres, to where neither the
+atmospheric models nor the map are valid, and the largest residuals are those of other satellites. The position with the
+least sum of absolute residuals does not move further when an error grows, because each outlying range has the same
 influence.
 """
 
@@ -22,31 +22,32 @@ from railfix.positioning.normal_equations import SinglePoint, normal_equations
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Raw codes, without atmospheric corrections, are wrong by this much only because of gross errors [m].
+#: Errors of raw codes (without atmospheric corrections) above this are gross errors [m].
 GROSS_M: Final = 100.0
-#: Largest median residual of the remaining codes: they agree with each other [m].
+#: The remaining codes agree with each other if the median of their absolute residuals is below this [m].
 AGREEING_M: Final = 30.0
-#: Redundant ranges that must remain after an exclusion in space, so that the rest is still checked.
+#: Least number of redundant ranges after an exclusion at a 3-D position, so that the remaining ranges are checked.
 _LEFT_IN_SPACE: Final = 3
-#: Where only one or two ranges remain, the other exclusions must fit worse by this factor.
+#: Where fewer redundant ranges remain, every other exclusion must fit worse by this factor.
 _CLEARER: Final = 5.0
-#: Multiple of the scale of the residuals from which on a corrected code disagrees with the others.
+#: A corrected code disagrees with the others if its residual exceeds this multiple of the robust scale.
 _DISAGREE: Final = 5.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-#: Iterations; the least residual that divides a weight, in sigmas, in the first ten of them and later.
+#: Largest number of iterations. Residuals that divide weights are at least `_COARSE` sigmas in the first
+#: `_COARSE_STEPS` iterations, and at least `_FINE` sigmas afterwards.
 _STEPS: Final = 60
 _COARSE_STEPS: Final = 10
 _COARSE, _FINE = 1.0, 0.3
 _LONGEST_STEP_M: Final = 3e6
 _SETTLED_M: Final = 0.3
-_SINGULAR: Final = 1e-15  #: Determinant of a normal matrix of unit trace.
+_SINGULAR: Final = 1e-15  #: A normal matrix of unit trace with a determinant up to this is singular.
 
 
 def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
-    """Return the positions with the least sum of absolute weighted residuals, each clock free, shape (T, 3) [m].
+    """Estimate the positions with the least sum of absolute weighted residuals, clocks eliminated, shape (T, 3) [m].
 
-    Iteratively reweighted least squares from starts (T, 3) [m] within some thousand kilometres. NaN where the ranges
-    do not determine a position.
+    Iteratively reweighted least squares from `start_ecef_m`, shape (T, 3), accurate to a few thousand kilometres. NaN
+    where the ranges do not determine a position.
     """
     place, factor = start_ecef_m.copy(), np.ones(ranges.weight.shape)
     root = np.sqrt(ranges.weight)
@@ -67,7 +68,7 @@ def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
 
 
 def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, 3) [m], each clock at the median of its ranges; NaN where not used, (T, M)."""
+    """Return residuals at positions (T, 3), each clock at the median of its ranges, (T, M) [m]; NaN where not used."""
     even = replace(ranges, weight=kernel_array((ranges.weight > 0).astype(np.float64)), ties=None)
     residual = normal_equations(even, np.nan_to_num(place_ecef_m)).residual_m
     value = np.where(ranges.weight > 0, residual, np.nan)
@@ -77,7 +78,7 @@ def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 
 
 def _median(values: Floats) -> Floats:
-    """Return the median of each row, NaN left out; 0 for a row without any, shape (T,)."""
+    """Return the median of each row without its NaN, shape (T,); 0 for a row of NaN only."""
     some = np.isfinite(values).any(axis=1)
     middle = np.zeros(len(values))
     middle[some] = np.nanmedian(values[some], axis=1)
@@ -85,10 +86,10 @@ def _median(values: Floats) -> Floats:
 
 
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return the raw codes that are off by more than `GROSS_M`, shape (T, M), where the others agree on a position.
+    """Find the raw codes with errors above `GROSS_M`, shape (T, M), where the other codes agree on a 3-D position.
 
-    Three redundant ranges remain and agree. With fewer ranges, one is rejected where leaving it out makes the others
-    agree, and leaving out any other one does not.
+    At least `_LEFT_IN_SPACE` redundant ranges must remain and agree. With fewer ranges, a single range is rejected if
+    the others agree without it, and do not agree without any other single range.
     """
     place = least_absolute(ranges, start_ecef_m)
     residual = residuals_at(ranges, place)
@@ -132,7 +133,7 @@ def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _step(matrix: Floats, vector: Floats) -> Floats:
-    """Return the steps of normal equations, shape (T, 3) [m]; NaN where they are singular."""
+    """Return the steps of normal equations, at most `_LONGEST_STEP_M` long, shape (T, 3) [m]; NaN if singular."""
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
     singular = ~(np.linalg.det(matrix / np.maximum(trace, 1e-300)) > _SINGULAR)
     solvable = np.where(singular[:, None, None], np.eye(3), matrix)
@@ -143,9 +144,10 @@ def _step(matrix: Floats, vector: Floats) -> Floats:
 
 
 def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return the corrected ranges that disagree with most others by their sigmas, shape (T, M).
+    """Find the corrected ranges that disagree with the majority of an epoch, shape (T, M).
 
-    Residuals at the position of least absolute residuals, beyond `_DISAGREE` robust scales (one sigma at least).
+    Their residuals at the position of least absolute residuals exceed `_DISAGREE` robust scales; the scale is at least
+    one sigma. None is returned where fewer than `_LEFT_IN_SPACE` redundant ranges would remain.
     """
     place = least_absolute(ranges, start_ecef_m)
     white = np.abs(residuals_at(ranges, place)) * np.sqrt(ranges.weight)
@@ -157,14 +159,14 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     return np.asarray(found & enough[:, None])
 
 
-#: Spacing of the points of a line that are tried, and of the points tried around the best one [m].
+#: Spacing of line points in the coarse scan, and of the points around its best point in the fine scan [m].
 _COARSE_M: Final = 100.0
 _FINE_M: Final = 12.5
-#: Points times epochs times channels that are computed at once.
+#: Largest product of points, epochs and channels that are computed together.
 _BLOCK: Final = 2_000_000
-#: Other exclusions must cost this much more, as a fraction of one gross error.
+#: Every other exclusion must cost more by this fraction of `GROSS_M`.
 _CLEAR: Final = 0.7
-#: Redundant ranges that must agree with a point of the line.
+#: Least number of redundant ranges that must agree with a point of the line.
 _LEFT_ON_LINE: Final = 2
 
 
@@ -172,16 +174,16 @@ class LineScan(NamedTuple):
     """Best points of a line for raw ranges of T epochs by M channels."""
 
     arc_m: Floats  #: Point with the least cost, shape (T,).
-    gross: Masks  #: Ranges that are off there by more than `GROSS_M`, shape (T, M).
-    agreed: Masks  #: Redundant ranges agree with the point, shape (T,).
-    clear: Masks  #: Points that imply other faulty ranges cost clearly more, shape (T,).
+    gross: Masks  #: Ranges whose residuals at the point exceed `GROSS_M`, shape (T, M).
+    agreed: Masks  #: Epochs at which enough redundant ranges agree with the point, shape (T,).
+    clear: Masks  #: Epochs at which all points that imply other gross errors cost clearly more, shape (T,).
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
-    """Find the points of a line that most raw ranges agree on.
+    """Find the point of a line with which most raw ranges agree, at each epoch.
 
-    The cost of a point is the sum of the residuals about the median of their clock, each counted with `GROSS_M` at
-    most: a larger error costs no more. Points `_COARSE_M` apart are tried, then those around the best one.
+    The cost of a point is the sum of absolute residuals about the median of their clock, each limited to `GROSS_M`, so
+    that larger errors cost no more. Points `_COARSE_M` apart are evaluated first, then points around the best of them.
     """
     epochs = len(ranges)
     nodes = np.linspace(line.arc_m[0], line.arc_m[-1], max(int(np.ceil(np.ptp(line.arc_m) / _COARSE_M)), 1) + 1)
@@ -209,7 +211,7 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at N positions per epoch, (T, N, 3) [m], each clock at its median, (T, N, M); NaN: unused."""
+    """Return residuals at N positions per epoch, (T, N, 3), each clock at its median, (T, N, M) [m]; NaN if unused."""
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
     square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
@@ -227,34 +229,34 @@ def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 
 
 def _capped_cost(residual_m: Floats) -> Floats:
-    """Return the sum of absolute residuals, each with `GROSS_M` at most, shape (T, N)."""
+    """Return the sum of absolute residuals, each limited to `GROSS_M`, shape (T, N) [m]."""
     return np.asarray(np.nansum(np.minimum(np.abs(residual_m), GROSS_M), axis=2))
 
 
 class GrossErrors(NamedTuple):
     """Gross errors of raw ranges, T epochs by M channels."""
 
-    gross: Masks  #: Ranges that are grossly wrong, shape (T, M).
-    #: Arc length of the best point of the line where the ranges cannot separate a position from a gross error; else
-    #: NaN; (T,).
+    gross: Masks  #: Ranges with gross errors, shape (T, M).
+    #: Arc length of the best-fitting point of the line at epochs that no position in space is accepted for; NaN
+    #: elsewhere; shape (T,).
     unsure_arc_m: Floats
     unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
 
 
-#: Plausible ellipsoidal heights of trains, with a margin [m]: a position outside is not used.
+#: Plausible ellipsoidal heights of trains, with a margin [m]. Positions outside are not used.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
-#: Root of the sum of squared raw residuals up to which an epoch is not examined; distance of its position from the
-#: line from which on it is [m].
+#: An epoch is examined if the root of the sum of its squared raw residuals is not below the first value, or its 3-D
+#: position is farther from the line than the second [m].
 _QUIET_M: Final = 30.0
 _BESIDE_M: Final = 1000.0
 
 
 def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> GrossErrors:
-    """Find grossly wrong codes among raw ranges; `point`: their 3-D positions by least squares.
+    """Find gross errors of raw ranges, given their least-squares 3-D positions `point`.
 
-    Epochs with large residuals, or positions far from the line, are examined: at the point of the line that most ranges
-    agree on, if redundant ranges agree with it and no other exclusion costs about as little; in space, if the ranges
-    agree with no point of the line.
+    Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
+    point of the line with which most ranges agree, if redundant ranges agree and every other exclusion costs clearly
+    more. Where the ranges agree with no point of the line, they are examined at a 3-D position.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -263,7 +265,7 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     suspect = ~located | ~(np.sqrt((residual**2).sum(axis=1)) < _QUIET_M)
     for index, rows in antennas.split(np.flatnonzero(located)):
         suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
-    # ranges that agree in space have no gross error, wherever the map is
+    # ranges that agree in space have no gross error, even if the map is wrong
     largest = np.abs(residual).max(axis=1, initial=0.0)
     agree = located & (ranges.space_redundancy >= _LEFT_IN_SPACE) & (largest < 0.5 * GROSS_M)
     suspect &= ~agree & (ranges.redundancy > 0)
@@ -287,10 +289,10 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
 
 
 def gross_alone(weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases) -> Masks:
-    """Return the ranges that are alone on their clock and off by more than `GROSS_M` by the known biases, shape (T, M).
+    """Find ranges that are alone on their clock and contradict the known biases by more than `GROSS_M`, shape (T, M).
 
-    Nothing contradicts such a range while its clock is free. `clock_m` are the clocks of a position with free clocks,
-    shape (T, G); the common clock is their median by satellites, less the biases.
+    No other range checks such a range while its clock is estimated freely. `clock_m`, shape (T, G), are clocks
+    estimated without ties. The common clock is the median of the clocks less their biases, weighted by satellites.
     """
     found = np.zeros(weight.shape, dtype=np.bool_)
     count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)

@@ -1,4 +1,4 @@
-"""Robust fits of an epoch's ranges, and robust clocks at a known position.
+"""Robust fits of an epoch's ranges.
 
 Fits are iteratively reweighted least squares with the IGG-III weights (Yang, Song and Xu, Journal of Geodesy 76, 2002)
 and the median of the absolute residuals as scale: no noise level is assumed.
@@ -26,9 +26,9 @@ _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard no
 class RobustFitLimits(Settings):
     """Limits of the robust fit."""
 
-    keep: float = Field(default=1.5, gt=0)  #: Residuals up to this many scales have full weight.
-    reject: float = Field(default=4.0, gt=0)  #: Residuals from this many scales on have no weight.
-    #: Reweightings. On the demonstration with a 20 m error on one satellite, the fifth reweighting changes no decision.
+    keep: float = Field(default=1.5, gt=0)  #: Residuals up to this multiple of the scale have full weight.
+    reject: float = Field(default=4.0, gt=0)  #: Residuals above this multiple of the scale have zero weight.
+    #: Number of reweightings. On the demonstration with a 20 m error on one satellite, the fifth changes no decision.
     iterations: int = Field(default=5, ge=1)
 
 
@@ -37,18 +37,18 @@ class RobustFit:
     """Ranges that agree with each other, T epochs by M channels."""
 
     kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
-    #: Weighted sum of squared residuals of the kept ranges over their freedom; NaN without any; shape (T,).
+    #: Weighted sum of squared residuals of the kept ranges divided by `freedom`; NaN where that is 0; shape (T,).
     variance: Floats
-    freedom: Integers  #: Redundancy of the kept ranges over clocks and position unknowns, shape (T,).
+    freedom: Integers  #: Number of kept ranges less the clocks and position unknowns, 0 without a fit; shape (T,).
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
-    """Return the inverse covariance of positions across and above a line, ECEF, shape (T, 3, 3) [1/m^2]."""
+    """Return the inverse covariance of the map error across and up at sections, ECEF, shape (T, 3, 3) [1/m^2]."""
     return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
 def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
-    """Return the inverse covariance, ECEF, shape (T, 3, 3) [1/m^2], from axes of the line and sigmas of its map."""
+    """Return the inverse covariance of the map error, ECEF, shape (T, 3, 3) [1/m^2], from axes (T, 3, 3) and sigmas."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
         across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2
@@ -58,12 +58,12 @@ def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float
 def robust_fit(
     ranges: Ranges, place_ecef_m: Floats, *, information: Floats | None = None, limits: RobustFitLimits | None = None
 ) -> RobustFit:
-    """Return the ranges of each epoch that agree, by IGG-III weights (Yang, Song and Xu, 2002) around a plain fit.
+    """Find the ranges of each epoch that agree with each other, by IGG-III weights (Yang, Song and Xu, 2002).
 
-    `place_ecef_m` is the solution of the plain fit, shape (T, 3); steps from it are linear.
+    `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which they are linearised.
 
-    `information`, shape (T, 3, 3) [1/m^2]: a-priori information (`map_information`: one unknown remains); None: three
-    unknowns.
+    `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`), with which one
+    position unknown remains; there are three without it.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0
@@ -92,9 +92,9 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Return the ranges that agree at positions on the line, by IGG-III weights (Yang, Song and Xu, 2002).
+    """Find the ranges that agree with each other at positions on the line, by IGG-III weights (`robust_fit`).
 
-    Where these are missing the fit is at approximate positions `near_ecef_m`, shape (T, 3).
+    Epochs without a position are fitted at `near_ecef_m`, shape (T, 3) [m], by default the middle of the line.
     """
     antennas, arc = AntennaRows.on(line), position.arc_m
     if near_ecef_m is None:

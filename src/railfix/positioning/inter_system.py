@@ -1,8 +1,8 @@
-"""3-D positions of several constellations, with receiver clocks tied by biases from earlier epochs.
+"""3-D positions from several constellations, with receiver clocks tied by inter-system biases from earlier epochs.
 
-The offsets of the constellations' clocks are stable to a metre over hours. Once an offset is known, even a single
-satellite of a constellation contributes, and every satellite is checked against all others. Offsets are estimated from
-earlier epochs only, so that results do not depend on chunks.
+The biases between the constellations' clocks are stable to a metre over hours. Once a bias is known, even a single
+satellite of a constellation contributes, and every satellite is checked against all others. Biases are estimated from
+earlier epochs only, so that results do not depend on the division of a log into chunks.
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 class ClockOffsetLimits(Settings):
     """Limits of the inter-system biases."""
 
-    #: Standard deviation of an offset about its mean; infinite: every constellation has its own clock. On an urban
-    #: recording the spread was 1.0 m (Galileo, BeiDou).
+    #: Standard deviation of a bias about its mean; with infinity every constellation keeps a separate clock. On an
+    #: urban recording the standard deviation was 1.0 m (Galileo, BeiDou).
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
     #: Epochs closer together than this are not independent: errors of a train at rest are correlated over tens of
     #: seconds.
     correlation_s: float = Field(default=30.0, gt=0)
-    #: Time constant of forgetting: offsets are stable to a metre over hours, so that half an hour is short enough, and
-    #: the effect of a receiver restart or an undetected error fades.
+    #: Time constant of exponential forgetting: biases are stable to a metre over hours, and within half an hour the
+    #: effect of a receiver restart or an undetected error decays.
     window_s: float = Field(default=1800.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetState:
-    """Offsets estimated so far, by clock letter."""
+    """Inter-system biases estimated so far, by clock letter."""
 
-    information: Mapping[str, float] = field(default_factory=dict)  #: [1/m^2].
-    moment: Mapping[str, float] = field(default_factory=dict)  #: Information times offset [1/m].
+    information: Mapping[str, float] = field(default_factory=dict)  #: Inverse variance of a bias [1/m^2].
+    moment: Mapping[str, float] = field(default_factory=dict)  #: Information times bias [1/m].
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Window of the last epoch [windows].
+    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
 
     def sums(self, letters: Sequence[str]) -> Floats:
-        """Return the information of some clocks, then their moments, in one array."""
+        """Return the information of G clocks, then their moments, shape (2 G,); 0 for clocks without a bias."""
         of_each = (self.information, self.moment)
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
     def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
-        """Return the state with new sums of some clocks (`sums`); the others are unchanged."""
+        """Return the state after epoch `last`, with new sums of some clocks; those of other clocks are unchanged."""
         count = len(letters)
         return OffsetState(
             information={**self.information, **dict(zip(letters, sums[:count], strict=True))},
@@ -76,10 +76,10 @@ def tie_clocks(
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
 ) -> tuple[InterSystemBiases, list[OffsetState]]:
-    """Return the inter-system biases (P1 3.3: constellations) known from the epochs before each, and new states.
+    """Estimate the inter-system biases at each epoch from earlier epochs (P1 3.3); also return the new states.
 
-    `ranges`: without ties, only the ranges that agree with each other, with the letter of each of its groups in
-    `clocks`; `free`: position with every clock on its own and a redundant range; `parts`: rows of each receiver.
+    `ranges` are untied ranges that agree with each other, and `clocks` the letters of their groups; `free` are
+    positions from them with separate clocks. `parts` are the rows of each receiver, one for each of `states`.
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
@@ -119,12 +119,12 @@ def tie_clocks(
 class PointPositions(NamedTuple):
     """3-D positions of T epochs and the inter-system biases."""
 
-    point: SinglePoint  #: The conventional position, with a clock for each constellation.
+    point: SinglePoint  #: Conventional position, with a clock for each constellation.
     tied: SinglePoint  #: Conventional position from the ranges tied by known biases.
-    free: SinglePoint  #: Position from the ranges that agree with each other in space.
-    disagreeing: Masks  #: The other ranges, shape (T, K).
+    free: SinglePoint  #: Position with separate clocks from the ranges that agree with each other in space.
+    disagreeing: Masks  #: Used ranges that do not agree with the others in space, shape (T, K).
     ties: InterSystemBiases
-    gross: Masks  #: Ranges that are alone on their clock and contradict the known biases grossly, shape (T, K).
+    gross: Masks  #: Ranges alone on their clock that contradict the known biases by over `GROSS_M`, shape (T, K).
 
 
 class TieLimits(NamedTuple):
@@ -148,9 +148,9 @@ def tie_constellations(
 ) -> tuple[Ranges, PointPositions, list[OffsetState]]:
     """Return ranges tied by the inter-system biases known before each epoch, 3-D positions (P1 5), and the new states.
 
-    Each further constellation costs one satellite for its clock, unless its bias is known to a metre. Biases
-    are differences of the receiver clocks of positions from ranges that agree with each other, averaged over earlier
-    epochs: results do not depend on the division of a log into chunks.
+    Each additional constellation requires one satellite for its clock, unless its bias is known to a metre. A bias is
+    the difference of two receiver clocks in positions from ranges that agree with each other, averaged over earlier
+    epochs; results therefore do not depend on the division of a log into chunks.
 
     Parameters
     ----------
@@ -158,13 +158,13 @@ def tie_constellations(
     clocks : tuple of str
         Letter of each receiver clock (`Channels.clocks`).
     ranges : Ranges
-        Of `weighted_ranges`.
+        Returned by `weighted_ranges`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
         Approximate positions.
     states : sequence of OffsetState
         State of each receiver after the earlier epochs; the new states are returned.
     reference : str, optional
-        Letter of the clock that biases refer to; by default the GPS clock, or the first clock without GPS.
+        Letter of the clock that biases refer to; by default the GPS clock, or the first clock if there is no GPS.
     parts : sequence of slice
         Epochs of each receiver.
     limits : TieLimits, optional
@@ -191,7 +191,7 @@ def tie_constellations(
 def _tie(
     ranges: Ranges, ties: InterSystemBiases, point: SinglePoint, start_ecef_m: Floats, limits: SinglePointLimits
 ) -> SinglePoint:
-    """Return the 3-D positions with the clocks tied; those with free clocks where no bias is known yet."""
+    """Return 3-D positions with tied clocks, or with separate clocks at epochs where no bias is known yet."""
     rows = ((ties.sigma_m < UNTIED_M).sum(axis=1) > 1).nonzero()[0]
     if not len(rows):
         return point
@@ -203,7 +203,7 @@ def _tie(
 def _agreeing(
     ranges: Ranges, point: SinglePoint, start_ecef_m: Floats, limits: TieLimits
 ) -> tuple[Ranges, SinglePoint, Masks]:
-    """Return the ranges that agree with each other in space, the 3-D positions from these, and the other ranges."""
+    """Return the ranges that agree with each other in space, 3-D positions from them, and a mask of the others."""
     dropped = (ranges.weight > 0) & ~robust_fit(ranges, start_ecef_m, limits=limits.robust_fit).kept
     changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):

@@ -1,4 +1,4 @@
-"""Section search and constrained fix of antennas from common ranges."""
+"""Section search and constrained position on the line from the same ranges."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class FixLimits(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class LineFix(NotebookTable):
-    """Positions of T epochs from common ranges."""
+    """3-D positions and positions on the line from the same ranges, T epochs."""
 
     point: SinglePoint  #: 3-D position without the map.
     section: Section  #: Best-fitting vertex of the trajectory.
@@ -41,7 +41,7 @@ class LineFix(NotebookTable):
 
 
 def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimits | None = None) -> LineFix:
-    """Return section and position on the line (P1 2.2(2), (3)) of the epochs with `FixLimits.min_satellites`."""
+    """Compute section and position on the line (P1 2.2(2), (3)); no position below `FixLimits.min_satellites`."""
     limits, antennas = limits or FixLimits(), AntennaRows.on(line)
     section = find_section(ranges, antennas, point, limits=limits.section)
     vertex = np.where(ranges.n_used >= limits.min_satellites, section.vertex, -1)
@@ -52,7 +52,7 @@ def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimit
 
 
 def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
-    """Return positions in which some epochs, in rising order, are replaced by positions from other ranges."""
+    """Return positions in which some epochs, in ascending order, are replaced by positions from `ranges`."""
     for index, own in antennas.split(epochs):
         part = ranges.take(own)
         solved = fix_on_line(

@@ -1,7 +1,8 @@
-"""Offset of the 3-D positions from the line over minutes: the test of a wrong map.
+"""Mean offset of the 3-D positions from the line over minutes, for the detection of map errors.
 
-Single epochs hide a constant offset in their noise; the mean over a window does not. Its sigma has three parts: noise,
-which the window averages; satellite and atmospheric errors, which it does not average; and the stated error of the map.
+A constant offset is hidden by the noise of single epochs, but not by that of the mean over a window. The covariance of
+the mean has three parts: noise, which the window averages; satellite and atmospheric errors, which it does not average;
+and the stated error of the map.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.positioning.normal_equations import SinglePoint
 from railfix.positioning.range_arrays import RangeArrays, Ranges
 
-_SUMS: Final = 9  #: Sums of a window.
+_SUMS: Final = 9  #: Number of sums per window.
 
 
 class MapOffsetLimits(Settings):
     """Limits of the test of the map."""
 
-    #: Time constant of forgetting: long enough for six independent samples, short enough to find a wrong stretch.
+    #: Time constant of exponential forgetting: six independent samples, short enough to detect local map errors.
     window_s: float = Field(default=120.0, gt=0)
     correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
-    least_samples: float = Field(default=3.0, gt=0)  #: Independent samples required before a decision: one minute.
-    #: Probability that noise alone passes the test: of the note, of the status (chi-square, two degrees of freedom).
-    #: The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic stays
+    least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision: one minute.
+    #: False-alarm probability of the note and of the status, by noise alone (chi-square, two degrees of freedom).
+    #: The nominal sigmas are assumptions; on the recordings, with a correct map and all screens, the statistic stays
     #: below the threshold of the status, 13.8 (``tests/references/results/bounds.txt``).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
     risk: float = Field(default=1e-3, gt=0, lt=1)
@@ -62,11 +63,11 @@ class MapOffsetLimits(Settings):
 class MapOffsetState:
     """Decayed sums after the last epoch."""
 
-    #: Of the last epoch; NaT before the first.
+    #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Window of the last epoch [windows].
-    #: Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples: of the
-    #: epochs on the map, then of the epochs off the map; shape (18,).
+    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
+    #: Sums of information matrices (across, mixed, up), information times offset (2), covariances of nominal errors (3)
+    #: and samples, of the epochs on the map, then of the epochs off the map; shape (18,).
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
@@ -80,30 +81,31 @@ class MapOffset(NotebookTable):
     #: Covariance across and up for a correct map: noise, satellites, atmosphere and the stated error of the map; shape
     #: (T, 2, 2).
     covariance_m2: Floats
-    statistic: Floats  #: Square of the offset in sigmas, both components together; shape (T,).
-    #: Smallest offsets across and up that the test finds, each alone; smaller ones are not excluded; shape (T, 2).
+    statistic: Floats  #: Squared Mahalanobis distance of the offset from zero, shape (T,).
+    #: Smallest offset across, and smallest offset up, that the test detects without an offset in the other component;
+    #: smaller offsets are not excluded; shape (T, 2).
     detectable_m: Floats
 
     @property
     def across_sigma_m(self) -> Floats:
-        """Standard deviation across, shape (T,) [m]."""
+        """Standard deviation of `across_m`, shape (T,) [m]."""
         return np.asarray(np.sqrt(self.covariance_m2[:, 0, 0]))
 
     @property
     def up_sigma_m(self) -> Floats:
-        """Standard deviation above, shape (T,) [m]."""
+        """Standard deviation of `up_m`, shape (T,) [m]."""
         return np.asarray(np.sqrt(self.covariance_m2[:, 1, 1]))
 
     @property
     def seen(self) -> tuple[Floats, Floats]:
-        """Offset (T, 2) [m] and its inverse covariance (T, 2, 2) [1/m^2]; 0 without a window."""
+        """Offset (T, 2) [m] and its inverse covariance (T, 2, 2) [1/m^2]; 0 where there are too few samples."""
         known = np.isfinite(self.across_m)[:, None]
         offset = np.where(known, np.array([self.across_m, self.up_m]).T, 0.0)
         return offset, np.where(known[..., None], _inverse_2x2(self.covariance_m2), 0.0)
 
     @property
     def beyond_m(self) -> tuple[Floats, Floats]:
-        """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 without a decision."""
+        """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 with too few samples."""
         across = np.sign(self.across_m) * np.maximum(np.abs(self.across_m) - self.across_sigma_m, 0.0)
         up = np.sign(self.up_m) * np.maximum(np.abs(self.up_m) - self.up_sigma_m, 0.0)
         known = np.isfinite(self.across_m)
@@ -113,16 +115,16 @@ class MapOffset(NotebookTable):
 class OffsetErrors(NamedTuple):
     """Errors of the ranges of T epochs."""
 
-    nominal_m: Floats  #: Standard deviations of satellites and atmosphere, shape (T, M).
-    variance: Floats  #: Scale of the ranges against their weights, shape (T,).
+    nominal_m: Floats  #: Standard deviations of satellite and atmospheric errors, shape (T, M).
+    variance: Floats  #: Variance of the ranges relative to their weights, shape (T,).
 
 
 class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
     arc_m: Floats  #: NaN where missing, shape (T,).
-    #: The train is away from the line. These epochs have a separate window: positions off the line contain no
-    #: information on the map when the train has returned to it; shape (T,).
+    #: Epochs at which the train is off the line, shape (T,). They have a separate window, because positions off the
+    #: line contain no information on the map after the train returns to it.
     off_map: Masks
 
 
@@ -137,7 +139,7 @@ def map_offset(
     *,
     limits: MapOffsetLimits | None = None,
 ) -> tuple[MapOffset, list[MapOffsetState]]:
-    """Compute the mean offset of 3-D positions from the line, each epoch's included; states are by antenna."""
+    """Compute the mean offset of 3-D positions from the line up to each epoch, and the new state of each antenna."""
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)
@@ -171,7 +173,7 @@ def map_offset(
 
 
 def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
-    """Return the offsets of 3-D positions (T, 3) from the line, right and up, shape (T, 2); NaN without."""
+    """Return the offsets of 3-D positions (T, 3) from the line, right and up, (T, 2) [m]; NaN where `arc_m` is NaN."""
     known = np.isfinite(arc_m)
     arc = np.where(known, arc_m, 0.0)
     axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]
@@ -188,11 +190,10 @@ def terms_of_epochs(
     nominal_m: Floats,
     variance: Floats,
 ) -> Floats:
-    """Return the contribution of each epoch to the sums of its window, shape (T, 9): `MapOffsetState.sums` of one
-    sample.
+    """Return the contribution of each epoch to the sums of its window (`MapOffsetState.sums`), shape (T, 9).
 
-    3-D positions with covariance (T, 3, 3), positions on the line (T, 3), unit vectors across and up there (T, 2, 3);
-    `nominal_m` (in C order) and `variance` of `OffsetErrors`.
+    `ecef_m` are 3-D positions with covariances (T, 3, 3), `place_ecef_m` positions on the line (T, 3), and `axes` the
+    unit vectors across and up there (T, 2, 3). `nominal_m` (in C order) and `variance` are fields of `OffsetErrors`.
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
     gain = (axes @ covariance_m2) @ (
@@ -215,9 +216,9 @@ def terms_of_epochs(
 def means_of_windows(
     sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and smallest offsets found (T, 2) by sums (T, 9).
+    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of sums (T, 9).
 
-    See `MapOffset`; the sigmas are taken from the map and from `MapOffsetLimits`.
+    They are fields of `MapOffset`. The sigmas are those of the map, and `MapOffsetLimits.detectable_sigmas`.
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])
@@ -236,5 +237,5 @@ def _inverse_2x2(matrix: Floats) -> Floats:
 
 
 def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:
-    """Return epochs whose window contradicts the map, shape (T,)."""
+    """Return the epochs whose statistic exceeds the threshold of the status, shape (T,)."""
     return np.asarray(offset.statistic > limits.threshold)

@@ -1,4 +1,4 @@
-"""Sums over earlier epochs with exponential forgetting: of noise, clocks, persistent errors, and the map."""
+"""Exponentially weighted sums over earlier epochs, for noise, inter-system biases, range biases and map offsets."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Windows(NamedTuple):
     """Ages of T epochs since the start of a log, concatenated for A antennas."""
 
     step_s: Floats  #: Time since the previous epoch; 0 without one; shape (T,).
-    growth: Floats  #: Decay of a sum since the start of its span of windows, shape (T,).
-    decay: Floats  #: Decay of a sum into the span of an epoch, shape (T,).
+    growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).
+    decay: Floats  #: Factor of the running sums for the spans begun since the previous epoch; 1 for none; shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).
     last: list[Dated]  #: Last epoch of each antenna.
 
@@ -27,7 +27,7 @@ class Windows(NamedTuple):
     def of(
         cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
     ) -> Windows:
-        """Compute the ages by the rows of each antenna and its last epoch before these.
+        """Compute the ages from the rows of each antenna and its last earlier epoch (`before`).
 
         A window is `window_s` or `least_epochs` epochs, whichever is longer: a gap counts as at most 1 / `least_epochs`
         of a window.
@@ -45,8 +45,8 @@ class Windows(NamedTuple):
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
         """Return the sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
 
-        `start`, shape (A, K): running sums after the previous epochs; the sums after the last epochs are returned as
-        well.
+        `start`, shape (A, K), are the running sums after the previous epochs; the running sums after the last epochs
+        are also returned.
         """
         after, grown = np.array(start, dtype=np.float64), np.ascontiguousarray(self.growth[:, None] * values)
         return kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends), after
@@ -62,11 +62,11 @@ def correlated_sums(
     window_s: float,
     correlation_s: float,
 ) -> tuple[Floats, Floats, Floats, list[Dated]]:
-    """Sums over a window of epochs whose errors are constant over `correlation_s`: each epoch counts by the time since
-    the previous one.
+    """Compute sums over a window of epochs whose errors are correlated over `correlation_s`.
 
-    Arguments as for `Windows`. Returns decayed sums at each epoch, its own values not included (T, K), the contribution
-    of each epoch (T, K), running sums after the last epochs (A, K), and these.
+    An epoch has the time since the previous epoch divided by `correlation_s`, at most 1, as its weight. Arguments are
+    as for `Windows`. Returns the decayed sums before each epoch (T, K), the weighted values of each epoch (T, K), the
+    running sums after the last epochs (A, K), and the last epochs.
     """
     windows = Windows.of(time, parts, before, window_s=window_s, least_epochs=window_s / correlation_s)
     own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values

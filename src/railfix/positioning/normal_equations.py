@@ -1,13 +1,13 @@
 """Normal equations of ranges with the receiver clocks eliminated; the constrained position and the 3-D single point.
 
-Subtracting the weighted mean of a constellation's satellites from its residuals and design rows is the same as solving
-for that clock (the Schur complement of the clock block). Where the offsets between the clocks are known with a sigma
-(`InterSystemBiases`), each mean less its offset is one more observation of a common clock, which is eliminated in the
+Subtracting the weighted mean over a constellation's satellites from its residuals and design rows is equivalent to
+solving for its clock (the Schur complement of the clock block). Where the biases between the clocks are known with a
+sigma (`InterSystemBiases`), each mean less its bias is an observation of a common clock, which is eliminated in the
 same way.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
-height errors are two more unknowns with their covariance as prior, the same as an added covariance ``H_m S_m H_m^T``.
-The single point is the reference method of P1 section 5.
+height errors are two unknowns with their covariance as prior, which is equivalent to an additional covariance
+``H_m S_m H_m^T`` of the ranges. The single point is the reference method of P1 section 5.
 """
 
 from __future__ import annotations
@@ -68,25 +68,25 @@ class ConstrainedLimits(Settings):
 
     #: Largest last step inside a section: after a step of 5 m the error is 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, into neighbouring sections included.
+    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including those between sections.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Constrained(NotebookTable):
     """Positions along the line, T epochs."""
 
-    arc_m: Floats  #: Along the trajectory; NaN where the iteration did not settle or was not started; shape (T,).
+    arc_m: Floats  #: Arc length; NaN where the iteration did not converge or was not started; shape (T,).
     section: Indices  #: Section that contains the position, -1 without a position; shape (T,).
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
-    exact_map_sigma_m: Floats  #: Its part from the weights alone, as for an exact map; shape (T,).
+    exact_map_sigma_m: Floats  #: Part of `sigma_m` from the weights alone, as for an exact map; shape (T,).
     #: Sigma along the line for unit, equal weights and an exact map; infinite where undetermined; shape (T,).
     dilution: Floats
-    #: Distance beyond an end of the line at which the ranges place a position clamped to it; 0 elsewhere; shape (T,).
+    #: Distance beyond the end of the line implied by the ranges of a position clamped to it; 0 elsewhere; shape (T,).
     overshoot_m: Floats
-    clock_m: Floats  #: Shape (T, G).
+    clock_m: Floats  #: Receiver clock of each group, shape (T, G).
     wsse: Floats  #: Weighted sum of squared residuals, with the map error taken into account; shape (T,).
     residual_m: Floats  #: Code - range - clock at the position on the line, shape (T, M).
-    iterations: Integers  #: Shape (T,).
+    iterations: Integers  #: Number of steps, shape (T,).
 
 
 def position_on_line(
@@ -94,15 +94,15 @@ def position_on_line(
 ) -> Constrained:
     """Compute the distance along the line by constrained least squares (P1 2.2(3)): ``R = r_i + d e_i``.
 
-    Newton steps in d with the receiver clocks eliminated, inside a section; a step that leaves it stops at its end and
-    continues in the neighbouring one. Where the steps from both neighbouring sections lead back to their common point,
-    that point is the solution. At an open end the position is clamped, and `overshoot_m` is the distance beyond it
-    implied by the ranges.
+    The iteration consists of Newton steps in d inside a section, with the receiver clocks eliminated. A step beyond the
+    section stops at its end, and the iteration continues in the neighbouring section. Where the steps from both
+    neighbouring sections lead back to their common point, that point is the solution. At an open end the position is
+    clamped, and `overshoot_m` is the distance beyond it implied by the ranges.
 
     Parameters
     ----------
     ranges : Ranges
-        Of `weighted_ranges`.
+        Returned by `weighted_ranges`.
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna.
     vertex : ndarray of int, shape (T,)
@@ -132,7 +132,10 @@ def position_on_line(
 def _on_line(
     ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
-    """Return arc lengths (T,), and the values of `_from` with the epochs on the last axis."""
+    """Return arc lengths (T,), and the values of `_from` with the epochs on the last axis.
+
+    Positions clamped to an end of a closed line are also solved from the other end; the better fit is kept.
+    """
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
         pulled = ((solved[4] > 0.0) & (section == end)).nonzero()[0]
@@ -152,7 +155,7 @@ def _on_line(
 def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """Run `iterate_along` on a trajectory, from points of it."""
+    """Run `kernels.ranges.iterate_along` on a trajectory from its points `vertex`."""
     line = SectionArrays(
         trajectory.ecef_m[:-1], trajectory.tangent, trajectory.across, trajectory.up, trajectory.length_m,
         trajectory.sigma_plan_m, trajectory.sigma_height_m,
@@ -161,7 +164,7 @@ def _from(
 
 
 class SectionArrays(NamedTuple):
-    """Sections of a line, S of them, and the sigmas of its map."""
+    """Arrays of the S sections of a line, and the sigmas of its map."""
 
     start_ecef_m: Floats  # (S, 3)
     tangent: Floats  # (S, 3)
@@ -173,13 +176,13 @@ class SectionArrays(NamedTuple):
 
 
 class SinglePointLimits(Settings):
-    """Limits of the iteration, and of the validation of its position (`conventional_status`)."""
+    """Limits of the iteration of 3-D positions, and of their validation (`conventional_status`)."""
 
     tolerance_m: float = Field(default=1.0, gt=0)  #: Largest last step: after a step of 1 m the error is 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
     #: Probability that noise alone fails the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
-    #: Largest position dilution of precision; 30, as RTKLIB has for the geometric one.
+    #: Largest position dilution of precision; RTKLIB limits the geometric dilution of precision to 30.
     dilution_limit: float = Field(default=30.0, gt=0)
 
 
@@ -188,22 +191,22 @@ class SinglePoint(RowArrays, NotebookTable):
     """3-D positions, T epochs."""
 
     ecef_m: Floats  #: NaN with too few satellites, singular geometry, or no convergence; shape (T, 3).
-    clock_m: Floats  #: Shape (T, G).
+    clock_m: Floats  #: Receiver clock of each group, shape (T, G).
     matrix: Floats  #: Normal matrix at the position, shape (T, 3, 3) [1/m^2].
     covariance_m2: Floats  #: Covariance of the position, from the weights; shape (T, 3, 3).
-    wsse: Floats  #: Shape (T,).
-    residual_m: Floats  #: Shape (T, M).
+    wsse: Floats  #: Weighted sum of squared residuals, shape (T,).
+    residual_m: Floats  #: Code - range - clock, shape (T, M).
 
 
 def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePointLimits | None = None) -> SinglePoint:
-    """Compute 3-D positions without the map, a clock per constellation: the conventional method (P1 5).
+    """Compute 3-D positions without the map by the conventional method (P1 5), one clock per constellation unless tied.
 
     Parameters
     ----------
     ranges : Ranges
-        Of `weighted_ranges`.
+        Returned by `weighted_ranges`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
-        Initial positions, good to some thousand kilometres.
+        Initial positions, accurate to a few thousand kilometres.
     limits : SinglePointLimits, optional
     """
     limits = limits or SinglePointLimits()

@@ -20,20 +20,20 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.corrected import ORBITS_M, is_orbit, is_pseudorange
 
-UNTIED_M: Final = 1e6  #: Sigma of an unknown offset between clocks [m].
+UNTIED_M: Final = 1e6  #: Sigma of an unknown inter-system bias [m].
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class InterSystemBiases(RowArrays, NotebookTable):
     """Known offsets between the receiver clocks of the constellations."""
 
-    #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
+    #: Receiver clock of each group less a clock common to all groups; any finite value where unknown; shape (T, G).
     offset_m: Floats
-    sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where the offset is unknown; shape (T, G).
+    sigma_m: Floats  #: Standard deviation of `offset_m`; `UNTIED_M` where the offset is unknown; shape (T, G).
 
 
 class RangeArrays(NamedTuple):
-    """Arrays of `Ranges` as `kernel_array`: T epochs, M channels, G groups."""
+    """Arrays of `Ranges` for the compiled functions (`kernel_array`): T epochs, M channels, G groups."""
 
     sat_ecef_m: Floats  # (T, M, 3)
     code_m: Floats  # (T, M)
@@ -44,12 +44,12 @@ class RangeArrays(NamedTuple):
 
     @property
     def tied(self) -> bool:
-        """Whether any offset between the clocks is known."""
+        """Whether there are inter-system biases."""
         return len(self.offset_m) == len(self.code_m)
 
     @property
     def clock(self) -> Indices:
-        """Group of each channel."""
+        """Index of the group of each channel, shape (M,)."""
         return self.starts.searchsorted(np.arange(self.code_m.shape[1]), side="right") - 1
 
     def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
@@ -68,7 +68,7 @@ class Ranges:
     code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for unused ranges; shape (T, M) [1/m^2].
     groups: tuple[slice, ...]  #: Channels that share one receiver clock are adjacent; one slice per clock.
-    ties: InterSystemBiases | None = None  #: Known offsets between these clocks; None if there are none.
+    ties: InterSystemBiases | None = None  #: Known offsets between the clocks; None for separate clocks.
 
     def __len__(self) -> int:
         return len(self.code_m)
@@ -82,7 +82,7 @@ class Ranges:
 
     @cached_property
     def arrays(self) -> RangeArrays:
-        """Plain arrays of the ranges."""
+        """Arrays of the ranges for the compiled functions."""
         ties = np.empty((2, 0, len(self.groups))) if self.ties is None else (self.ties.offset_m, self.ties.sigma_m)
         arrays = (self.sat_ecef_m, self.code_m, self.weight, *ties)
         sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
@@ -90,17 +90,17 @@ class Ranges:
 
     @cached_property
     def n_used(self) -> Integers:
-        """Channels with weight, shape (T,)."""
+        """Number of used ranges (with a weight above 0), shape (T,)."""
         return np.asarray((self.weight > 0).sum(axis=1), dtype=np.int64)
 
     @cached_property
     def starts(self) -> Indices:
-        """First channel of each group."""
+        """Index of the first channel of each group, shape (G,)."""
         return np.array([group.start for group in self.groups], dtype=np.intp)
 
     @cached_property
     def n_clocks(self) -> Integers:
-        """Number of clocks with at least one channel, tied clocks counted as one, shape (T,)."""
+        """Number of clocks with at least one used range, shape (T,); all tied clocks together count as one."""
         seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
         if self.ties is None:
             return np.asarray(seen.sum(axis=1), dtype=np.int64)
@@ -109,23 +109,23 @@ class Ranges:
 
     @property
     def redundancy(self) -> Integers:
-        """Redundant ranges beyond the clocks and the distance along the line, shape (T,)."""
+        """Number of used ranges less the clocks and the distance along the line, shape (T,); can be negative."""
         return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
 
     @property
     def space_redundancy(self) -> Integers:
-        """Redundant ranges beyond the clocks and a 3-D position, shape (T,)."""
+        """Number of used ranges less the clocks and three coordinates, shape (T,); can be negative."""
         return np.asarray(self.n_used - self.n_clocks - 3, dtype=np.int64)
 
 
-#: Satellite position of ranges without weight: any finite value will do [m].
+#: Satellite position of unused ranges; any finite value is possible [m].
 FILLER_SATELLITE_M: Final = (2.6e7, 0.0, 0.0)
 
 
 def weighted_ranges(
     sat_ecef_m: ArrayLike, code_m: ArrayLike, sigma_m: ArrayLike, clock: Sequence[str] | Strings
 ) -> Ranges:
-    """Return ranges to be fitted, each with the weight ``1/sigma^2`` (P1 2.2(3)); 0 where code or sigma is NaN.
+    """Return ranges to be fitted, with weights ``1/sigma^2`` (P1 2.2(3)); 0 where code, sigma or satellite is NaN.
 
     Parameters
     ----------
@@ -134,13 +134,13 @@ def weighted_ranges(
     code_m, sigma_m : array_like, shape (T, M) [m]
         Corrected pseudoranges and their standard deviations; NaN for unused codes.
     clock : sequence of str, length M
-        Constellation, or letter of the receiver clock, of each channel; channels of one clock are adjacent.
+        Letter of the constellation or receiver clock of each channel; channels of one clock are adjacent.
 
     Raises
     ------
     ValueError
-        Shapes that do not match, arrays that are not of double precision, a standard deviation that is not positive,
-        a satellite or a code at an impossible distance, a letter of no constellation.
+        Shapes do not match, an array is not numeric or has single precision, a standard deviation is not positive,
+        a satellite or a code is at an impossible distance, or a letter is not that of a constellation.
     """
     code = _check_floats("code_m", code_m, 2)
     sigma = _check_floats("sigma_m", sigma_m, 2)
@@ -177,7 +177,7 @@ def weighted_ranges(
 
 
 def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
-    """Return an array of double precision with a given number of axes; ValueError for any other array."""
+    """Return values in double precision; ValueError for single precision, other types or a wrong number of axes."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 8):
         raise ValueError(

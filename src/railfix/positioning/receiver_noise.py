@@ -1,9 +1,9 @@
 """Receiver noise scale and single-epoch sigma.
 
-Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting: the robust one, from the
-ranges of each epoch that agree with each other, for the RAIM test, which does not influence it; and the stated one,
-from the ranges that RAIM accepted, for every sigma and protection level. Epochs that RAIM did not resolve, and epochs
-off the map, contribute to neither.
+Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting. The robust scale, from
+the ranges of each epoch that agree with each other, is that of the RAIM test and independent of its results. The stated
+scale, from the ranges that RAIM accepted, is that of every sigma and protection level. Epochs that RAIM did not
+resolve, and epochs off the map, contribute to neither scale.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ _MOST_FREEDOM: Final = 128
 
 
 class NoiseScaleLimits(Settings):
-    """Estimation of a receiver's noise scale."""
+    """Limits of the estimation of a receiver's noise scale."""
 
-    #: Time constant of forgetting. Code errors are correlated over about 20 s (0.6 after 10 s on recordings): five such
-    #: times give enough independent samples for a mean, and are short enough for a street or station to be forgotten
-    #: before the next one.
+    #: Time constant of exponential forgetting. Code errors are correlated over about 20 s (0.6 after 10 s on
+    #: recordings): five correlation times give enough independent samples for a mean, and are short enough that the
+    #: effect of a street or station decays before the next.
     window_s: float = Field(default=100.0, gt=0)
-    #: Weight of the prior scale of 1 as a number of redundant ranges: two or three epochs. Infinite keeps the scale at
-    #: 1.
+    #: Weight of the prior scale as a number of redundant ranges: two or three epochs. With infinity the scale is the
+    #: prior scale.
     prior: float = Field(default=20.0, gt=0)
-    least_epochs: float = Field(default=20.0, ge=1)  #: Fewest epochs in the window, gaps left out.
-    #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
-    #: predicts, so the variance stated for an epoch combines the window's variance, counted this many times, with the
-    #: variance of its own residuals. 4 is also the Student t of code errors on recordings.
+    least_epochs: float = Field(default=20.0, ge=1)  #: Fewest epochs in the window; gaps are not counted.
+    #: Degrees of freedom of the scale between epochs: the noise of single epochs varies more than chi-square predicts,
+    #: so the variance stated for an epoch combines the window's variance, weighted by this number, with the squared
+    #: residuals of the epoch. Student's t of code errors on recordings also has 4 degrees of freedom.
     spread: float = Field(default=4.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseState:
-    """Decayed sums behind the noise scales, after the last epoch."""
+    """Decayed sums of the noise scales, after the last epoch."""
 
-    #: Of the last epoch; NaT before the first.
+    #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Of the last epoch [windows].
-    #: Weighted sum of squared residuals, and degrees of freedom: of the ranges kept by the robust fit, and of the
-    #: ranges accepted by RAIM; shape (2,).
+    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
+    #: Weighted sum of squared residuals, and degrees of freedom, shape (2,), of the ranges kept by the robust fit
+    #: (`robust`), and of the ranges accepted by RAIM (`remaining`).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
@@ -64,10 +64,11 @@ def noise_scale(
     limits: NoiseScaleLimits,
     least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Return the ratio of the ranges' standard deviation to the assumed one (P4: 1), and new sums.
+    """Return the ratio of the ranges' standard deviation to the assumed value (1 in P4), and the new sums (A, 2).
 
-    Root mean square of the residuals of the epochs before, with forgetting, around a prior scale, shape (T,); it is at
-    least `least`. `start`: sums before (A, 2).
+    The ratio, shape (T,), at least `least`, is the root mean square of the normalised residuals of earlier epochs with
+    exponential forgetting, combined with `prior`, shape (T,). Epochs outside of `teaching` are left out. `start`,
+    shape (A, 2), are the sums after the previous epochs.
     """
     use = teaching & (freedom > 0) & np.isfinite(wsse)
     values = np.array([np.where(use, wsse, 0.0), np.where(use, freedom, 0)], dtype=np.float64).T
@@ -79,10 +80,10 @@ def noise_scale(
 
 
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
-    """Return the variance of the ranges of each epoch against their weights, shape (T,).
+    """Return the variance of the ranges of each epoch relative to their weights, shape (T,).
 
-    Posterior mean of a variance that scatters about the window's variance with `spread` degrees of freedom (scaled
-    inverse chi-square distribution), given the epoch's own residuals.
+    It is the scale of the posterior of a variance that has a scaled inverse chi-square distribution about the window's
+    variance with `spread` degrees of freedom, given the residuals of the epoch.
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
@@ -92,8 +93,8 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
 def epoch_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
     """Return the single-epoch sigma along the line, shape (T,) [m].
 
-    The standard deviation by the weights, times the larger of the receiver's scale and the scale of the epoch's own
-    residuals, widened as Student's t where the redundancy is small.
+    It is the standard deviation from the weights, times the larger of the receiver's scale and the scale of the epoch's
+    residuals, times the ratio of the 97.5 % quantiles of Student's t and of the normal distribution.
     """
     freedom = np.maximum(redundancy, 1)
     shown = np.sqrt(np.maximum(wsse, 0.0) / freedom)
@@ -103,7 +104,7 @@ def epoch_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Fl
 
 #: Huber's tuning constant [sigma]: 95 % efficiency for normal errors.
 HUBER: Final = 1.345
-_ROUNDS: Final = 10
+_ROUNDS: Final = 10  #: Number of reweightings.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,10 +118,10 @@ class RobustClock:
 def robust_clock(
     residual_m: Floats, sigma_m: Floats, groups: tuple[slice, ...], *, least_ranges: int = 4
 ) -> RobustClock:
-    """Return the receiver clock of each group of channels: Huber-weighted mean of residuals, starting at their median.
+    """Estimate the receiver clock of each group of channels: the Huber-weighted mean of residuals, from their median.
 
-    `residual_m`, `sigma_m`, shape (T, K): range errors plus the clock, NaN is ignored; `least_ranges`: fewest ranges
-    for a clock estimate.
+    `residual_m`, shape (T, K), are range errors plus the clock, and `sigma_m` their standard deviations; channels with
+    NaN are left out. `least_ranges` is the fewest ranges for a clock estimate.
     """
     clock = np.full((len(residual_m), len(groups)), np.nan)
     share = np.zeros(residual_m.shape)

@@ -1,4 +1,4 @@
-"""Search structures of a trajectory: a k-d tree of its points, and stretches of rising length."""
+"""Search structures of a trajectory: a k-d tree of its points, and stretches of increasing length."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from railfix.track.trajectory import Trajectory
 
 
 class SearchIndex:
-    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
+    """Search structures of a trajectory, built once: a k-d tree, and stretches of increasing length."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
-        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
+        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of the trajectory points, shape (3,).
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
-        self.tree = scipy.spatial.cKDTree(points)  #: k-d tree of its points.
-        #: Stretches of each level: middle points, and the radii [m] that cover the rest.
+        self.tree = scipy.spatial.cKDTree(points)  #: k-d tree of the trajectory points.
+        #: Stretches of each level: index of the middle point, and radius [m] around it that contains all points.
         self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1
         while True:
@@ -36,20 +36,19 @@ class SearchIndex:
 
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
-        """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first of each level."""
+        """Middle points and radii [m] of the stretches of all levels, shape (S,), and where each level starts."""
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
     @cached_property
     def arc_of_points_m(self) -> Floats:
-        """Arc length of each point, the smallest one where a line passes a point several times, shape (V,) [m]."""
+        """Arc length of each point, the smallest value where the line passes it several times, shape (V,) [m]."""
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
+        """Return a horizontal distance from positions on the line within which it lies on the tangent, shape (T,) [m].
 
-        Along and across, without the height. The distance for all positions on a section, computed once per section; at
-        most `CLEAR_M`.
+        The distance, at most `CLEAR_M`, is computed once per section and valid for all positions on it.
         """
         line = self.trajectory
         section = line.segment_at(arc_m)[0]

@@ -1,10 +1,10 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
-P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares equals
-the sum for the residuals after each constellation's clock is eliminated. `find_section` returns the point with the
-least such ``q`` in a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a
-quadratic form, so stretches outside a ball are dropped. Otherwise the search is coarse to fine: the root of ``q``
-changes at most by the root of the summed weights times the distance moved. Both are exact.
+P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares ``q``
+equals that of the residuals after each constellation's clock is eliminated. `find_section` returns the point with the
+least ``q`` in a time that does not grow with the length of the line. Where a 3-D position exists, ``q`` grows from it
+as a quadratic form, so stretches outside a ball are dropped. Otherwise the search is coarse to fine: the root of ``q``
+changes at most by the root of the summed weights times the distance moved. Both searches are exact.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Other positions are searched up to an excess that noise has with this probability: beyond the limit of ambiguity, as
-#: a fault of one range can hide that much.
+#: Other positions are searched up to the excess that noise exceeds with this probability. It is larger than the limit
+#: of ambiguity, because a fault of one range can increase the excess of the true position.
 _REACH_RISK: Final = 1e-16
 
 
 class SectionLimits(Settings):
     """Limits of ambiguous sections."""
 
-    #: Probability that noise makes the true position fit worse than the best one by this much. Chi-square, one degree
-    #: of freedom. P1 3.2: wrong sections on sharp curves.
+    #: Probability that noise makes the true position fit worse than the best position by more than the threshold
+    #: (chi-square, one degree of freedom). P1 3.2: wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
     separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct positions.
-    #: Ranges beyond the unknowns below which a section is doubtful: on real recordings of two constellations a quarter
-    #: of the sections were wrong with one redundant range, 3 to 4 % with two.
+    #: Number of redundant ranges below which a section is doubtful: on recordings with two constellations a quarter of
+    #: the sections were wrong with one redundant range, 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
 
     @cached_property
     def threshold(self) -> float:
-        """Excess of q that noise of unit variance explains."""
+        """Largest excess of q within noise of unit variance."""
         return float(scipy.special.chdtri(1, self.ambiguity_risk))
 
     @cached_property
@@ -55,25 +55,25 @@ class SectionLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """The best point of the trajectory, T epochs."""
+    """Best-fitting point of the trajectory, T epochs."""
 
     vertex: Indices  #: Point with the least q; -1 where no range is redundant with the clocks; shape (T,).
-    q: Floats  #: Weighted sum of squared residuals of the section, shape (T,).
-    #: Difference in q of the best other position, at its own best point between the points of the trajectory, in
-    #: variances estimated from the fit of the best position (never below the variance of the weights); negative when it
-    #: fits better, infinite without another position; shape (T,).
+    q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without one; shape (T,).
+    #: Excess of q at the best alternative position over q at the best position, both interpolated between the points of
+    #: the trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
+    #: better, infinite without an alternative; shape (T,).
     excess: Floats
-    other_vertex: Indices  #: Section of the other position; -1 without one; shape (T,).
+    other_vertex: Indices  #: Point of the alternative position; -1 without one; shape (T,).
     evaluations: Integers  #: Points whose q was computed, shape (T,).
 
 
 class SectionCandidates(NamedTuple):
-    """Evaluated points, sorted by epoch and point, with q and its slope there; n epochs, p points."""
+    """Evaluated points, sorted by epoch and point, with q and half its gradient; n epochs, p points."""
 
-    #: The epochs, and their numbers of points (at least one each); shape (n,).
+    #: Epochs, and number of points of each epoch (at least 1); shape (n,).
     at: Indices
     points: Indices
-    #: Shapes (p,), (p,), (p, 3).
+    #: Points, q and half the gradient of q; shapes (p,), (p,), (p, 3).
     vertex: Indices
     q: Floats
     half_gradient: Floats
@@ -85,12 +85,12 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     """Return the point of the line that the ranges fit best, by between-satellite single differences (P1 2.2(2)).
 
     With full covariances the single differences of the residuals ``v_i = P_i - |s_i - r|`` at a point r have the
-    weighted sum of squares ``q = sum_i w_i (v_i - mean)^2``, means over the satellites of a clock.
+    weighted sum of squares ``q = sum_i w_i (v_i - mean)^2``, with weighted means over the satellites of a clock.
 
     Parameters
     ----------
     ranges : Ranges
-        Of `weighted_ranges`.
+        Returned by `weighted_ranges`.
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
     point : SinglePoint
@@ -142,7 +142,7 @@ def _ball(
     epochs: Indices,
     limits: SectionLimits,
 ) -> Floats:
-    """Radius around the 3-D position of some epochs that contains every candidate point; NaN where unknown."""
+    """Return the radius around the 3-D positions that contains every candidate point [m]; NaN where unknown."""
     radius = np.full(len(epochs), np.nan)
     known = np.isfinite(point.ecef_m[epochs, 0])
     at = epochs[known]
@@ -160,7 +160,7 @@ def _ball(
 def _in_ball(
     ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
-    """Return the points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
+    """Return the points in the ball of each epoch; q is exact where its quadratic form does not determine the best."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
         point.wsse[epochs], weight_norm[epochs],
@@ -176,7 +176,10 @@ def _in_ball(
 def _coarse_to_fine(
     ranges: Ranges, index: SearchIndex, weight_norm: Floats, freedom: Integers, limits: SectionLimits, epochs: Indices
 ) -> tuple[SectionCandidates, Integers]:
-    """Return the points that fit within the noise, by dropping stretches of line that fit too badly."""
+    """Return the points that may fit within the noise, and the number of points evaluated at each epoch.
+
+    Stretches of the line on which no point can fit within the noise are dropped.
+    """
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
     tried = np.zeros(len(ranges), dtype=np.int64)

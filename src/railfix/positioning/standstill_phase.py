@@ -1,9 +1,9 @@
-"""Carrier phases of a train at rest with a base station: their probability given a position of known error.
+"""Likelihood of the carrier phases of a train at rest and a base station, given a position of known error.
 
 Double differences have integer ambiguities that are constant while the train is at rest; along a track, integers that
 fit the phases of all satellites exist only near the true position (P1 2.5). Each satellite's phase has a constant
-error, which does not average out. LAMBDA: decorrelation and a search in a shrinking ellipsoid (Teunissen 1995,
-doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
+error, which does not average out. Integers are found by LAMBDA: decorrelation and a search in a shrinking ellipsoid
+(Teunissen 1995, doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-#: Vectors whose square exceeds the least by more than this are not searched for: exp(-20) of its likelihood.
+#: Vectors whose square exceeds the least square by more than this have a relative likelihood below exp(-20); omitted.
 _WITHIN: Final = 40.0
-_ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.
+_ROUNDING: Final = 1e-9  #: Least relative decrease of a conditional variance for which two unknowns are exchanged.
 
 
 class IntegerSearch:
-    """Search for integer vectors near real ones with the same positive definite covariance, shape (n, n) [cycle^2]."""
+    """Search for integer vectors near real vectors of one positive definite covariance, shape (n, n) [cycle^2]."""
 
     def __init__(self, covariance: Floats) -> None:
         # unit lower triangular L and variances d with covariance = L' diag(d) L
@@ -43,7 +43,7 @@ class IntegerSearch:
 
 
 def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
-    """Return the integer transformation that makes the unknowns nearly uncorrelated, ordered by falling precision."""
+    """Return the integer transformation that nearly decorrelates the unknowns, and their L and d, d mostly falling."""
     n = len(variance)
     lower, variance, transform = lower.copy(), variance.copy(), np.eye(n, dtype=np.int64)
     rounded_to = n - 2
@@ -65,7 +65,7 @@ def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Flo
 
 
 def _exchange(lower: Floats, variance: Floats, transform: Integers, k: int, new: float) -> None:
-    """Exchange unknowns k and k + 1 in place; `new` is the conditional variance of the latter then."""
+    """Exchange unknowns k and k + 1 in place; `new` is the conditional variance of k + 1 after the exchange."""
     share, slope = variance[k] / new, variance[k + 1] * lower[k + 1, k] / new
     variance[k], variance[k + 1] = share * variance[k + 1], new
     above, below = lower[k, :k].copy(), lower[k + 1, :k].copy()
@@ -77,9 +77,9 @@ def _exchange(lower: Floats, variance: Floats, transform: Integers, k: int, new:
 
 
 def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: float) -> tuple[Integers, Floats]:
-    """Return the nearest integer vectors of decorrelated unknowns, depth first from the last one."""
+    """Return the nearest integer vectors of decorrelated unknowns, by a depth-first search from the last unknown."""
     n = len(variance)
-    # plain floats: the search goes one unknown at a time
+    # Python floats are faster here than arrays of one element
     start, weight = cycles.tolist(), (1.0 / variance).tolist()
     conditional, chosen, steps, sums = [0.0] * n, [0.0] * n, [0.0] * n, [0.0] * (n + 1)
     shifts = np.zeros((n + 1, n))
@@ -115,8 +115,8 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Largest number of integer vectors in the sum; vectors that add less than this (logarithm) to uniform phases are left
-#: out.
+#: Largest number of integer vectors in the sum, and least log likelihood of a vector relative to that of uniform
+#: phases.
 _VECTORS: Final = 20
 _NEGLIGIBLE: Final = -5.0
 
@@ -125,15 +125,15 @@ _NEGLIGIBLE: Final = -5.0
 class MeanPhases:
     """Mean double differences of one antenna's carrier phases, n pairs of satellites."""
 
-    difference_m: Floats  #: Observed less computed for the origin, but for multiples of the wavelength; shape (n,).
-    away: Floats  #: Its change with the position, east, north, up; shape (n, 3).
+    difference_m: Floats  #: Observed less computed at the origin, up to multiples of the wavelength; shape (n,).
+    away: Floats  #: Derivative of the double difference by position east, north and up; shape (n, 3).
     wavelength_m: Floats  #: Shape (n,).
-    covariance_m2: Floats  #: Shape (n, n).
+    covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodePlace:
-    """Position of one antenna by its codes, shape (3,) east, north, up of the origin [m], and its covariance."""
+    """Code position of one antenna, shape (3,) east, north and up of the origin [m], and its covariance."""
 
     place_m: Floats
     covariance_m2: Floats
@@ -147,10 +147,10 @@ def phase_log_likelihood(
     *,
     fault_prior: float,
 ) -> Floats:
-    """Log density of the phases of A antennas, given their codes, for U hypotheses of their positions, shape (U,).
+    """Return the log density of the phases of A antennas, given their codes, for U hypotheses of position, shape (U,).
 
-    `expected_m` (U, 3 A) and covariance `prior_m2` about it. The phases are within a wavelength, as the integers are
-    unknown; with the probability `fault_prior` they follow no model (a slip, half a cycle) and are uniform there.
+    A hypothesis has the mean `expected_m` (U, 3 A) and the covariance `prior_m2`. Phases are known modulo the
+    wavelength. With the probability `fault_prior` they follow no model (slip, half cycle) and are uniform over it.
     """
     measured = np.concatenate([code.place_m for code in codes])
     of_codes = scipy.linalg.block_diag(*(code.covariance_m2 for code in codes))
@@ -170,5 +170,5 @@ def phase_log_likelihood(
 
 
 def uniform_log_likelihood(phases: Sequence[MeanPhases], *, fault_prior: float) -> float:
-    """Return the logarithm of the density of phases that follow no model: a lower bound at every position."""
+    """Return the log density of phases that follow no model: a lower bound of `phase_log_likelihood`."""
     return float(np.log(fault_prior) - sum(np.log(phase.wavelength_m).sum() for phase in phases))

@@ -1,10 +1,10 @@
 """Track of a train at rest, from codes and carrier phases (P1 2.5).
 
-Hypotheses are a track with the facing of the train, and *none*: a parallel track that is missing from the map. At rest
+A hypothesis is a track and the facing of the train; *none* is a parallel track that is missing from the map. At rest
 each satellite's code has a constant bias, so the covariance of the mean does not fall with the number of epochs. The
-posterior of a hypothesis is its prior times the likelihood integrated over the position along the track. A track is
-decided on when all other hypotheses together have less than the allowed risk, which is the probability of a wrong
-decision if the error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
+posterior of a hypothesis is proportional to its prior times its likelihood integrated along the track. A track is
+selected when the posterior of all other tracks together is below the allowed risk, which bounds the probability of a
+wrong decision if the error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
 """
 
 from __future__ import annotations
@@ -25,49 +25,49 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UN
 #: Steps of the integrals along and across the track [m].
 _ALONG_M: Final = 0.25
 _ACROSS_M: Final = 0.3
-#: Weight of a missing track within the clearance of a mapped track (the map would be displaced), relative to one
-#: farther away; 0 nearer than the second value [m].
+#: Weight of an unmapped track within the clearance of a mapped track (possible only if the map is displaced), relative
+#: to an unmapped track farther away. It is 0 at distances below the second value [m].
 _BETWEEN_SHARE: Final = 0.1
 _BETWEEN_M: Final = 1.2
 #: A position farther than this from the most likely track, in standard deviations, gives no decision.
 _LARGEST_MISFIT: Final = 4.0
-#: Part of a track about the train that is integrated over, either side [m].
+#: Length of track before and behind the code position over which the likelihood is integrated [m].
 _REACH_M: Final = 40.0
-_LEAST_ELEVATION_DEG: Final = 10.0
+_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are those at this elevation.
 #: Residual atmospheric error of the difference of phases at two positions, as a fraction of their distance.
 _PHASE_SHARE: Final = 1e-6
-#: Hypotheses with codes this much less likely (logarithm) than the best are not evaluated with phases.
+#: Phases are evaluated for hypotheses whose log likelihood of the codes is less than this below the largest.
 _UNLIKELY: Final = 25.0
-#: Standard deviations of the position along the track, and of the height, for the phase search [m].
+#: Standard deviation of the position along the track, and of the height, in the phase search [m].
 _ANY_PLACE_M: Final = 50.0
-#: Probability of a larger misfit of the mean codes below which the error model is rejected.
+#: Significance level at which the misfit of the mean codes rejects the error model.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
-_FREEDOM: Final = 8.0  #: Degrees of freedom of height errors.
+_FREEDOM: Final = 8.0  #: Degrees of freedom of the Student's t distribution of height errors.
 #: Probability that the phases of a standstill follow no model, by an undetected slip or half a cycle.
 _PHASE_FAULT_PRIOR: Final = 1e-3
 _UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a missing track can lie.
 
 
 class StandstillErrors(Settings):
-    """Errors of codes at rest, and prior of a track that the map does not have."""
+    """Standard deviations of code and phase errors at rest, and prior probability of an unmapped track."""
 
-    #: Constant part of a satellite's code at the zenith (multipath); divided by the sine of the elevation.
+    #: Constant code error of a satellite at the zenith (multipath); divided by the sine of the elevation.
     code_bias_m: float = option("Constant code error of a satellite at the zenith.", 0.6, metavar="M", gt=0)
-    #: Part that varies, correlated over `correlation_s`, likewise.
+    #: Varying code error at the zenith, correlated over `correlation_s`; divided by the sine of the elevation.
     code_noise_m: float = option("Varying code error of a satellite at the zenith.", 0.5, metavar="M", gt=0)
 
-    correlation_s: float = option("Time over which the varying part persists.", 60.0, metavar="S", gt=0)
-    #: Constant part of a satellite's carrier phase at the zenith, likewise.
+    correlation_s: float = option("Correlation time of the varying code error.", 60.0, metavar="S", gt=0)
+    #: Constant carrier-phase error of a satellite at the zenith; divided by the sine of the elevation.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
     #: Error of each antenna's position on the train, along and across: spacing, sway, lean.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
-    #: Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
+    #: Map error across the track common to all tracks of a yard, including the shift of the antenna on canted track.
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
 
-    #: With a standard deviation of 1.5 m where it is not given: from bogies to roofs.
+    #: If not given, `ANTENNA_UP_M` with a standard deviation of `ANTENNA_SIGMA_M`: from bogies to roofs.
     antenna_up_m: float | None = option(
-        "Height of the antennas above the rails, for tracks above each other; else about 2.5 m.",
+        "Height of the antennas above the rails, for tracks above each other; by default about 2.5 m.",
         None,
         name="--antenna-height",
         metavar="M",
@@ -83,13 +83,13 @@ class StandstillErrors(Settings):
         return np.asarray(self.code_bias_m / _sine(elevation_deg))
 
     def phase_sigma_m(self, elevation_deg: Floats, *, distance_m: float) -> Floats:
-        """Standard deviation of the difference of two receivers' phases [m], atmosphere at a distance included."""
+        """Return the standard deviation of the difference of two receivers' phases, with atmospheric error [m]."""
         return np.asarray(np.hypot(np.sqrt(2.0) * self.phase_bias_m, _PHASE_SHARE * distance_m) / _sine(elevation_deg))
 
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
         """Return the standard deviation of the mean of the varying code error over a time [m].
 
-        Fraction of variance of a first-order Gauss-Markov process in its mean: 2 tau/T (1 - tau/T (1 - exp(-T/tau))).
+        The mean of a Gauss-Markov process has the fraction 2 tau/T (1 - tau/T (1 - exp(-T/tau))) of its variance.
         """
         ratio = self.correlation_s / max(seconds, 1e-9)
         share = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
@@ -106,9 +106,9 @@ class StandstillFix:
 
     east_north_m: Floats  #: From the origin of the yard's coordinates, shape (2,).
     own_m2: Floats  #: Covariance of this antenna's own errors: code bias and noise; shape (2, 2).
-    common_m2: Floats  #: Covariance of errors common to both antennas: satellites and atmosphere; shape (2, 2).
+    common_m2: Floats  #: Covariance of satellite and atmospheric errors, common to both antennas; shape (2, 2).
     misfit: float  #: Weighted sum of squares of the residuals.
-    freedom: int
+    freedom: int  #: Degrees of freedom of `misfit`.
     place: CodePlace | None = None  #: Position with height, for phases; None where there are no phases.
 
     @property
@@ -128,10 +128,11 @@ def standstill_fix(
     errors: StandstillErrors,
     receivers: int = 1,
 ) -> StandstillFix | None:
-    """Fix the position of an antenna at rest from mean code residuals at an origin; None where satellites are too few.
+    """Estimate the position of an antenna at rest from mean code residuals; None if satellites do not determine it.
 
-    Shapes (K,): `system` letters of the clocks, `residual_m` observed minus computed, means over `seconds`, `common_m`
-    sigmas of satellite and atmospheric errors; `receivers` is 2 where a base station's codes are subtracted.
+    Arrays have shape (K,): `system` are clock letters, `residual_m` means over `seconds` of observed less computed
+    codes at the origin, and `common_m` sigmas of satellite and atmospheric errors. `receivers` is 2 if the codes of a
+    base station are subtracted.
     """
     letters = np.unique(system)
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -167,8 +168,8 @@ class YardTrack:
 
     name: str
     points_m: Floats
-    up_m: float = np.nan  #: Height above the origin where the track is nearest to it; NaN without.
-    sigma_up_m: float = 0.0  #: Standard deviation of this height.
+    up_m: float = np.nan  #: Height above the origin where the track is nearest to it; NaN if unknown.
+    sigma_up_m: float = 0.0  #: Standard deviation of `up_m`.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +184,7 @@ class TrackPosterior:
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
-        """Return the name of the track whose probability exceeds one minus the risk; empty while undecided."""
+        """Return the track (or `NONE`) whose probability exceeds one minus the risk; empty if undecided or no fit."""
         best = int(np.argmax(self.probability))
         if not self.fits or self.misfit_sigmas[best] > _LARGEST_MISFIT:
             return ""
@@ -201,8 +202,9 @@ def track_posterior(
 ) -> TrackPosterior:
     """Compute the probability that a train at rest is on each track, or on none.
 
-    `arms_m`: position of each antenna along the train, positive to its front; `prior`: weights of the mapped tracks by
-    name, 0 for tracks not named; `phases`: phases of each antenna with a base station; empty without one.
+    `arms_m` is the position of each antenna along the train, positive to its front. `prior` are weights of the tracks
+    by name, 0 for tracks not named; ValueError if all are 0. `phases` has one item per antenna, or none without a base
+    station.
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -255,8 +257,8 @@ def track_posterior(
 def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFix], errors: StandstillErrors) -> Floats:
     """Return the log likelihood of the codes' height on each track and on none, shape (tracks + 1,).
 
-    Student's t: a height that fits no track has less influence. A track without height, and `NONE`, have the
-    best-fitting height.
+    Student's t distribution limits the influence of a height that fits no track. A track of unknown height, and `NONE`,
+    have the largest likelihood of the other tracks.
     """
     codes = [fix.place for fix in fixes if fix.place is not None]
     up = np.array([track.up_m for track in tracks])
@@ -275,7 +277,7 @@ def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFi
 def _with_phases(
     found: list[list[_Places]], fixes: Sequence[StandstillFix], phases: Sequence[MeanPhases], errors: StandstillErrors
 ) -> list[list[_Places]]:
-    """Return the evidence including the phases."""
+    """Return the hypotheses with the log likelihood of the phases added to their evidence."""
     codes = [fix.place for fix in fixes if fix.place is not None]
     heights = np.array([code.place_m[2] for code in codes])
     best = max(item.log_evidence.max(initial=-np.inf) for row in found for item in row)
@@ -305,7 +307,7 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Covariance of antenna positions, shape (3 A, 3 A); only along-track and map errors are common."""
+    """Return the covariance of antenna positions, shape (3 A, 3 A); only along-track and map errors are common."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
@@ -315,7 +317,7 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Return the covariance of all positions, shape (2 A, 2 A): common and map errors are equal for all antennas."""
+    """Return the covariance of all positions, shape (2 A, 2 A); common and map errors are equal for all antennas."""
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0
@@ -355,18 +357,18 @@ def _distances(points_m: Floats, places_m: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Hypotheses of a track, U shifts across it."""
+    """Hypotheses of one track and facing, at U shifts across the track."""
 
     log_evidence: Floats  #: Likelihood integrated over the position along the track, shape (U,).
     expected_m: Floats  #: Most likely positions of the antennas, shape (U, A, 2).
     heading: Floats  #: Unit vectors along the track there, shape (A, 2).
-    misfit: float = np.inf  #: Least distance of the positions from the hypotheses in standard deviations.
+    misfit: float = np.inf  #: Least distance of the code positions from the hypotheses, in standard deviations.
 
 
 def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
 ) -> _Places:
-    """Likelihood of antenna positions on a track and at shifts across it; none beyond the ends of the track."""
+    """Return the likelihoods of a track at shifts across it, given antenna positions; empty beyond the track's ends."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)

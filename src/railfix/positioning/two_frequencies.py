@@ -1,14 +1,14 @@
-"""Two frequencies: both codes of a satellite combined to one pseudorange, with the ionosphere measured.
+"""Combination of both codes of a satellite to one pseudorange, with the ionospheric delay measured.
 
 The difference of the two corrected codes of a satellite has no geometry. With ``ratio = (f1/f2)^2`` it is
 
     ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
 
 where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
-receiver. The error is a field, alike for neighbouring satellites: an offset and two gradients with the sigma of the
-model as the prior, and a rest of each satellite's own. The residual delays and B follow from the means of all
-satellites by best linear prediction. The two codes, less the ionosphere predicted so far, then measure one range: least
-squares in closed form, in which only the unpredicted part distinguishes the codes.
+receiver. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as prior) and a
+residual of each satellite. I and B are estimated from the mean differences of all satellites by best linear prediction.
+The range is then the least-squares estimate from both codes less the predicted ionosphere; only the unpredicted part of
+the ionosphere distinguishes the codes.
 """
 
 from __future__ import annotations
@@ -26,40 +26,40 @@ from railfix.core.settings import Settings
 from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.second_codes import SecondCodes
 
-_FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.
-_FIRST_SAMPLES: Final = 2.0  #: Samples with the noise that the weights assume, which the noise scale begins with.
-_CLIP: Final = 2.5  #: Number of sigmas at which the mean difference of a satellite is limited.
-_LEAST_SUSPICION_M: Final = 3.0  #: Smallest such difference.
+_FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
+_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples with the noise assumed by the weights.
+_CLIP: Final = 2.5  #: Limit of the mean difference of a satellite [sigma].
+_LEAST_SUSPICION_M: Final = 3.0  #: Least difference of the two codes that is suspected [m].
 
 
 class TwoFrequencyLimits(Settings):
     """Limits of the combination of two frequencies."""
 
-    #: Time constant of the mean differences of the codes: the error of the Klobuchar model changes over many minutes.
+    #: Time constant of the mean differences of the codes. The error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
     #: Epochs closer together than this are one sample: the multipath of a train at rest is correlated over this time.
     correlation_s: float = Field(default=60.0, gt=0)
-    #: Standard deviation of a broadcast group delay, difference of two signals.
+    #: Standard deviation of the difference of two signals' broadcast group delays.
     delay_sigma_m: float = Field(default=0.2, gt=0)
-    #: Sigmas beyond which a difference of the two codes reduces the range's weight.
+    #: Difference of the two codes, in standard deviations, beyond which the weight of the range is reduced.
     suspicion: float = Field(default=4.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwoFrequencyState:
-    """Mean differences of the codes so far, Q pairs of signals of a satellite."""
+    """Mean differences of the codes so far, for Q signal pairs of satellites."""
 
-    names: tuple[str, ...] = ()  #: Length Q.
+    names: tuple[str, ...] = ()  #: Name of each pair.
     #: Information [1/m^2] of each pair, then moments [1/m]; shape (2 Q,).
     sums: Floats = field(default_factory=lambda: np.empty(0))
-    #: Sum of the sizes of the differences over the assumed ones, and their number; shape (2,).
+    #: Sum of the absolute differences divided by the assumed sigmas, and number of differences; shape (2,).
     scale: Floats = field(default_factory=lambda: np.zeros(2))
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Of the last epoch [windows].
+    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
-        """Return the state with the pairs of a chunk added, and the number of each pair."""
+        """Return the state with the pairs of a chunk added, and the index of each of these pairs in it."""
         if names == self.names:
             return self, np.arange(len(names))
         known = {name: i for i, name in enumerate(self.names)}
@@ -74,16 +74,16 @@ class TwoFrequencyState:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Combined(NotebookTable):
-    """One pseudorange per satellite from two codes: T epochs by K channels; NaN where only the first is used."""
+    """One pseudorange per satellite from two codes: T epochs by K channels; NaN where only the first code is used."""
 
-    code_m: Floats  #: Shape (T, K).
-    variance_m2: Floats  #: Change of the variance relative to the first code, shape (T, K).
-    share: Floats  #: Weight of the second code; the first has 1 less this weight; shape (T, K).
-    #: Delay on the first frequency beyond the model, shape (T, K).
+    code_m: Floats  #: Combined code, shape (T, K).
+    variance_m2: Floats  #: Variance less that of the first code, shape (T, K).
+    share: Floats  #: Weight of the second code; the first code has 1 - `share`; shape (T, K).
+    #: Ionospheric delay on the first frequency beyond the model, and its sigma; shape (T, K).
     ionosphere_m: Floats
     ionosphere_sigma_m: Floats
-    difference_m: Floats  #: Second code less first, less the prediction; shape (T, K).
-    suspected: Masks  #: Shape (T, K).
+    difference_m: Floats  #: Second code less first code, less the prediction; shape (T, K).
+    suspected: Masks  #: Ranges whose `difference_m` exceeds the limit, shape (T, K).
 
 
 def combine_codes(
@@ -96,12 +96,12 @@ def combine_codes(
     state: TwoFrequencyState,
     limits: TwoFrequencyLimits,
 ) -> tuple[Combined, TwoFrequencyState]:
-    """Combine the two codes of each satellite, with the ionosphere from earlier epochs, independently of chunks.
+    """Combine the two codes of each satellite, with the ionosphere estimated from earlier epochs, and the new state.
 
-    `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is the noise assumed by the
-    weights; `field_m`, shape (T, K, 4), are the standard deviations with sign of the modelled ionosphere on the first
-    frequency by its offset, two gradients and the satellite's own rest; `pairs` are the names of the pairs, length Q,
-    and the group of each whose receiver delay is common.
+    `code_m`, shape (T, K), are corrected first codes, NaN where unusable, and `noise_m` the sigmas of their noise.
+    `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionosphere on the first frequency by its
+    offset, its two gradients and the residual of the satellite. `pairs` are the names of the pairs, length Q, and the
+    group of each pair; the receiver delay is common to a group.
     """
     names, groups = pairs
     own, number = state.with_pairs(names)
@@ -165,8 +165,8 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
 
-    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise is not smoothed over epochs. `delays_m` are the group delays that
-    the corrections contain already, of the first and the second code, shapes (T, K).
+    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise is not smoothed over epochs. `delays_m` are the group delays of
+    the first and the second code that the corrections contain; they are added back; shapes (T, K).
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]
@@ -180,7 +180,7 @@ def ionosphere_free(
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
     """Return the weight of the second code in the range by least squares, and the variance of the codes' difference.
 
-    Variances of both codes are without the ionosphere; a large `ionosphere_m2` gives the ionosphere-free combination.
+    `first_m2` and `second_m2` exclude the ionosphere; a large `ionosphere_m2` gives the ionosphere-free combination.
     """
     total = first_m2 + second_m2 + (ratio - 1.0) ** 2 * ionosphere_m2
     return (first_m2 - (ratio - 1.0) * ionosphere_m2) / total, total
@@ -189,7 +189,7 @@ def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphe
 def _noise_scale(
     time: Datetimes, deviation: Floats, variance: Floats, known: Masks, own: TwoFrequencyState, ages: dict[str, float]
 ) -> tuple[Floats, Floats]:
-    """Return the variance of the differences over the assumed one, from earlier epochs, shape (T,), and the sums."""
+    """Return the ratio of the differences' variance to the assumed value, from earlier epochs (T,), and new sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
     sample = np.stack([channel_sums(size), channel_sums(known.astype(np.float64))], axis=1)
     last_epoch = [(own.last, own.age)]
@@ -201,9 +201,9 @@ def _noise_scale(
 def _fit_field(
     mean: Floats, basis: Floats, lever: Floats, weight: Floats, group: Integers
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Fit the field of the ionosphere and the delay of each group to mean differences.
+    """Fit the field of the ionosphere, and the receiver delay of each group, to mean differences.
 
-    Returns the field and its variance, the delay and its variance, of each channel, shapes (T, K).
+    Returns the field and its variance, and the delay and its variance, at each channel, shapes (T, K).
     """
     values = np.concatenate([lever[..., None] * basis, mean[..., None]], axis=-1)
     centre, of_centre = np.zeros(values.shape), np.zeros(mean.shape)

@@ -1,4 +1,4 @@
-"""Positions along the line from code and phase over a run of epochs (P4 with the map's constraint), integers fixed.
+"""Ambiguities of positions along the line from code and phase (P4 with the map's constraint), and integer fixing.
 
 The unknowns of the epochs (distance and clocks) are eliminated: the normal matrix has one row per arc of phase.
 Integers are fixed where the risk of a wrong integer is bounded, by Bayes' rule: the density of the float ambiguities
@@ -23,7 +23,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
-FREE_AMBIGUITY_M: Final = 1e4  #: Sigma of an ambiguity against its first value [m]: loose prior for conditioning.
+FREE_AMBIGUITY_M: Final = 1e4  #: Prior sigma of an ambiguity about its first value [m]: loose prior for conditioning.
 FORGET_S: Final = 600.0  #: An arc not observed for this long is restarted.
 
 
@@ -36,28 +36,29 @@ class PhaseLimits(Settings):
     #: hundredths of a radian bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0
     #: holds ambiguities constant.
     drift_m: float = Field(default=0.01, ge=0)
-    hop_s: float = Field(default=10.0, gt=0)  #: Steps of the walk.
+    hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
     #: Correlation time of code errors: epochs closer together than this add no information on the ambiguities.
     #: The variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes
     #: alone. The positions do not change. 0 for white noise, such as simulated noise.
     correlation_s: float = Field(default=20.0, ge=0)
-    #: Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
+    #: Number of linearisations; each has its own state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
     #: Largest probability of a wrong integer at which ambiguities are fixed, with a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
-    #: Probability that phases are not whole cycles (multipath, half a cycle).
+    #: Prior probability that phases are not whole cycles (multipath, half a cycle).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
-    largest_sigma_m: float = Field(default=1e3, gt=0)  #: Epochs with more noise along the line have no position.
+    #: Largest sigma from noise along the line; epochs with a larger sigma have no position.
+    largest_sigma_m: float = Field(default=1e3, gt=0)
 
 
 def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
-    """Return the number of the hop that contains each time."""
+    """Return the number of the time step (`hop_s`) that contains each time, shape (T,)."""
     nanoseconds = (time.astype("datetime64[ns]") - GPS_EPOCH).astype(np.int64)
     return np.asarray(nanoseconds // round(limits.hop_s * 1e9), dtype=np.int64)
 
 
 def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Return the number of correlated epochs for each epoch, shape (T,); 1 for the first."""
+    """Return the number of epochs per correlation time at each epoch, at least 1, shape (T,); 1 for the first epoch."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -66,9 +67,9 @@ def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class ArcAmbiguities:
-    """Ambiguities of A arcs (with a drift over a complete run: of parts of arcs within a hop)."""
+    """Ambiguities of A arcs."""
 
-    arc_id: Integers  #: Shape (A,).
+    arc_id: Integers  #: Number of each arc (`number_arcs`), shape (A,).
     #: Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With separate phase clocks,
     #: ambiguities are known up to a common constant: the mean of the corrections to their first values is zero, and the
     #: covariance refers to that mean; shape (A,).
@@ -80,7 +81,7 @@ class ArcAmbiguities:
 class PhasePositions(NotebookTable):
     """Positions along the line from code and phase, T epochs by M channels."""
 
-    #: Along the trajectory, within its ends; NaN without an initial position or enough satellites; shape (T,).
+    #: Arc length within the trajectory; NaN without an initial position or with too large a sigma; shape (T,).
     arc_m: Floats
     #: Standard deviation including the map error, and from noise alone; shape (T,).
     sigma_m: Floats
@@ -89,26 +90,28 @@ class PhasePositions(NotebookTable):
     #: Observed less computed; NaN where not used; shape (T, M).
     code_residual_m: Floats
     phase_residual_m: Floats
-    #: Ambiguity of the arc of each used phase, as known at the epoch; shape (T, M).
+    #: Ambiguity of the arc of each used phase, as estimated at the epoch, and its sigma; shape (T, M).
     ambiguity_m: Floats
     ambiguity_sigma_m: Floats
-    #: Used, shape (T,).
+    #: Number of used codes and of used phases, shape (T,).
     n_codes: Integers
     n_phases: Integers
-    n_fixed: Integers  #: Differences of ambiguities fixed to whole cycles, shape (T,).
-    #: Probability that one of these, or of the best candidates, is wrong; NaN without any; shape (T,).
+    n_fixed: Integers  #: Number of ambiguity differences fixed to whole cycles, shape (T,).
+    #: Probability that a fixed difference is wrong, or one of the best candidates where none is fixed; NaN where there
+    #: are no differences; shape (T,).
     integer_risk: Floats
-    #: All arcs of a run, or the arcs that continue after the last epoch (`phase_positions`); None in results, row by
-    #: row.
-    arcs: ArcAmbiguities | None
+    arcs: ArcAmbiguities | None  #: Arcs that continue after the last epoch; None in results of the pipeline.
 
-    iterations: int
+    iterations: int  #: Number of linearisations.
 
 
 def prepare_start(
     ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats
 ) -> tuple[Ranges, Phases, Floats]:
-    """Return ranges, phases and positions to start from; epochs without a position have no weight and arc 0."""
+    """Return ranges, phases and initial positions; epochs without a position have weight 0 and arc length 0.
+
+    Raises ValueError if shapes differ or a used phase has no arc.
+    """
     shape = ranges.code_m.shape
     if phases.phase_m.shape != shape or phases.weight.shape != shape or phases.arc_id.shape != shape:
         raise ValueError(f"phases have shape {phases.phase_m.shape}, expected that of the ranges {shape}")
@@ -125,8 +128,8 @@ def prepare_start(
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    A common constant is unobservable with separate phase clocks. It is fixed by a zero mean of the `held` ambiguities
-    (1, others 0; shape (..., A)), which changes no difference between them.
+    A constant common to all ambiguities is unobservable with separate phase clocks. It is fixed by a zero mean of the
+    ambiguities where `held`, shape (..., A), is 1 (else 0), which changes no difference between them.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -167,8 +170,8 @@ def assemble_positions(
     )
 
 
-_VECTORS: Final = 12  #: Vectors compared.
-#: Fractions of the differences, strongest phases first, that are tried in turn.
+_VECTORS: Final = 12  #: Number of integer vectors compared.
+#: Fractions of the differences that are fixed in turn, strongest phases first.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
@@ -176,10 +179,11 @@ _SHARES: Final = (1.0, 0.75, 0.5)
 class Fixed:
     """Ambiguities of A arcs, with the sufficiently certain differences fixed."""
 
-    value_m: Floats  #: Ambiguities, and their responses to a map 1 m off across and in height; shape (A, 3).
+    value_m: Floats  #: Ambiguities, and their responses to map errors of 1 m across and in height; shape (A, 3).
     covariance_m2: Floats  #: Covariance of noise alone, shape (A, A).
-    count: int  #: Differences fixed; 0: the float ambiguities are returned.
-    #: Probability that one of them, or of the best ones where none is fixed, is wrong; NaN without any difference.
+    count: int  #: Number of fixed differences; 0 for float ambiguities.
+    #: Probability that a fixed difference is wrong, or one of the best candidates where none is fixed; NaN where there
+    #: are no differences.
     risk: float
 
 
@@ -193,18 +197,18 @@ def fix_integers(
     largest_risk: float,
     no_integer_prior: float,
 ) -> Fixed:
-    """Fix differences of float ambiguities to whole cycles.
+    """Fix differences of float ambiguities to whole cycles; return the float ambiguities where the risk is too large.
 
     Parameters
     ----------
     value_m : ndarray, shape (A, 3) [m]
-        Float ambiguities, and their responses to a map 1 m off across and in height.
+        Float ambiguities, and their responses to map errors of 1 m across and in height.
     covariance_m2 : ndarray, shape (A, A) [m^2]
-        Of noise alone.
+        Covariance of noise alone.
     strength : ndarray, shape (A,)
         Weight of each phase; the strongest phase of a group is the reference of its differences.
     channels : IntegerChannels
-        Of the A arcs.
+        Wavelength and group of each arc.
     map_sigma_m : tuple of float
         Standard deviation of the map across and in height [m].
     largest_risk, no_integer_prior : float
@@ -266,7 +270,7 @@ def _fix_pairs(
     log_density = -0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
     peak = max(float(log_density[0]), 0.0)
     weight = (1.0 - no_integer_prior) * np.exp(log_density - peak)
-    # A density of one per cycle, for phases that are not whole cycles.
+    # density of phases that are not whole cycles: one per cycle
     others = weight[1:].sum() + no_integer_prior * np.exp(-peak)
     step = np.zeros((len(rows), 3))
     step[:, 0] = cycles - integers[0]

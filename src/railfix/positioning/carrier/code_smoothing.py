@@ -1,13 +1,13 @@
 """Cycle slips and gaps of the phase, and carrier-smoothed codes (Hatch filter).
 
-The phase's change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or
-without Dopplers with the change of the code, less the median of the channels, so that a clock step is no slip. A clock
-step is common to all channels of an epoch; codes follow the time tags, so that the true interval is the tags' less the
-step seen in the codes; phases step with the codes, or continue and then differ by whole milliseconds, which
-`Slips.phase_m` adds.
+The change of the phase is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or,
+where there are none, with the change of the code. The median over the channels is subtracted, because a step of the
+receiver clock is common to all channels. Codes follow the time tags, so the true interval is the difference of the time
+tags less the step of the codes. Phases either step with the codes, or continue and then differ by whole milliseconds,
+which are added in `Slips.phase_m`.
 
-The mean of code less phase over the arc so far, added to the phase, is a code with less noise. The ionosphere makes
-it drift by twice the change of its delay, which the window limits: at 1 mm/s a window of 100 s leaves up to 0.2 m.
+The smoothed code is the phase plus the mean of code less phase over the arc so far. The ionosphere makes that mean
+drift by twice the change of its delay, which the window limits: at 1 mm/s a window of 100 s leaves up to 0.2 m.
 """
 
 from __future__ import annotations
@@ -30,81 +30,82 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
 #: Least common change of the codes for which the interval is corrected [m]; smaller changes are noise.
 _CLOCK_STEP_M: Final = 1e4
-_COMMON: Final = 3  #: Channels required for a median to represent the clock.
+_COMMON: Final = 3  #: Fewest channels whose median represents the receiver clock.
 
 
 class SlipReason(IntFlag):
-    """Reasons why the phase of an epoch and channel restarts; 0 = joined to the previous epoch."""
+    """Reasons why the phase of an epoch and channel starts a new arc; 0 where the arc continues."""
 
     JOINED = 0
     NO_PHASE = 1 << 0  #: No phase at this epoch: no arc begins.
     FIRST = 1 << 1  #: A phase, but no phase of this channel at the previous epoch.
-    LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator.
-    HALF_CYCLE = 1 << 3  #: Its bit 1 (half-cycle ambiguity) differs from the previous epoch.
+    LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator is set.
+    HALF_CYCLE = 1 << 3  #: Bit 1 of that indicator (half-cycle ambiguity) differs from the previous epoch.
     GAP = 1 << 4  #: The interval since the previous epoch exceeds the limit.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
-    DOPPLER = 1 << 6  #: The phase's change disagrees with the Dopplers.
-    CODE = 1 << 7  #: The phase's change disagrees with the code, where there are no Dopplers.
+    DOPPLER = 1 << 6  #: The phase change disagrees with the Dopplers.
+    CODE = 1 << 7  #: The phase change disagrees with the code; tested where Dopplers are absent or less precise.
 
 
 class CycleSlipLimits(Settings):
     """Limits of the tests, in metres for an interval dt in seconds.
 
     The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise of the phases,
-    noise of the mean Doppler, and the error of the trapezoidal rule for a motion with that jerk. One cycle on L1 (0.19
-    m) is detected up to intervals of about 1 s, two to 1.5 s; a test on the track (`continuity.track_jumps`) has no
-    such limit.
+    noise of the mean Doppler, and the error of the trapezoidal rule for a motion with that jerk. One cycle on L1
+    (0.19 m) is detected up to intervals of about 1 s, two cycles up to 1.5 s; the test on the track
+    (`continuity.track_jumps`) has no such limit.
     """
 
-    #: Longest interval that is bridged: the interval of a station's log, 30 s.
+    #: Longest interval without a new arc; station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Limit of the phase change against its Doppler, constant and in proportion to the interval. On real
+    #: Limit of the phase change less its Doppler prediction, constant and in proportion to the interval. On real
     #: receivers at 1 Hz the median of the metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
     doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
-    code_m: float = Field(default=10.0, gt=0)  #: Limit of code less phase where Dopplers are absent or less precise.
+    #: Limit of the change of code less phase, tested where Dopplers are absent or less precise.
+    code_m: float = Field(default=10.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CycleSlipState:
-    """The last epoch of a chunk, by channel ("G05", "1C"), and the clock steps so far."""
+    """Observations of the last epoch of a chunk, by channel ("G05", "1C"), and the clock steps so far."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
-    #: The phase as received, without `step_ms`; shape (M,).
+    #: Code, phase as received (without `step_ms`), and Doppler times wavelength; shape (M,).
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     phase_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
     half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
-    step_ms: int = 0  #: Whole milliseconds that the codes' clock has stepped and the phases' has not.
+    step_ms: int = 0  #: Steps of the clock so far, in whole milliseconds, that are in the codes but not in the phases.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slips:
     """Phases and the starts of their arcs, T epochs by M channels."""
 
-    slip: Masks  #: True where there is a phase that may not be joined to the previous epoch, shape (T, M).
+    slip: Masks  #: True where a phase starts a new arc, shape (T, M).
     reason: Integers  #: `SlipReason` bits, shape (T, M).
-    #: Phase times wavelength on the clock of the codes: whole milliseconds that only the codes stepped are added. NaN
+    #: Phase times wavelength on the clock of the codes: steps of whole milliseconds of the codes alone are added. NaN
     #: where the phase is missing or its wavelength is unknown; shape (T, M).
     phase_m: Floats
-    #: Metrics of the two tests; NaN where they cannot be used; shape (T, M).
+    #: Metrics of the Doppler test and of the code test; NaN where a test is not possible; shape (T, M).
     doppler_metric_m: Floats
     code_metric_m: Floats
-    doppler_limit_m: Floats  #: Shape (T,).
-    #: Step of the receiver's clock into the epoch from the codes; 0 where none is detected; shape (T,).
+    doppler_limit_m: Floats  #: Limit of `doppler_metric_m`, shape (T,).
+    #: Step of the receiver clock since the previous epoch, from the codes; 0 where none is detected; shape (T,).
     clock_step_m: Floats
-    half_cycle: Masks  #: The receiver reports an unresolved half cycle: harmless to a float ambiguity; shape (T, M).
+    half_cycle: Masks  #: True where the receiver reports an unresolved half cycle, shape (T, M).
 
 
 def median_or_zero(values: Floats) -> Floats:
-    """Return the median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
+    """Return the median over the channels of each epoch, shape (T,); 0 where fewer than three have a value."""
     return np.where(np.isfinite(values).sum(axis=1) >= _COMMON, medians(values), 0.0)
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Return the values of the preceding epoch; for the first epoch from the state."""
+    """Return the values of the previous epoch at each epoch; `last` at the first epoch."""
     return np.concatenate([last[None], values[:-1]])
 
 
@@ -117,18 +118,17 @@ def find_slips(
 ) -> tuple[Slips, CycleSlipState]:
     """Return the cycle slips of every channel of a chunk.
 
-    A channel's phase starts a new arc after an epoch without it.
-    With fewer than three channels a clock step cannot be distinguished from a slip, and counts as a slip.
+    A phase also starts a new arc if its channel had no phase at the previous epoch. With fewer than three channels a
+    clock step cannot be distinguished from a slip, and is reported as a slip.
 
     Parameters
     ----------
     observations : Observations
         T epochs, M channels.
     state : CycleSlipState, optional
-        Left by the previous chunk; None at the start of a log.
+        State after the previous chunk; None at the start of a log.
     frequency_hz : ndarray, shape (M,), optional [Hz]
-        Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
-        channels.
+        Carrier frequency of each channel; by default from the log's header, which may lack GLONASS frequency channels.
     limits : CycleSlipLimits, optional
 
     Returns
@@ -195,10 +195,10 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Compute the clock step of the codes [m], its whole milliseconds that phases lack, and the metrics of both tests.
+    """Compute the clock step of the codes [m], whole milliseconds of it not in the phases, and metrics of both tests.
 
     `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
-    then, `range_mps` the range rate by the Dopplers.
+    that epoch, and `range_mps` is the range rate from the Dopplers.
     """
     moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
     step = median_or_zero(code_m - moved)
@@ -211,9 +211,9 @@ def slip_metrics(
 
 
 def linear_recursion(gain: Floats, drive: Floats) -> Floats:
-    """``x_k = gain_k x_{k-1} + drive_k`` along axis 0 with x_{-1} = 0, without a loop over epochs.
+    """Compute ``x_k = gain_k x_{k-1} + drive_k`` along axis 0 with x_{-1} = 0, without a loop over epochs.
 
-    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...; gains in [0, 1] are stable.
+    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...; rounding errors do not grow for gains in [0, 1].
     """
     total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, `drive` is broadcast
     stride = 1
@@ -227,10 +227,10 @@ def linear_recursion(gain: Floats, drive: Floats) -> Floats:
 class SmoothingLimits(Settings):
     """Limits of the smoothing."""
 
-    #: Time constant: all codes of an arc have equal weight until the arc is this old; from then on older codes lose
-    #: weight (DO-229D 2.1.4.1.5: 100 s, because of the ionosphere's drift).
+    #: Time constant: all codes of an arc have equal weight until the arc is this old; the weight of older codes then
+    #: decays (DO-229D 2.1.4.1.5: 100 s, because of the ionosphere's drift).
     window_s: float = Field(default=100.0, gt=0)
-    #: "own": the codes' mean change against their phases is a clock: subtracted before and added after averaging. For
+    #: "own": the mean change of code less phase is a clock, subtracted before and added after averaging. For
     #: telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
     #: against 50 m with "shared"); other receivers were no worse with it.
     clocks: Literal["own", "shared"] = "own"
@@ -238,7 +238,7 @@ class SmoothingLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothingState:
-    """The last epoch of a chunk, by channel."""
+    """State of the smoothing after the last epoch of a chunk, by channel."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
@@ -250,7 +250,7 @@ class SmoothingState:
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: Last code less phase, for `clocks="own"`; shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
-    clock_m: float = 0.0  #: Mean change of the codes relative to the phases so far.
+    clock_m: float = 0.0  #: Sum of the mean changes of code less phase so far, for `clocks="own"`.
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
@@ -280,9 +280,9 @@ def smooth_codes(
 ) -> tuple[Floats, SmoothingState]:
     """Return codes smoothed by the phase along unbroken arcs.
 
-    Weight of the n-th code of an arc: the greater of 1/n and dt / window. A phase times its
-    wavelength is of the order of 1e8 m, where a double steps by 1.5e-8 m; the recursion runs on
-    code less phase less its first value on the arc, which is metres, so that rounding errors do not accumulate.
+    The weight of the n-th code of an arc is the greater of 1/n and dt / window. Phases are of the order of 1e8 m, where
+    double precision resolves 1.5e-8 m. The recursion therefore uses code less phase, less its first value on the arc,
+    which is of the order of metres, so that rounding errors do not accumulate.
 
     Parameters
     ----------

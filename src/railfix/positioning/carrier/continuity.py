@@ -1,8 +1,8 @@
-"""Phase jumps on the line from the change of the phases between two epochs, and numbers of arcs without a slip.
+"""Phase jumps on the line from the phase changes between two epochs, and numbers of arcs without a slip.
 
-Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every further
-satellite is a check, precise to a centimetre. Where the satellites disagree, the worst channels are rejected one by one
-until the others agree. The number of an arc, unique in a run, is the channel's five letters and its count of arcs.
+Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every additional
+satellite is a check precise to a centimetre. Where the satellites disagree, the worst channels are rejected one by one
+until the others agree. The number of an arc, unique in a run, contains the letters of its channel and a count of arcs.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-COUNT_BITS: Final = 23  #: Bits of the count in an arc's number; the channel's letters are above them.
-NO_ARC: Final = -1  #: No phase, no arc.
+COUNT_BITS: Final = 23  #: Low bits of an arc's number, which are its count; the higher bits are the channel's letters.
+NO_ARC: Final = -1  #: Arc number where there is no phase.
 
 ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each channel.
 
@@ -34,7 +34,7 @@ class ArcState:
 
 
 def channel_code(satellite: str, signal: str) -> int:
-    """Return a channel's letters as a number: ``G05`` on ``1C``."""
+    """Return the letters of a channel (satellite ``G05``, signal ``1C``) as a number."""
     return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
 
 
@@ -44,7 +44,7 @@ def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Return each channel's row in the previous epoch, shape (M,); -1, a NaN appended to values, for new ones."""
+    """Return each channel's index in the previous epoch, shape (M,); -1, for an appended NaN, for new channels."""
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
@@ -57,7 +57,7 @@ def number_arcs(
     Parameters
     ----------
     slip : ndarray of bool, shape (T, M)
-        Where arcs begin (`slips.find_slips`, and further tests).
+        True where arcs begin (`find_slips`, and additional tests).
     has_phase : ndarray of bool, shape (T, M)
     satellite, signal : ndarray of str, shape (M,)
     state : ArcState, optional
@@ -65,7 +65,7 @@ def number_arcs(
     Returns
     -------
     ndarray of int64, shape (T, M)
-        `NO_ARC` without a phase.
+        Number of each arc; `NO_ARC` without a phase.
     ArcState
     """
     before = dict(state.count) if state else {}
@@ -91,16 +91,15 @@ def decode_channel(arc_id: Integers) -> Integers:
 
 
 class ContinuityLimits(Settings):
-    """Limits of the test."""
+    """Limits of the test of phase changes."""
 
-    #: Standard deviation of a change of phase: at once, and for each second between the epochs (satellite clocks,
-    #: delays).
+    #: Standard deviation of a phase change, constant and in proportion to the interval (satellite clocks, delays).
     phase_m: float = Field(default=0.012, gt=0)
     drift_mps: float = Field(default=0.008, gt=0)
-    #: Standard deviation across and up of a sudden change of position (map points).
+    #: Standard deviation of the map error of the motion across and up, independent of its length (map points).
     aside_m: float = Field(default=0.02, gt=0)
-    #: Standard deviations as fractions of the distance moved: a position error of 5 m turns the line by 0.017 on a
-    #: curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
+    #: Standard deviation of the map error of the motion, as a fraction of the distance moved: a position error of 5 m
+    #: turns the line by 0.017 rad on a curve of 300 m radius, and by 0.0025 rad on a vertical curve of 2000 m.
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
     sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
@@ -111,7 +110,7 @@ class ContinuityLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ContinuityState:
-    """The last epoch of a chunk, by channel."""
+    """Phases, satellites and position of the last epoch of a chunk, by channel."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channels: ChannelKeys = ()
@@ -124,21 +123,20 @@ class ContinuityState:
 class TrackJumps:
     """Test result for the change of each phase into its epoch, T epochs by M channels."""
 
-    jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
-    metric_m: Floats  #: Change of phase less the change of the remaining channels; NaN where not tested; shape (T, M).
-    judged: Masks  #: Shape (T, M).
-    moved_m: (
-        Floats  #: Distance along the line since the previous epoch, from the phases; NaN where not known; shape (T,).
-    )
-    moved_sigma_m: Floats  #: Shape (T,).
+    jump: Masks  #: True where the phase change does not fit and a new arc begins, shape (T, M).
+    metric_m: Floats  #: Residual of the phase change in the fit of the kept channels; NaN if not tested; shape (T, M).
+    judged: Masks  #: True where the phase change is tested, shape (T, M).
+    #: Distance along the line since the previous epoch, from the phases, and its sigma; NaN where unknown; shape (T,).
+    moved_m: Floats
+    moved_sigma_m: Floats
 
 
 class TrackedPhases(NamedTuple):
     """Phases of T epochs by M channels."""
 
     phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), NaN where not used; shape (T, M).
-    sat_ecef_m: Floats  #: Satellites where there is a phase, shape (T, M, 3).
-    slip: Masks  #: Slips already known: not tested again; shape (T, M).
+    sat_ecef_m: Floats  #: Satellite positions where there is a phase, shape (T, M, 3).
+    slip: Masks  #: Slips already detected, which are not tested; shape (T, M).
 
 
 def track_jumps(
@@ -152,7 +150,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Return phases that disagree with the other phases and the line.
+    """Return phases whose change disagrees with that of the other phases on the line, and the distance moved.
 
     Parameters
     ----------
@@ -161,7 +159,7 @@ def track_jumps(
     phases : TrackedPhases
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
-        Positions of codes alone, good to some metres; NaN: the epoch is not used.
+        Positions from codes alone, accurate to a few metres; epochs with NaN are not used.
     state : ContinuityState, optional
     limits : ContinuityLimits, optional
 
@@ -219,7 +217,8 @@ def _reject_jumps(
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
     """Reject the worst channels one by one until the others agree; without redundancy all are kept.
 
-    Returns the mask of kept channels, residuals of all, step along the line, its variance, and where the rest agrees.
+    Returns a mask of kept channels, residuals of all channels, step along the line, its variance, and a mask of epochs
+    whose kept channels agree.
     """
     design = np.where(judged[..., None], design, 0.0)
     change = np.where(judged, change, 0.0)
@@ -233,7 +232,7 @@ def _reject_jumps(
     if len(at):
         part = design[at], change[at], sigma[at], prior[at]
         kept[at], decided[at] = _worst_out(*part, judged[at], limits)
-        # A channel rejected because of another one is accepted again.
+        # A channel that was rejected because of another channel's jump is accepted again.
         back = judged[at] & (_fit(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
         kept[at], again = _worst_out(*part, back, limits)
         decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.max_rejected)
@@ -243,7 +242,7 @@ def _reject_jumps(
 
 @dataclass(frozen=True)
 class _ContinuityFit:
-    """Residuals of all channels, and in sigmas (of the residual if kept, else of the prediction)."""
+    """Residuals of all channels, also in sigmas (of the residual if kept, else of the prediction); step; variance."""
 
     residual: Floats
     size: Floats
@@ -252,7 +251,7 @@ class _ContinuityFit:
 
 
 def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _ContinuityFit:
-    """Return the least squares of the kept channels of each epoch."""
+    """Return the least-squares fit of the kept channels of each epoch."""
     weight = kept / sigma[:, None] ** 2
     inverse = np.linalg.inv(np.matmul((design * weight[..., None]).swapaxes(1, 2), design) + prior)
     right = np.matmul((weight * change)[:, None, :], design)[:, 0]
@@ -269,7 +268,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Return the channels that remain after rejecting the worst one by one, and the epochs where these agree."""
+    """Return the channels that remain after rejecting the worst one by one, and the epochs where they agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

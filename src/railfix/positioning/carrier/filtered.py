@@ -1,8 +1,8 @@
-"""Positions along the line from code and phase, each epoch from itself and earlier epochs only.
+"""Positions along the line from code and phase, each epoch from its own and earlier observations only.
 
-The state between epochs is the normal matrix of the running arcs' ambiguities; at multiples of a hop process noise is
-added to the ambiguities. Where an arc begins, the previous arc of its channel is eliminated, so that the state never
-has more arcs than channels.
+The state between epochs is the normal matrix of the ambiguities of the active arcs; at multiples of
+`PhaseLimits.hop_s` process noise is added to the ambiguities. Where an arc begins, the previous arc of its channel is
+eliminated, so that the state never has more arcs than channels.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from railfix.positioning.carrier.observation_model import (
 from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
-SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together; it bounds the memory.
+SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together, which limits the use of memory.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +49,12 @@ class Memory:
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))  #: Shape (A,).
-    seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))  #: Shape (A,).
+    arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))  #: Number of each arc, shape (A,).
+    #: Time of the last phase of each arc, shape (A,).
+    seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
     first_m: Floats = field(default_factory=lambda: np.empty(0))  #: First values of the ambiguities, shape (A,).
-    matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))  #: Shape (A, A) [1/m^2].
-    #: Vectors of the observations, and of map errors across and in height; shape (A, 3) [1/m].
+    matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))  #: Normal matrix, shape (A, A) [1/m^2].
+    #: Right-hand sides of the observations, and of map errors of 1 m across and in height; shape (A, 3) [1/m].
     right: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 
@@ -80,9 +81,9 @@ def phase_positions(
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     ranges : Ranges
-        Corrected codes with their weights, satellites, clocks, ties between clocks.
+        Corrected codes with weights, satellite positions, clock groups and inter-system biases.
     phases : Phases
-        Arcs named by `number_arcs`: only the newest arc of a channel is active.
+        Corrected phases with arcs from `number_arcs`; only the newest arc of a channel is active.
     trajectory : Trajectory
     arc_m_start : ndarray, shape (T,) [m]
         Initial position of each epoch (the constrained position from codes alone); an epoch with NaN is left out.
@@ -98,11 +99,11 @@ def phase_positions(
     limits = limits or PhaseLimits()
     memories = state.memories if state and state.memories else (Memory(),) * limits.passes
     if len(memories) != limits.passes:
-        raise ValueError(f"the state has {len(memories)} passes, the limits ask for {limits.passes}")
+        raise ValueError(f"the state has {len(memories)} passes, the limits require {limits.passes}")
     started = np.isfinite(arc_m_start)
     ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
     cuts = _cuts(number_hops(time, limits))
-    integers, phases = phases.integers, replace(phases, integers=None)  # the last pass fixes
+    integers, phases = phases.integers, replace(phases, integers=None)  # integers are fixed in the last pass only
     after: list[Memory] = []
     pieces: list[PhasePositions] = []
     for number, before in enumerate(memories, 1):
@@ -122,7 +123,7 @@ def phase_positions(
 
 
 def _cuts(hop: Integers) -> list[Indices]:
-    """Cut epochs into segments, each inside a hop."""
+    """Divide epochs into segments within one time step of the random walk, of at most `SEGMENT_EPOCHS` epochs."""
     blocks = np.arange(0, len(hop), SEGMENT_EPOCHS)
     starts = np.union1d(np.flatnonzero(np.diff(hop)) + 1, blocks)
     return np.split(np.arange(len(hop)), starts[1:])
@@ -137,9 +138,7 @@ def _segment(
     memory: Memory,
     limits: PhaseLimits,
 ) -> tuple[PhasePositions, Floats, Memory]:
-    """Positions of one segment, and its final memory; `start`: positions, and the epochs
-    that have one.
-    """
+    """Compute the positions of one segment and its final memory; `start` are initial positions, and a mask of them."""
     arc_m, started = start
     used = phases.weight > 0
     lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
@@ -185,8 +184,8 @@ def _ambiguities(
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
     """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
 
-    Computed from the normal equations of each epoch and all earlier epochs; then the ambiguities of all arcs, and
-    the memory after the last epoch. `held`: see `inverse_of_arcs`.
+    They are computed from the normal equations of each epoch and all earlier epochs. The ambiguities of all arcs and
+    the memory after the last epoch are also returned. `held` is that of `inverse_of_arcs`.
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # An extra row and column collects channels without a phase.
@@ -216,10 +215,10 @@ def _ambiguities(
 def _fix_epochs(
     floats: tuple[Floats, Floats, Floats], phases: Phases, trajectory: Trajectory, limits: PhaseLimits
 ) -> tuple[Integers, Floats]:
-    """Fix ambiguities in place, epoch by epoch; return the number of fixed differences, and the risk.
+    """Fix ambiguities in place, epoch by epoch; return the number of fixed differences and the risk, shape (T,).
 
-    `floats`, by channel: first values of the ambiguities, corrections to them with their responses to the map, and
-    covariances.
+    `floats` are the first values of each channel's ambiguity (T, M), the corrections to them with their responses to
+    the map (T, M, 3), and the covariances (T, M, M).
     """
     first, value, covariance = floats
     count, risk = np.zeros(len(value), dtype=np.int64), np.full(len(value), np.nan)
@@ -244,7 +243,7 @@ def _fix_epochs(
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """Return the memory with space for new arcs, sorted by name; older arcs of the same channels are eliminated."""
+    """Return the memory with space for new arcs, sorted by number; older arcs of the same channels are eliminated."""
     if not len(ids):
         return memory
     memory = _without(memory, np.isin(decode_channel(memory.arc_id), decode_channel(ids)))
@@ -265,7 +264,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at a later hop: long-absent arcs are dropped, the others get process noise."""
+    """Return the memory at the time step of `time`: absent arcs are eliminated, process noise is added to the others."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)
@@ -282,7 +281,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
 
 
 def _without(memory: Memory, ends: Masks) -> Memory:
-    """Return the normal equations with some arcs eliminated; the information on the others is unchanged."""
+    """Return the memory with some arcs eliminated; the information on the other arcs is unchanged."""
     runs = ~ends
     if runs.all():
         return memory

@@ -1,15 +1,15 @@
-"""P4's observation equations, linearised, the unknowns of each epoch eliminated.
+"""Linearised observation equations of P4, with the unknowns of each epoch eliminated.
 
 Per epoch t and channel i, around a position on the line::
 
     code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
 
-with d along the section, m1 and m2 the map's error across the track and in height, b_g the clock of the constellation.
-P4 writes b = b_g (`clocks="shared"`); telephones do not satisfy this; with a separate phase clock the N are known up to
-a common constant. With ``L`` the normal matrix of an epoch's own unknowns and ``C`` their coupling to the N, the epoch
-adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). Residual ionospheric errors are absorbed
-by N at the arc's begin and drift by twice their change.
+where d is the distance along the section, m1 and m2 are the map errors across the track and in height, and b_g is the
+clock of the constellation. P4 sets b = b_g (`clocks="shared"`), which does not hold for telephones. With a separate
+phase clock the N are known up to a common constant. With ``L`` the normal matrix of an epoch's own unknowns and ``C``
+their coupling to the N, the epoch adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). The
+residual ionospheric error at the start of an arc is absorbed by N; afterwards N drifts by twice its change.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from railfix.track.trajectory import Trajectory
 
 PhaseClocks = Literal["own", "shared"]
 
-PLACE: Final = 3  #: Own unknowns of an epoch before the clocks: along, across, up.
+PLACE: Final = 3  #: Number of own unknowns of an epoch before the clocks: along, across, up.
 _FREE_M: Final = 1e5  #: Sigma of an unknown without any information [m]: loose prior for conditioning.
 _LEAST_TIE_M: Final = 1e-2  #: Least sigma of a tie between clocks [m].
 
@@ -36,7 +36,7 @@ class IntegerChannels:
     """Channels whose ambiguities differ by whole cycles."""
 
     wavelength_m: Floats  #: Shape (M,).
-    group: Integers  #: Index of channels with one clock and signal; -1 for those without integers; shape (M,).
+    group: Integers  #: Group of channels with the same clock and signal; -1 for no integer ambiguity; shape (M,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +45,11 @@ class Phases:
 
     #: Phase times wavelength, corrected like the code (`corrected_phase_m`); any value where the weight is 0; (T, M).
     phase_m: Floats
-    #: 1/sigma^2, 0 for unused phases; otherwise `Ranges.sat_ecef_m` is the satellite; shape (T, M) [1/m^2].
+    #: 1/sigma^2, 0 for unused phases; `Ranges.sat_ecef_m` must be valid where it is positive; shape (T, M) [1/m^2].
     weight: Floats
-    #: Number of the arc: constant within an unbroken stretch of one channel's phase, different elsewhere; shape (T, M).
+    #: Number of the arc, constant while the phase of one channel is unbroken, and unique in a run; shape (T, M).
     arc_id: Integers
-    integers: IntegerChannels | None = None  #: None: all ambiguities are real-valued.
+    integers: IntegerChannels | None = None  #: Channels with integer ambiguities; None if all are real-valued.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """Return the phases of some epochs."""
@@ -65,22 +65,22 @@ def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats
     phase_m : ndarray, shape (T, M) [m]
         `Slips.phase_m`.
     sat_clock_m : ndarray, shape (T, M) [m]
-        c times the satellite clock. Group delays affect the code, and are constant on an arc.
+        c times the satellite clock. Group delays of the phase are constant on an arc and are not corrected.
     ionosphere_m, troposphere_m : ndarray, shape (T, M) [m]
-        Delays of the code: the phase is advanced by the ionosphere.
+        Delays of the code; the ionosphere advances the phase by the same amount.
     """
     return phase_m + sat_clock_m + ionosphere_m - troposphere_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """Linearised epochs, with own unknowns ``x = [along, across, up, clocks]`` (P of them)."""
+    """Linearised epochs, with P own unknowns ``x = [along, across, up, clocks]``."""
 
-    #: Shape (T, M, P).
+    #: Design rows of codes and phases, shape (T, M, P).
     code_design: Floats
     phase_design: Floats
-    groups: int  #: Number of code clocks; a phase clock comes after them.
-    #: Shape (T, M) [1/m^2].
+    groups: int  #: Number of code clocks, before the phase clock if that is separate.
+    #: Weights of codes and phases, shape (T, M) [1/m^2].
     code_weight: Floats
     phase_weight: Floats
     #: Observed less computed, less `clock_m`; shape (T, M).
@@ -89,9 +89,9 @@ class Linearised:
     #: First values of the epoch's clocks, subtracted from codes and phases; shape (T,).
     clock_m: Floats
     phase_clock_m: Floats
-    known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
+    known: Floats  #: Prior information on map errors and inter-system biases, shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of the own unknowns, shape (T, P, P).
-    #: Right-hand side of the additional unknowns; of the codes alone before `shift_phases`; shape (T, P).
+    #: Right-hand side of the own unknowns; before `shift_phases` from the codes alone; shape (T, P).
     right: Floats
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
     prior: Floats  #: Information of the map's errors, shape (2,) [1/m^2].
@@ -100,7 +100,7 @@ class Linearised:
 def linearise(
     ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats, *, clocks: PhaseClocks = "own"
 ) -> Linearised:
-    """Linearise the observation equations at positions on the line, finite, shape (T,) [m]."""
+    """Linearise the observation equations at finite arc lengths `arc_m`, shape (T,)."""
     section, along = trajectory.segment_at(arc_m)
     place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
@@ -149,7 +149,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the values less their weighted mean of each epoch, 0 where the weight is, and the mean."""
+    """Return the values less the weighted mean of their epoch, 0 where the weight is 0, and that mean, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -157,7 +157,7 @@ def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
 
 
 def _ties(ties: InterSystemBiases) -> tuple[Floats, Floats]:
-    """Return matrix and right-hand side of the known clock offsets, a common clock eliminated."""
+    """Return normal matrix and right-hand side of the inter-system biases, with the common clock eliminated."""
     mass = 1.0 / np.maximum(ties.sigma_m, _LEAST_TIE_M) ** 2
     share = mass / mass.sum(axis=1, keepdims=True)
     matrix = mass[:, :, None] * (np.eye(mass.shape[1]) - share[:, None, :])
@@ -170,9 +170,10 @@ def own_clock(lin: Linearised) -> bool:
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Subtract first values of the ambiguities (T, M), and the common remainder, from the phases.
+    """Subtract first values of the ambiguities (T, M), and with a separate phase clock the mean rest, from the phases.
 
-    Only then they join the right-hand side: first values of 1e7 m would leave it with rounding errors of millimetres.
+    The phases are added to the right-hand side only afterwards, because values of 1e7 m would cause rounding errors of
+    millimetres.
     """
     phase = np.where(lin.phase_weight > 0, lin.phase_m - first_m, 0.0)
     clock = np.zeros(len(phase))
@@ -183,11 +184,11 @@ def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
 
 
 def reduce(lin: Linearised) -> tuple[Floats, Floats]:
-    """Information of each epoch on the ambiguities of its channels: Schur complement of the epoch's own unknowns.
+    """Compute the information of each epoch on its channels' ambiguities (Schur complement of its own unknowns).
 
-    Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m]: of the observations, and of a map
-    that is 1 m off across and in height, which changes code and phase alike by columns of their designs; against its
-    prior this leaves ``prior_k C^T L^-1 e_k`` on the right.
+    Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m] of the observations, and of map
+    errors of 1 m across and in height. A map error changes code and phase equally, by a column of their designs; with
+    its prior the right-hand side is ``prior_k C^T L^-1 e_k``.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
     # Computed as a sum of squares of the residuals of the own unknowns: never negative, and errors of the inverse enter
@@ -214,8 +215,8 @@ class OwnUnknowns:
     #: Standard deviation from noise alone, and including the map error; shape (T,).
     noise_sigma_m: Floats
     sigma_m: Floats
-    clock_m: Floats  #: Shape (T, G).
-    #: 0 where the weight is 0, shape (T, M).
+    clock_m: Floats  #: Receiver clock of each group, shape (T, G).
+    #: Observed less computed, 0 where the weight is 0; shape (T, M).
     code_residual_m: Floats
     phase_residual_m: Floats
 
@@ -225,9 +226,10 @@ def own_unknowns(
 ) -> OwnUnknowns:
     """Solve for each epoch's own unknowns by back-substitution.
 
-    `ambiguity_m`, shape (T, M, 3), is of each channel, and its response to a map 1 m off across and in height. A map
-    error that is constant over a run does not average out, so the sigma uses the response to it in place of the single
-    epoch's part. `repeats`, shape (T,): epochs with the same code errors, by which the ambiguities' variance is larger.
+    `ambiguity_m`, shape (T, M, 3), are each channel's ambiguity and its responses to map errors of 1 m across and in
+    height. A map error that is constant over a run does not average out, so the sigma uses the larger of the response
+    of the epoch alone and the response including the ambiguities. `repeats`, shape (T,), are the numbers of epochs with
+    the same code errors, by which the ambiguities' variance is multiplied.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)
@@ -236,7 +238,7 @@ def own_unknowns(
     row = -np.matmul(lin.inverse[:, :1], lin.coupling)[:, 0]
     from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
     from_noise = lin.inverse[:, 0, 0] + from_arcs
-    # With fully correlated errors the phases do not reduce the sigma.
+    # With fully correlated code errors the phases do not reduce the sigma.
     by_codes = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
     most = np.maximum(np.linalg.inv(by_codes + lin.known)[:, 0, 0], from_noise)
     from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)
