@@ -1,7 +1,7 @@
 """Filter along the track over codes, Dopplers, carrier phases and sensors, with hypotheses over branches.
 
-The interface is plain functions on arrays: `track` takes epochs and the state after the previous epochs, and returns
-positions along the trajectory and the new state.
+`track` takes epochs and the state after the previous epochs, and returns positions along the trajectory and the new
+state. All quantities are numpy arrays.
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
-"""Fault sources with a sub-filter in the protection level of the filtered position, and the risk budget.
+"""Risk budget of the filter's protection level, and the fault sources that have a sub-filter.
 
-`railfix.kernels.tracking.subfilters` has the sub-filters, `railfix.kernels.tracking.level` the level.
+`railfix.kernels.tracking.subfilters` computes the sub-filters, `railfix.kernels.tracking.level` the level.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits
 
-#: Sensor names by the kind of their rows.
+#: Sensor name of each measurement kind.
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
-#: Time from a constellation fault to the alert of users [s] (ARAIM milestone 3 report: one hour).
+#: Time between a constellation fault and the alert to users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: A kind needs no sub-filters if the probabilities of so many sources of it sum to less than this fraction of the risk.
+#: A kind gets no sub-filters if faults of `MOST_SOURCES` such sources are less probable than this fraction of the risk.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
 #: Risk of the speed bound as a fraction of the risk of the position level.
@@ -30,7 +30,7 @@ SPEED_SHARE: Final = 0.01
 
 
 class SourceKind(IntEnum):
-    """Kind of a source of measurements that has a sub-filter, in the order of `Budget.prior`."""
+    """Kind of a measurement source that has a sub-filter, in the order of `Budget.prior`."""
 
     SATELLITE = 0
     CONSTELLATION = 1
@@ -42,8 +42,8 @@ class SourceKind(IntEnum):
     ALL_IN_VIEW = 7
 
 
-#: Further sources: all Dopplers, all phases, the codes of satellites ahead, of satellites behind, the map; and no
-#: source, for all satellites in view.
+#: Kind of each further source: all Dopplers, all phases, all codes of the satellites ahead or behind, and the map. The
+#: last sub-filter excludes no source.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
     "phase": SourceKind.MOTION,
@@ -63,27 +63,27 @@ KINDS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Risk of an independent error and fault probabilities, with the factors computed from these."""
+    """Risk per independent error, fault probabilities, and the factors K computed from both."""
 
-    risk: float
-    k: float  #: Two-sided normal quantile of the risk: the sigmas that fault-free noise exceeds with this probability.
-    #: Probability that a source of each `SourceKind` is faulty or an earlier fault is still in the filter; 0 needs no
-    #: sub-filter.
+    risk: float  #: Risk per independent error, less the fault probabilities of sources without a sub-filter.
+    k: float  #: Two-sided normal quantile of the risk.
+    #: Probability per `SourceKind` that a source is faulty or that a past fault still affects the filter; 0 for kinds
+    #: without sub-filters.
     prior: tuple[float, ...]
-    #: One-sided normal quantile of the risk over that probability: the minimum factor of a sub-filter's sigma.
+    #: One-sided normal quantile of risk / prior, the minimum factor of a sub-filter's sigma; 0 without sub-filters.
     k_fault: tuple[float, ...]
-    #: Two-sided and one-sided quantile for the speed bound, which has the additional fraction `SPEED_SHARE` of the
-    #: risk, in equal parts for all sources.
+    #: Two-sided and one-sided quantiles for the speed bound, which has the additional fraction `SPEED_SHARE` of the
+    #: risk, divided equally among the sources.
     k_speed: float
     k_speed_fault: tuple[float, ...]
 
 
 @lru_cache(maxsize=8)
 def budget(limits: TrackingLimits) -> Budget:
-    """Return the risk of an independent error and the fault probabilities of the sources.
+    """Compute the risk budget of the level from the settings.
 
-    A source affects the filter as long as its errors stay in the state: for `FORGOTTEN` correlation times after the
-    fault. A fault lasts for one independent error, a constellation fault for `CONSTELLATION_FAULT_S`.
+    A fault is assumed to last for one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. It affects
+    the filter for `FORGOTTEN` further correlation times of codes, as long as its errors remain in the state.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

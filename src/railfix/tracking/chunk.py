@@ -1,4 +1,4 @@
-"""Prepare epochs for the recursion: position-independent quantities are computed for all epochs of a chunk at once."""
+"""Preparation of epochs for the recursion: quantities that do not depend on positions, for a whole chunk at once."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from railfix.tracking.state import TrackState
 
 #: Shortest interval between epochs [s].
 _SHORTEST_S: Final = 1e-3
-#: Epochs further apart than this are treated as independent [s].
+#: Longest interval over which the filter continues [s]; it restarts after a longer interval.
 _APART_S: Final = 3600.0
-#: Minimum number of phases or Dopplers that determine speed and clock drift with redundancy.
+#: Minimum number of phases or Dopplers for a measured velocity and clock drift.
 _MOTION: Final = 4
 #: Index of each clock in `ix.CLOCKS`.
 _OFFSETS: Final = {letter: k for k, letter in enumerate(ix.CLOCKS)}
-#: Satellites unseen for this many correlation times of codes are dropped from the state.
+#: Number of code correlation times after which the error of an unobserved satellite is dropped from the state.
 FORGOTTEN: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """Inputs of the recursion: T epochs of K channels and S satellite errors."""
+    """Inputs of the recursion for T epochs of K channels, with S satellite errors in the state."""
 
     time: Datetimes  #: Shape (T,).
-    satellite: Strings  #: Of each channel; shape (K,).
-    epoch: Records  #: `railfix.kernels.tracking.layout.EPOCH`; shape (T,).
-    channel: Records  #: `railfix.kernels.tracking.layout.CHANNEL`; shape (T, K).
-    off_map: Masks  #: True where the train is away from the line; shape (T,).
-    fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
-    within_memory: Masks  #: Satellites whose error continues from before an epoch; shape (T, S).
+    satellite: Strings  #: Satellite of each channel, shape (K,).
+    epoch: Records  #: Records `railfix.kernels.tracking.layout.EPOCH`, shape (T,).
+    channel: Records  #: Records `railfix.kernels.tracking.layout.CHANNEL`, shape (T, K).
+    off_map: Masks  #: True where the train is away from the line, shape (T,).
+    fresh: Masks  #: True where a satellite error is initialised at the epoch, shape (T, S).
+    within_memory: Masks  #: True where a satellite error continues from an earlier epoch, shape (T, S).
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
-    """Return the chunk, and add an error unknown to the state for each satellite measured in it."""
+    """Return the chunk, and add an unknown to the state for the error of each satellite observed in the chunk."""
     state.origin = epochs.time[0] if np.isnat(state.origin) else state.origin
     phase, before = _previous(epochs.channel, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
@@ -62,7 +62,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     if np.isnat(state.time):
         gap[:1] = 0.0
     apart = gap > _APART_S
-    # Two epochs at one instant are treated as a millisecond apart, because Dopplers and forces are weighted by the
+    # The interval is at least a millisecond, also for equal times, because Dopplers and forces are weighted by the
     # interval.
     interval = np.maximum(gap, _SHORTEST_S)
     interval[apart] = 1.0
@@ -104,9 +104,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
 
 
 def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLimits) -> Floats:
-    """Return the white-error variances of codes, phases and Dopplers, the last two as functions of C/N0; shape (3, T,
-    K).
-    """
+    """Return the white-error variances of codes, phase changes and Dopplers, the last two by C/N0, shape (3, T, K)."""
     cn0 = np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
     return np.array(
@@ -126,7 +124,7 @@ def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Flo
 
 
 def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
-    """Write the velocities without the line; numba is imported here, so that runs without a filter do not load it."""
+    """Write velocities computed without the line; numba is imported here, so that runs without a filter omit it."""
     from railfix.kernels.tracking.velocity import write_velocities
 
     latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))
@@ -135,7 +133,7 @@ def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> 
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
-    """Prepare the state for the next chunk: drop satellites unseen for long, store the phases of the last epoch."""
+    """Drop satellites unobserved for `FORGOTTEN` correlation times, and store the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
     state.previous = Previous(channel=epochs.channel, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
     kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * constants.CODE_CORRELATION_S
@@ -144,7 +142,7 @@ def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
 
 
 def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Floats]:
-    """Return phases and satellite positions of the epoch before the first, in the order of the channels."""
+    """Return phases and satellite positions of the last epoch before the chunk, in channel order; NaN if missing."""
     if previous is not None and np.array_equal(channels, previous.channel):
         return previous.phase_m, previous.sat_ecef_m
     size = len(channels)
@@ -156,7 +154,7 @@ def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Flo
 
 
 def _with_satellites(state: TrackState, satellite: Strings, measured: Masks) -> Indices:
-    """Add an error unknown to the state for each satellite measured; return the index of each channel's error."""
+    """Add an unknown for each newly observed satellite; return each channel's satellite index, -1 if not observed."""
     place = {name: k for k, name in enumerate(state.satellite.tolist())}
     names = satellite.tolist()
     new = [name for name in dict.fromkeys(satellite[measured].tolist()) if name not in place]

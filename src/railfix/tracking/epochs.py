@@ -1,4 +1,4 @@
-"""Measurements of the filter: arrays (T epochs, K channels) for GNSS, and (T,) for sensors."""
+"""Measurements of the filter: arrays of shape (T epochs, K channels) for GNSS, and (T,) for sensors."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Kind(IntEnum):
     WHEEL = 3
     RADAR = 4
     FORCE = 5
-    PLACE = 6  # by a feature of the line
-    BALISE = 7  # and the next balise: balises alternate, so that the protection level can exclude either
+    PLACE = 6  # position from a feature of the line
+    BALISE = 7  # balises alternate with NEXT_BALISE, so that the protection level can exclude either
     NEXT_BALISE = 8
     RANGE = 9  # to a ground unit
 
@@ -31,27 +31,27 @@ class GnssEpochs:
     """Corrected GNSS measurements of one antenna; NaN where absent or not to be used."""
 
     time: Datetimes  #: Shape (T,).
-    satellite: Strings  #: Shape (K,).
-    signal: Strings  #: Signal; with the satellite it identifies the channel uniquely; shape (K,).
-    clock: Strings  #: Letter of the receiver clock of each channel's codes; shape (K,).
-    #: Satellite position and velocity at transmission; shape (T, K, 3).
+    satellite: Strings  #: Satellite of each channel, shape (K,).
+    signal: Strings  #: Signal of each channel, shape (K,); satellite and signal identify a channel uniquely.
+    clock: Strings  #: Letter of the receiver clock of each channel's codes, shape (K,).
+    #: Satellite position and velocity at transmission, shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
-    #: Pseudorange corrected for satellite clock, group delay and atmosphere, and its standard deviation with the
-    #: receiver's noise scale; shape (T, K).
+    #: Pseudorange corrected for satellite clock, group delay and atmosphere, and its standard deviation including the
+    #: receiver's noise scale, shape (T, K).
     code_m: Floats
     code_sigma_m: Floats
-    phase_m: Floats  #: Carrier phase corrected for satellite clock and troposphere; shape (T, K).
-    phase_joined: Masks  #: True where the phase continues from the previous epoch without a cycle slip; shape (T, K).
-    #: Range rate from the Doppler, positive for a growing range. Satellite clock drift and tropospheric rate, some
-    #: millimetres per second, may be included; shape (T, K).
+    phase_m: Floats  #: Carrier phase corrected for satellite clock and troposphere, shape (T, K).
+    phase_joined: Masks  #: True where the phase continues from the previous epoch without a cycle slip, shape (T, K).
+    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). It may include the satellite clock
+    #: drift and the tropospheric rate, which are some millimetres per second.
     rate_mps: Floats
     cn0_dbhz: Floats  #: Shape (T, K).
-    #: Epochs at which the train is known to be away from the line: the positions are reset and no measurement is used;
-    #: shape (T,).
+    #: True where the train is known to be away from the line, shape (T,). The filter is reset there, and no measurement
+    #: is used.
     off_map: Masks
-    #: Position without the line, accurate to some hundred metres, for the velocity across the line; not used if NaN or
-    #: None; shape (T, 3).
+    #: Position computed without the line, accurate to some hundred metres, shape (T, 3). It is used for the velocity
+    #: across the line, unless it is NaN or None.
     near_ecef_m: Floats | None = None
 
     def __len__(self) -> int:
@@ -59,11 +59,11 @@ class GnssEpochs:
 
     @property
     def channel(self) -> Strings:
-        """Channel names, shape (K,)."""
+        """Channel names, satellite and signal joined, shape (K,)."""
         return np.char.add(self.satellite, self.signal)
 
     def take(self, rows: Indices | slice) -> GnssEpochs:
-        """Return a selection of epochs with all channels."""
+        """Return the selected epochs with all channels."""
         of_channels = ("satellite", "signal", "clock")
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in of_channels}
         values = {name: value[rows] for name, value in values.items() if value is not None}
@@ -72,40 +72,40 @@ class GnssEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class RangeEpochs:
-    """Ranges to ground units since the previous epoch, up to R per epoch; NaN where absent."""
+    """Two-way ranges to ground units since the previous epoch, up to R per epoch; NaN where absent."""
 
-    #: Ranges, standard deviations, and ages at the epoch; shape (T, R).
+    #: Ranges, their standard deviations, and their ages at the epoch, shape (T, R).
     range_m: Floats
     sigma_m: Floats
     age_s: Floats
-    unit_ecef_m: Floats  #: Shape (T, R, 3).
-    #: From the trajectory's point to the vehicle's unit: along rising arc length, to the right, up; shape (3,).
+    unit_ecef_m: Floats  #: Position of each range's ground unit, shape (T, R, 3).
+    #: Lever arm from the trajectory to the unit on the vehicle: along increasing arc length, right and up, shape (3,).
     lever_m: Floats
 
     def take(self, rows: Indices) -> RangeEpochs:
-        """Return the ranges of a selection of epochs."""
+        """Return the ranges of the selected epochs."""
         names = ("range_m", "sigma_m", "age_s", "unit_ecef_m")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseEpochs:
-    """Balises read since the previous epoch, in two alternating columns: NaN, with any time, where absent."""
+    """Balises read since the previous epoch, in two alternating columns; NaN where absent."""
 
-    time: Datetimes  #: Time at which each balise was passed; shape (T, 2).
-    #: Arc length of the trajectory's point at that time, and its standard deviation; shape (T, 2).
+    time: Datetimes  #: Time at which each balise was passed, shape (T, 2); any value where absent.
+    #: Arc length of the train along the trajectory at that time, and its standard deviation, shape (T, 2).
     place_m: Floats
     sigma_m: Floats
 
     @classmethod
     def none(cls, epochs: int) -> BaliseEpochs:
-        """Return epochs without balises."""
+        """Return the measurements of T epochs without balises."""
         place_m, sigma_m = np.full((2, epochs, 2), np.nan)
         return cls(time=np.zeros((epochs, 2), dtype="datetime64[ns]"), place_m=place_m, sigma_m=sigma_m)
 
     def find_latest(self, interval: Indices, intervals: int) -> BaliseEpochs:
-        """Return the last balise of each column in each interval; `interval` is the interval index of each epoch, shape
-        (T,).
+        """Return the last balise of each column in each of the `intervals` intervals; `interval`, shape (T,), is the
+        interval index of each epoch.
         """
         row = np.full((intervals, 2), -1, dtype=np.intp)
         epoch, turn = np.nonzero(np.isfinite(self.place_m))
@@ -120,20 +120,20 @@ class BaliseEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorEpochs:
-    """Sensor measurements at the same epochs, shape (T,) each, NaN where absent; None without the sensor."""
+    """Sensor measurements at the GNSS epochs, shape (T,) each; NaN where absent, None without the sensor."""
 
-    #: Wheel distance since the previous epoch, positive toward rising chainage.
+    #: Wheel distance since the previous epoch, positive toward increasing chainage, and its standard deviation.
     wheel_m: Floats | None = None
     wheel_sigma_m: Floats | None = None
-    #: With "unknown" the distance has no sign and gets the sign of the speed.
+    #: Whether the wheel distance is signed. If "unknown", the filter gives it the sign of the speed.
     wheel_sign: Literal["measured", "unknown"] = "measured"
-    #: Radar distance since the previous epoch; over a distance the swings of the body cancel (P2 3.2).
+    #: Radar distance since the previous epoch. A distance is used because oscillations of the body cancel (P2 3.2).
     radar_m: Floats | None = None
     radar_sigma_m: Floats | None = None
-    #: Mean specific force along rising chainage since the previous epoch, including gravity on the gradient.
+    #: Mean specific force toward increasing chainage since the previous epoch, including gravity on the gradient.
     force_mps2: Floats | None = None
     force_sigma_mps2: Floats | None = None
-    #: Arc length from a feature of the line.
+    #: Arc length measured by recognising a feature of the line, such as a curve, and its standard deviation.
     place_m: Floats | None = None
     place_sigma_m: Floats | None = None
     balises: BaliseEpochs | None = None  #: Balises read.
@@ -142,8 +142,8 @@ class SensorEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """Last epoch of the previous chunk, as the reference of the first phase changes."""
+    """Last epoch of the previous chunk, to which the first phase changes refer."""
 
-    channel: Strings  #: Shape (K,).
-    sat_ecef_m: Floats  #: Shape (K, 3).
-    phase_m: Floats  #: Shape (K,).
+    channel: Strings  #: Channel names, shape (K,).
+    sat_ecef_m: Floats  #: Satellite positions, shape (K, 3).
+    phase_m: Floats  #: Corrected carrier phases, shape (K,); NaN where absent.

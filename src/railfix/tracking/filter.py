@@ -1,6 +1,6 @@
-"""Filter along the track: from epochs to positions along the trajectory and the state for the next epochs.
+"""Filter along the track: estimates positions along the trajectory from epochs and the previous state.
 
-`railfix.kernels.tracking.layout` has the arrays, `railfix.kernels.tracking.recursion` the recursion over them.
+`railfix.kernels.tracking.layout` defines the arrays, `railfix.kernels.tracking.recursion` the recursion over epochs.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ class Step:
     """Result of one filter epoch with H hypotheses."""
 
     dt: float  #: Interval since the previous epoch [s].
-    satellite: Strings  #: Shape (N - ix.SATELLITES,).
+    satellite: Strings  #: Satellites whose errors are in the state, shape (N - ix.SATELLITES,).
     trace: Trace | None = None  #: Measurements and restarts of the epoch; None without a hypothesis.
-    #: Means and covariances after the epoch; shapes (H, N), (H, N, N).
+    #: Means and covariances after the epoch, shapes (H, N) and (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
-    #: Index of each hypothesis at the previous epoch; -1 for a new one; shape (H,).
+    #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    splits: list[SplitHypothesis | None] | None = None
+    splits: list[SplitHypothesis | None] | None = None  #: `Sought.splits`.
 
 
 class Recursion:
-    """Kernel inputs of a chunk; `start_state` is the state before it, with the errors of its satellites."""
+    """Kernel inputs of a chunk; `start_state` is the state before the chunk, after `prepare_chunk`."""
 
     def __init__(
         self,
@@ -66,8 +66,8 @@ class Recursion:
         )  # fmt: skip
 
     def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
-        """Search positions for an epoch to which hypotheses are predicted; None if there is none, which ends the
-        epoch.
+        """Search positions for an epoch to which the hypotheses are predicted; return None, with the epoch finished, if
+        there is no hypothesis after the search.
         """
         if not state.hypotheses:
             state.code_bias = np.where(self.chunk.fresh[epoch], 0.0, state.code_bias)
@@ -81,11 +81,10 @@ class Recursion:
         return None
 
     def run(self, state: TrackState, first: int, found: Sought | None, trace: list[Step] | None) -> tuple[int, int]:
-        """Process epochs from `first` on and update the state; return the next epoch, and the reasons for a position
-        search there or 0.
+        """Process epochs from `first` on, and update the state.
 
-        Only that epoch is processed if positions have been `found` for it, or if the smoother requires a record per
-        epoch.
+        Return the next epoch, and the reasons for a position search before this epoch (0 for none). Only the epoch
+        `first` is processed if its positions have been `found`, or if a `trace` is required.
         """
         count, width = state.mean.shape
         last = len(self.chunk.time) if trace is None and found is None else first + 1
@@ -109,12 +108,12 @@ class Recursion:
         return done, reasons
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
-        """Return the smoother's record of an epoch, without hypotheses."""
+        """Return a smoother record of an epoch, without hypotheses."""
         return Step(dt=float(self.chunk.epoch["interval_s"][epoch]), satellite=state.satellite)
 
 
 def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:
-    """Return an empty smoother record of an epoch."""
+    """Return an empty trace of an epoch."""
     return layout.Trace(
         prior=np.zeros((hypotheses, unknowns, unknowns)), row=np.zeros((hypotheses, rows, unknowns)),
         value=np.zeros((hypotheses, rows)), variance=np.full((hypotheses, rows), np.inf),
@@ -132,31 +131,31 @@ def track(
     levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
-    """Estimate positions along the trajectory, each from its own and earlier epochs (model: R. A. Singer, 1970).
+    """Estimate the position at each epoch from this and all earlier epochs (motion model: R. A. Singer, 1970).
 
     The equations are in docs/filter-equations.md, the compiled recursion in `railfix.kernels.tracking.recursion`. With
-    ``NUMBA_DISABLE_JIT=1`` in the environment the same code runs as plain Python, for a debugger.
+    ``NUMBA_DISABLE_JIT=1`` in the environment, the same code runs as plain Python for debugging.
 
     Parameters
     ----------
     epochs : GnssEpochs
-        T epochs in rising time; epochs without any measurement are predicted.
+        T epochs in ascending time; positions of epochs without measurements are predicted.
     line : Line
     state : TrackState, optional
         State after the previous epochs; None at the start.
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
     levels : bool
-        Whether a bank of sub-filters computes a protection level at every epoch (`railfix.tracking.levels`: at a lower
-        rate).
+        Whether a bank of sub-filters computes a protection level at every epoch; `railfix.tracking.levels` uses a lower
+        rate.
     trace : list of Step, optional
-        Receives the record of each epoch that the smoother requires (`railfix.tracking.smoother`).
+        List to which the record of each epoch is appended for the smoother (`railfix.tracking.smoother`).
 
     Returns
     -------
     Tracked
     TrackState
-        Processing epochs one by one with the returned state gives the same numbers as all at once.
+        State for the next epochs. Epochs processed in several calls give the same numbers as in a single call.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
     state = TrackState() if state is None else copy_with(state)

@@ -1,8 +1,8 @@
-"""Protection level of the filtered position at every epoch, from a filter with sub-filters over epochs a second apart.
+"""Protection level of the filtered position at every epoch, from a second filter with sub-filters at a lower rate.
 
 The bank of `railfix.tracking.bank` costs as many filters as there are satellites, and codes of neighbouring epochs have
-nearly the same errors. A second filter with the bank therefore processes one epoch per second. docs/filter-equations.md
-has the level that is carried to the epochs between; the bound of the speed uses a hundredth of its risk.
+nearly the same errors. The second filter therefore processes one epoch per `level_period_s`, a second by default. The
+equations that propagate its level to the epochs in between are in docs/filter-equations.md.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus, is_bounded
 from railfix.tracking.state import TrackState
 
-#: Sensors whose values between two epochs are summed, and the sensor whose values are averaged.
+#: Sensors whose values between two selected epochs are accumulated, and the mask of sensors whose values are averaged.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])
-#: Separation in standard deviations up to which a sub-filter is consistent with noise: for a position without a level,
-#: and with one. A sub-filter without the faulty satellite is further away.
+#: Separation in standard deviations up to which a sub-filter is consistent with noise, for positions without and with a
+#: level. The sub-filter that excludes a faulty satellite has a larger separation.
 _EXPLAINED: Final = (3.0, 4.0)
-#: Larger levels count as missing [m]: they come from a sub-filter without measurements.
+#: Level above which a level counts as infinite [m], because it results from a sub-filter without measurements.
 LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
@@ -39,28 +39,28 @@ _KEPT: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class AccumulatedIncrement:
-    """Measurements accumulated since the last epoch selected."""
+    """Measurements accumulated since the last selected epoch."""
 
-    #: First epoch of the log; an epoch is selected where the number of periods since then, rounded, changes.
+    #: Time of the first epoch. An epoch is selected where the rounded number of periods since `start` increases.
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    number: int = -1  #: Number of periods from `start` to the last epoch selected; -1 before the first.
-    epochs: int = 0  #: Number of epochs since then.
-    #: Channels whose carrier phase continued at all these epochs; None without such an epoch.
+    number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first.
+    epochs: int = 0  #: Number of epochs since the last selected epoch.
+    #: Channels whose carrier phase has continued at all epochs since the selected epoch; None without such epochs.
     unbroken: frozenset[str] | None = None
-    #: Sums over these epochs of distances by wheel and radar [m] and force [m/s2], and of variances; shape (3,).
+    #: Sums of wheel distances [m], radar distances [m] and forces [m/s2], and of their variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
-    balises: BaliseEpochs | None = None  #: Balises read since then, as a single epoch.
+    balises: BaliseEpochs | None = None  #: Last balises read since the selected epoch, as a single epoch.
 
 
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return the indices of selected epochs, these epochs with accumulated measurements, and the remainder after them.
+    """Return indices and measurements of one epoch per period, and the remainder after the last selected epoch.
 
-    A carrier phase continues if it did so at all epochs between. Distances between epochs are summed and forces
-    averaged; balises belong to the next selected epoch; positions from features and ranges to ground units are used at
-    selected epochs only. `since` is the remainder of the previous chunk.
+    A carrier phase continues if it does so at all epochs in between. Distances between selected epochs are summed,
+    forces averaged, and balises assigned to the next selected epoch. Positions from features and ranges to ground units
+    are used at selected epochs only. `since` is the remainder of the previous chunk.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
@@ -69,8 +69,8 @@ def decimate_epochs(
     before = np.maximum.accumulate(np.concatenate([[since.number], number]))
     taken = (before[1:] > before[:-1]).nonzero()[0]
     value, variance = _columns(sensors, len(epochs))
-    # Row 0 is the remainder of the previous chunk, row t + 1 epoch t; a selected row ends an interval.
-    # With the epochs 1 and 3 of five selected, rows 0 to 2 and 3 to 4 are intervals, and row 5 remains.
+    # Row 0 is the remainder of the previous chunk, row t + 1 is epoch t. An interval ends with a selected epoch: if
+    # epochs 1 and 3 of five are selected, the intervals are rows 0 to 2 and 3 to 4, and row 5 remains.
     goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
     if since.unbroken is not None:
         goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
@@ -107,7 +107,7 @@ def decimate_epochs(
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
-    """Return values and variances of the sensors that are summed between epochs, shape (T, 3); NaN without a sensor."""
+    """Return values and variances of the accumulated sensors `_SUMMED`, shape (T, 3); NaN without a sensor."""
     value, variance = np.full((epochs, 3), np.nan), np.full((epochs, 3), np.nan)
     for column, (name, sigma) in enumerate(_SUMMED):
         if getattr(sensors, name) is not None:
@@ -118,7 +118,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
 def _balises(
     sensors: SensorEpochs, since: AccumulatedIncrement, interval: Indices, taken: int
 ) -> tuple[BaliseEpochs | None, BaliseEpochs | None]:
-    """Return the balises at the selected epochs, and the balises read after them, including the earlier remainder."""
+    """Return the balises of the selected epochs, and the balises read after the last selected epoch."""
     if sensors.balises is None and since.balises is None:
         return None, None
     rows = join_epochs([since.balises or BaliseEpochs.none(1), sensors.balises or BaliseEpochs.none(len(interval))])
@@ -131,10 +131,10 @@ class LevelState:
     """State of the filter with sub-filters after a chunk."""
 
     track: TrackState | None = None
-    every: bool = True  #: True while it has used every epoch, so that it equals the main filter.
+    every: bool = True  #: True as long as this filter has used every epoch, so that it equals the main filter.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Its last epoch.
-    #: Its position, speed, levels with parts, confidence amount and status at that epoch; shape (10,).
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch of this filter.
+    #: Results `_KEPT` of this filter at its last epoch, shape (10,); NaN before the first epoch.
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 
 
@@ -146,9 +146,9 @@ def track_with_levels(
     limits: TrackingLimits,
     sensors: SensorEpochs,
 ) -> tuple[Tracked, TrackState, LevelState]:
-    """Return the filter's positions with their levels, its state, and the state of the filter with sub-filters.
+    """Return positions with protection levels, the state of the main filter, and that of the filter with sub-filters.
 
-    If the filter with sub-filters processes every epoch, its positions are returned and the main filter does not run.
+    If the filter with sub-filters processes every epoch, its positions are returned, and the main filter does not run.
     """
     taken, some, decimated_sensors, since = decimate_epochs(epochs, sensors, state.since, limits.level_period_s)
     with_bank, after = None, state.track
@@ -172,10 +172,10 @@ def carried_levels(
     state: LevelState,
     limits: TrackingLimits,
 ) -> tuple[Tracked, LevelState]:
-    """Return positions with the levels of the sub-filtered epochs propagated to all epochs.
+    """Return the main filter's positions with levels propagated from the epochs of the filter with sub-filters.
 
-    `tracked` has the main filter's positions, `taken` the indices of the epochs of the filter with sub-filters,
-    `with_bank` its positions at these epochs (None without any), and `state` its last epoch before the chunk.
+    `tracked` contains the main filter's results. `taken` contains the indices of the epochs of the filter with
+    sub-filters, `with_bank` its results at these epochs (None without any), and `state` its state before the chunk.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
@@ -201,8 +201,8 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # In doubt the most distant sub-filter may be the correct one; otherwise a sub-filter that is not consistent with
-    # noise.
+    # In doubt, the most distant sub-filter may be the correct one; otherwise, only a sub-filter inconsistent with noise
+    # may be.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
@@ -218,12 +218,12 @@ def carried_levels(
 
 
 def _useful(level_m: Floats) -> Floats:
-    """Return levels, infinite beyond `LARGEST_LEVEL_M`, because a sub-filter without data diverges."""
+    """Return the levels, infinite above `LARGEST_LEVEL_M`."""
     return np.where(level_m > LARGEST_LEVEL_M, np.inf, level_m)
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Return the statuses of positions; a position without a level is neither tracking nor coasting."""
+    """Return the statuses of positions; without a finite level, a position is neither tracking nor coasting."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)

@@ -16,17 +16,17 @@ class Tails(NamedTuple):
     """Degrees of freedom of the Student t distribution of measurement errors."""
 
     usual: float
-    #: Degrees of freedom for codes that are longer than expected: a reflected signal arrives late, never early, and the
+    #: Degrees of freedom for codes longer than expected, because a reflected signal arrives late, never early, and its
     #: excess path has no typical length. Small errors have the same weight on both sides.
     late: float
 
     def weight(self, residual: Floats, square: Floats) -> Floats:
-        """Return the weights of codes from their residuals and normalised mean squares; any shape."""
+        """Return the weights of codes from their residuals and normalised squared residuals, same shape."""
         degrees = np.where(residual > 0.0, self.late, self.usual)
         return np.asarray((self.usual + 1.0) / self.usual * degrees / (degrees + square))
 
     def log_density(self, residual: Floats, square: Floats) -> Floats:
-        """Return the log density whose weights are `weight`, 0 at its maximum; same parameters."""
+        """Return the log density that corresponds to `weight`, for the same parameters; 0 at its maximum."""
         degrees = np.where(residual > 0.0, self.late, self.usual)
         return np.asarray(-0.5 * (self.usual + 1.0) / self.usual * degrees * np.log1p(square / degrees))
 
@@ -38,26 +38,26 @@ class TrackingLimits(Settings):
     #: and accelerate at up to 1.3 m/s2 for some seconds; cars at higher rates, for shorter times.
     acceleration_mps2: float = Field(default=1.0, gt=0)
     acceleration_s: float = Field(default=2.0, gt=0)
-    #: Without a sensor, a speed from fewer satellites than this is not used beyond the given acceleration: near a wall
-    #: or under a station roof only reflections may remain, which agree with each other
+    #: Largest acceleration assumed for a speed from fewer satellites than `trusted_satellites`, without a speed sensor.
+    #: Near a wall or under a station roof, only reflections may remain, which are consistent with each other
     #: (`kernels.tracking.model.narrow_speed_range`).
     service_acceleration_mps2: float = Field(default=1.5, gt=0)
     trusted_satellites: int = Field(default=7, ge=0)
-    #: Degrees of freedom of the Student t distribution of measurement errors: 4 is the smallest integer with a finite
+    #: Degrees of freedom of the Student t distribution of measurement errors. 4 is the smallest integer with a finite
     #: kurtosis bound of the score, and fits urban code errors.
     degrees_of_freedom: float = Field(default=4.0, gt=2)
-    #: Degrees of freedom for codes that are longer than expected: reflections arrive late, and with one degree of
-    #: freedom (Cauchy) their mean delay is unbounded. The value was chosen from 0.4, 1 and 4 (symmetric) on logs from
-    #: Hong Kong and California; logs from Berlin, and from Hong Kong two years earlier, were kept out and improve alike
-    #: (docs/filter.md).
+    #: Degrees of freedom for codes longer than expected. Reflections arrive late, and with one degree of freedom
+    #: (Cauchy) their mean delay is unbounded. The value was chosen from 0.4, 1 and 4 (symmetric) on logs from Hong Kong
+    #: and California; logs from Berlin, and from Hong Kong two years earlier, were not used for the choice and improve
+    #: alike (docs/filter.md).
     late_degrees_of_freedom: float = Field(default=1.0, gt=0)
-    #: White fraction of a code's standard deviation, per second, not per epoch.
+    #: White part of the code error as a fraction of the code's standard deviation, per second, not per epoch.
     code_white_share: float = Field(default=1.0, gt=0)
-    #: Interval at which codes are used while phases or Dopplers propagate the position: code errors last for a minute,
-    #: so that intermediate epochs add no information. With 0 the codes of every epoch are used.
+    #: Interval at which codes are used while phases or Dopplers propagate the position. Code errors last for a minute,
+    #: so that codes at intermediate epochs add no information. With 0, the codes of every epoch are used.
     code_period_s: float = Field(default=1.0, ge=0)
-    #: Displacement by orbit and ionospheric errors over hours: about 1 m per satellite with a dilution of one;
-    #: averaging over epochs does not reduce it.
+    #: Standard deviation of the displacement by orbit and ionospheric errors, which last for hours. They are about 1 m
+    #: per satellite, with a dilution of one; averaging over epochs does not reduce them.
     slow_code_m: float = Field(default=1.0, ge=1e-6)
     #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler; C/N0 at most 50 dB-Hz, 45 if not given.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
@@ -65,39 +65,39 @@ class TrackingLimits(Settings):
     #: The same two parameters for the change of a carrier phase over an epoch.
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
-    #: Mean innovation over half a minute, in sigmas, that indicates a larger length error of the map than assumed.
+    #: Mean innovation over half a minute, in sigmas, above which the map's length error is larger than assumed.
     map_misfit_sigmas: float = Field(default=3.0, gt=0)
     most_hypotheses: int = Field(default=24, ge=1)  #: Largest number of hypotheses; the most probable ones are kept.
-    start_separation_m: float = Field(default=60.0, gt=0)  #: Positions of the first epoch closer than this are merged.
-    #: Whether a bank of sub-filters computes a protection level; it costs as many filters as there are satellites.
+    start_separation_m: float = Field(default=60.0, gt=0)  #: Distance within which positions of a search are merged.
+    #: Whether a bank of sub-filters computes a protection level. It costs as many filters as there are satellites.
     level: Literal["on", "off"] = "on"
-    #: Interval of the epochs that the bank processes; codes of neighbouring epochs have the same errors.
+    #: Interval of the epochs processed by the bank. Codes of neighbouring epochs have the same errors.
     level_period_s: float = Field(default=1.0, gt=0)
-    #: Largest acceleration between these epochs: emergency braking of trains reaches 3 m/s2 (magnetic track brakes).
-    #: After an epoch whose speed was not accepted, the next speed may differ by this acceleration.
+    #: Largest acceleration between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes). It also
+    #: limits the next speed after an epoch whose speed was not accepted.
     level_acceleration_mps2: float = Field(default=3.0, ge=0)
-    #: Probability per hour that the error exceeds the level without warning: 1e-7 for the satellite part (P1 2.4).
+    #: Probability per hour that the error exceeds the level without warning. 1e-7 is for the satellite part (P1 2.4).
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
-    #: Number of independent errors per hour; code errors last about a minute.
+    #: Number of independent errors per hour. Code errors last about a minute.
     level_samples_per_hour: float = Field(default=60.0, gt=0)
-    #: Probability that a satellite is faulty in such a sample, with its square for two satellites: multipath beyond its
-    #: weight in a city. This is an assumption.
+    #: Probability that a satellite is faulty in an independent error, by city multipath that exceeds its weight. Its
+    #: square is used for two satellites. This is an assumption.
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
-    #: Probability of a fault common to a constellation: 1e-4, the value of the ARAIM milestone 3 report for Galileo.
+    #: Probability of a fault common to a constellation. 1e-4 is the value of the ARAIM milestone 3 report for Galileo.
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
-    #: Probability that a sample of an on-board sensor is faulty. This is an assumption.
+    #: Probability that an on-board sensor is faulty in an independent error. This is an assumption.
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
-    #: Probability that a balise is not at its listed position. This is an assumption; it must be small, because two
-    #: wrong balises together are not bounded.
+    #: Probability that a balise is not at its listed position. This is an assumption. It must be small, because two
+    #: simultaneously wrong balises are not bounded.
     level_balise_prior: float = Field(default=1e-6, ge=0, le=3e-6)
     #: Probability that all Dopplers, or all phases, are wrong together. This is an assumption.
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
-    #: Probability that the codes of all satellites ahead, or of all behind, are late together, as for the low
-    #: satellites of one side in single epochs. This is an assumption.
+    #: Probability that the codes of all satellites ahead, or of all satellites behind, are late together, as for the
+    #: low satellites of one side in single epochs. This is an assumption.
     level_side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Probability that the map is wrong by more than its sigma, and the sigma of that error. These are assumptions.
+    #: Probability that the map is wrong by more than its sigma, and the sigma of a wrong map. These are assumptions.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
-    #: Probability that the ionosphere is tilted over the sky by more than `slow_code_m`: a storm, or the equatorial
-    #: anomaly (size in `tracking.line.TILT_M`). This is an assumption.
+    #: Probability that a storm or the equatorial anomaly tilts the ionosphere over the sky by more than `slow_code_m`
+    #: (size of the tilt in `tracking.line.TILT_M`). This is an assumption.
     level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)

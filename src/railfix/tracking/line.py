@@ -1,4 +1,4 @@
-"""Trajectory of the filter: points, smooth tangents and axes at arc lengths, including beyond its ends."""
+"""Trajectory as used by the filter: points, smooth tangents and axes at arc lengths, also beyond its ends."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude: 2/9 of the
-#: vertical-delay sigma that DO-229D J.2.3 assumes without SBAS, 9 m up to 20 deg, 4.5 m up to 55 deg, 6 m beyond [m].
-#: At middle latitudes it equals `slow_code_m`.
+#: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude [m]: 2/9 of the
+#: vertical-delay sigma without SBAS in DO-229D J.2.3, which is 9 m up to 20 deg, 4.5 m up to 55 deg, and 6 m beyond. At
+#: middle latitudes the displacement equals `slow_code_m`.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
 class Line:
-    """Trajectory with smooth axes at its points; it continues beyond its ends."""
+    """Trajectory of V points with smooth axes, continued straight beyond its ends or, if closed, along its loop."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
-        self.arc_m: Floats = trajectory.arc_m  #: Shape (V,).
-        self.ecef_m: Floats = trajectory.ecef_m  #: Shape (V, 3).
-        self.segment: Floats = trajectory.tangent  #: Unit vectors of the segments; shape (V - 1, 3).
+        self.arc_m: Floats = trajectory.arc_m  #: Arc lengths of the points, shape (V,).
+        self.ecef_m: Floats = trajectory.ecef_m  #: Points, shape (V, 3).
+        self.segment: Floats = trajectory.tangent  #: Unit vectors of the segments, shape (V - 1, 3).
         self.joins_m = trajectory.joins_m
         #: Standard deviations of the map, across and up [m].
         self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
     @cached_property
     def axes(self) -> Floats:
-        """Axes at the points, in rows: tangent (mean of the two segments), right, up; shape (V, 3, 3)."""
+        """Axes at the points, shape (V, 3, 3), with the rows tangent (mean of two segments), right and up."""
         segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -44,13 +44,13 @@ class Line:
 
     @cached_property
     def gradient(self) -> Floats:
-        """Climb over horizontal length of each segment, shape (V - 1,)."""
+        """Gradient of each segment, climb divided by horizontal length, shape (V - 1,)."""
         return self.trajectory.gradient_permille / 1e3
 
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
-        """Return points [m] and axes at arc lengths [m], shapes (H, 3), (H, 3, 3) and (H,).
+        """Return points [m], shape (H, 3), and axes, shape (H, 3, 3), at arc lengths [m], shape (H,).
 
-        A closed line is continued round its loop, an open line straight beyond its ends. The rows of the axes are
+        A closed line is continued along its loop, an open line straight beyond its ends. The rows of the axes are
         tangent, right and up, interpolated between vertices.
         """
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
@@ -63,12 +63,12 @@ class Line:
 
     @cached_property
     def closed(self) -> bool:
-        """Whether the line continues at one of its ends."""
+        """True if the line is joined to itself at an end."""
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift of positions beyond an end of a closed line to their equivalent on the line [m]; 0 for
-        others.
+        """Return the shift [m] from each position beyond an end of a closed line to its equivalent on the line; 0 for
+        positions on the line or on an open line.
         """
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
@@ -78,7 +78,7 @@ class Line:
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
-        """Return the arc lengths, modulo laps of a closed line, nearest to other arc lengths [m]."""
+        """Return the arc lengths shifted by whole laps of a closed line to be nearest to `to_m` [m]."""
         if not self.closed:
             return arc_m
         back = self.round_m(to_m)
@@ -95,7 +95,7 @@ class Line:
 
     @cached_property
     def records(self) -> tuple[Records, Records]:
-        """Vertex and line records of the recursion; shapes (V,), (1,)."""
+        """Records of the vertices and of the line for the recursion, shapes (V,) and (1,)."""
         vertex, line = np.zeros(len(self.arc_m), dtype=VERTEX), np.zeros(1, dtype=LINE)
         for name in ("arc_m", "ecef_m", "axes"):
             vertex[name] = getattr(self, name)
@@ -111,7 +111,7 @@ class Line:
         return vertex, line
 
     def gradient_at(self, arc_m: Floats) -> Floats:
-        """Return the gradient, climb over horizontal length, linear between the middles of segments, shape (H,)."""
+        """Return the gradient, climb divided by horizontal length, interpolated between segment middles, shape (H,)."""
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         return np.interp(arc_m, self._middle_m, self.gradient)
 

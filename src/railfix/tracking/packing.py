@@ -1,4 +1,4 @@
-"""Conversion of state, settings and sensors to the recursion's arrays, and of the state back."""
+"""Conversion of state, settings and sensors to the arrays of the recursion, and of the resulting state back."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
 
-#: Minimum `MAP_BRANCH_M` in standard deviations of the map across.
+#: Minimum of the parameter `map_branch_m` in standard deviations of the map across.
 _BRANCH_SIGMAS = 3.0
 
 
 @lru_cache(maxsize=8)
 def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
-    """Return the numeric settings and the risk budget of the level; shape (1,)."""
+    """Return a record, shape (1,), of the numeric settings and the risk budget of the level."""
     budget = bank.budget(limits)
     values = {name: value for name, value in dict(limits).items() if isinstance(value, (int, float))}
     values["map_branch_m"] = max(constants.MAP_BRANCH_M, _BRANCH_SIGMAS * sigma_plan_m)
@@ -36,7 +36,7 @@ def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
 
 
 def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
-    """Return wheel, radar, force, position, balises and ranges by column, `layout.SENSOR`; shape (T, C)."""
+    """Return records `layout.SENSOR`, shape (T, C), with columns for wheel, radar, force, position, balises, ranges."""
     ranges = sensors.ranges
     columns = ix.RANGE_COLUMN + (0 if ranges is None else ranges.range_m.shape[1])
     packed = np.zeros((len(time), columns), dtype=layout.SENSOR)
@@ -62,12 +62,12 @@ def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
 
 
 def list_sources(state: TrackState) -> list[str]:
-    """Return the sub-filter sources in the order of the recursion."""
+    """Return the names of the sub-filter sources in the order of the recursion."""
     return [*state.satellite.tolist(), *ix.CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
 
 
 def pack_state(state: TrackState, limits: TrackingLimits, *, levels: bool) -> layout.State:
-    """Return a copy of the state as the recursion's arrays."""
+    """Return a copy of the state as arrays of the recursion; without `levels`, no sub-filters are included."""
     names = list_sources(state) if levels else []
     count, width = state.mean.shape
     x, P = np.zeros((count + len(names), width)), np.zeros((count + len(names), width, width))
@@ -88,7 +88,7 @@ def pack_state(state: TrackState, limits: TrackingLimits, *, levels: bool) -> la
 
 
 def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
-    """Return the sources with their probabilities and factors, `layout.SOURCE`; shape (B,)."""
+    """Return records `layout.SOURCE`, shape (B,), with the fault probability and factors K of each source."""
     source = np.zeros(len(names), dtype=layout.SOURCE)
     if names:
         given, kinds = bank.budget(limits), [bank.KINDS.get(name, bank.SourceKind.SATELLITE) for name in names]
@@ -100,7 +100,7 @@ def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
 
 
 def unpack_state(state: TrackState, packed: layout.State) -> None:
-    """Write the arrays of the recursion back into the state."""
+    """Update the state from the arrays of the recursion."""
     monitors: Any = packed.monitors[0]
     first, count = len(packed.hypothesis), int(monitors["hypotheses"])
     state.mean, state.covariance = packed.x[:count].copy(), packed.P[:count].copy()

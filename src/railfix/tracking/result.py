@@ -1,4 +1,4 @@
-"""Results of the filter per epoch: positions, speeds and the measurements behind them."""
+"""Filter results per epoch: positions, speeds, protection levels, innovations and weights."""
 
 from __future__ import annotations
 
@@ -13,73 +13,73 @@ from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
 
-#: Statuses whose level bounds the error. Beside the map, on one of several branches or on a doubtful track, no
-#: sub-filter bounds it.
+#: Statuses in which the level bounds the error. Sub-filters do not bound the error of a train away from the map, on one
+#: of several branches or on a doubtful track.
 BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
 _IS_BOUNDED: Final = np.array([status in BOUNDED for status in TrackStatus])
 
 
 def is_bounded(status: Codes) -> Masks:
-    """Return whether a status is one of `BOUNDED`, element by element."""
+    """Return the mask of statuses in `BOUNDED`, same shape."""
     return np.asarray(_IS_BOUNDED[status])
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Tracked(NotebookTable):
-    """Positions of T epochs; NaN where unknown."""
+    """Filter results of T epochs with K channels; NaN where unknown."""
 
     time: Datetimes  #: Shape (T,).
-    status: Codes  #: `TrackStatus`; shape (T,).
-    #: Arc length and standard deviation of the most probable hypothesis; the standard deviation includes the straight
-    #: distance to the other hypotheses, and in doubt the separation; shape (T,).
+    status: Codes  #: `TrackStatus`, shape (T,).
+    #: Arc length and standard deviation of the most probable hypothesis, shape (T,). The standard deviation includes
+    #: the straight distance to the other hypotheses, and in doubt the separation of a sub-filter.
     arc_m: Floats
     sigma_m: Floats
-    #: Shape (T,).
+    #: Speed along the line, its standard deviation, and acceleration, shape (T,).
     speed_mps: Floats
     speed_sigma_mps: Floats
     acceleration_mps2: Floats
-    probability: Floats  #: Probability of the reported hypothesis; shape (T,).
-    hypotheses: Integers  #: Number of hypotheses; shape (T,).
-    #: Mean weights of the codes that are not left out, and of Dopplers and phases; shape (T,).
+    probability: Floats  #: Probability of the reported hypothesis, shape (T,).
+    hypotheses: Integers  #: Number of hypotheses, shape (T,).
+    #: Mean weight of the codes that are not left out, and mean weight of Dopplers and phases, shape (T,).
     code_weight: Floats
     motion_weight: Floats
-    #: Shape (T,).
+    #: Estimated scale-factor error of the wheel, accelerometer offset, and scale-factor error of the radar, shape (T,).
     wheel_scale: Floats
     force_offset_mps2: Floats
     radar_scale: Floats
-    map_scale: Floats  #: Factor on the length error of the map, 1 where codes do not contradict it; shape (T,).
-    #: Levels of the error along the line; of the straight distance, including all branches and a laterally displaced
-    #: map; and without faults and branches. NaN where levels are off; shape (T,).
+    map_scale: Floats  #: Factor on the map's length error, shape (T,); 1 if codes do not contradict the map length.
+    #: Protection levels of the error along the line, of the straight distance (including all branches and a laterally
+    #: displaced map), and of the fault-free noise of a single branch, shape (T,); NaN where levels are off.
     level_m: Floats
     ground_level_m: Floats
     level_noise_m: Floats
-    #: Bound of the speed error, which propagates the level to the next epochs; shape (T,).
+    #: Bound of the speed error, used to propagate the level to the next epochs, shape (T,).
     level_speed_mps: Floats
-    #: Largest separation of a sub-filter. NaN where levels are off; shape (T,).
+    #: Largest separation of a sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
-    #: Probability of faults that the level does not bound: a fault common to the only constellation; shape (T,).
+    #: Probability of faults not bounded by the level, those common to the only constellation, shape (T,).
     unchecked_prior: Floats
-    #: Over- and under-reading amount: the level, but at least the scale bound times the distance since codes were used
-    #: (SUBSET-026 3.6.8); shape (T,).
+    #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the level, but at least the scale bound times the
+    #: distance since codes were used.
     amount_m: Floats
-    used: Integers  #: Measurements of each kind with a weight of more than a half; shape (T, len(Kind)).
-    innovation: Floats  #: Innovations of codes, phases and Dopplers; shape (T, 3, K).
-    #: Innovations of the sensors, in the order of `Kind`; of several ranges the last; shape (T, len(Kind) - 3).
+    used: Integers  #: Number of measurements of each kind with a weight above a half, shape (T, len(Kind)).
+    innovation: Floats  #: Innovations of codes, phase changes and Dopplers, shape (T, 3, K).
+    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); of several ranges, the last.
     sensed: Floats
-    weight: Floats  #: Weights, 0 for codes that are left out; shape (T, 3, K).
-    faulty: Masks  #: Codes that are left out (`railfix.kernels.tracking.adaptation`); shape (T, K).
+    weight: Floats  #: Weights of codes, phase changes and Dopplers, shape (T, 3, K); 0 for codes that are left out.
+    faulty: Masks  #: True for codes that are left out (`railfix.kernels.tracking.adaptation`), shape (T, K).
 
     def __len__(self) -> int:
         return len(self.time)
 
     @classmethod
     def empty(cls, time: Datetimes, channels: int) -> Tracked:
-        """Return unknown positions for T epochs of K channels."""
+        """Return results without positions for the given times and number of channels."""
         return cls.from_records(time, new_results(len(time), channels))
 
     @classmethod
     def from_records(cls, time: Datetimes, results: Results) -> Tracked:
-        """Convert the recursion's records to columns."""
+        """Return the records of the recursion as columns."""
         columns = {name: np.ascontiguousarray(results.epoch[name]) for name in EPOCH_RESULT.names or ()}
         columns |= {
             name: np.ascontiguousarray(np.moveaxis(results.channel[name], -1, 1)) for name in ("innovation", "weight")
@@ -101,7 +101,7 @@ CHANNEL_RESULT: Final = record_of({"innovation": (float, (3,)), "weight": (float
 
 
 def new_results(epochs: int, channels: int) -> Results:
-    """Return records of epochs without positions."""
+    """Return records of epochs without positions, with the status NOT_STARTED."""
     results = Results(np.zeros(epochs, dtype=EPOCH_RESULT), np.zeros((epochs, channels), dtype=CHANNEL_RESULT))
     for name, (kind, *_) in (EPOCH_RESULT.fields or {}).items():
         if kind.base == np.float64:

@@ -1,4 +1,4 @@
-"""Position search at the start, after gaps and after a loss of track, before an epoch's update."""
+"""Position search from the codes of an epoch: at the start, after gaps and after a loss of track."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from railfix.tracking.limits import Tails, TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
-#: Largest spacing of the points at which the line is searched; a Gaussian of `START_SIGMA_M` covers the positions
-#: between, and the code variance includes the error of a position between two points [m].
+#: Largest spacing of the points at which the line is searched [m]. A Gaussian of `START_SIGMA_M` covers the positions
+#: in between, and the code variance includes the error of a position between two points.
 _SPACING_M: Final = 15.0
-#: Required redundancy of codes beyond position and clocks for a search: with one a wrong position fits as well.
+#: Minimum redundancy of codes for a search. With a single redundant code, a wrong position can fit as well.
 REDUNDANT: Final = 2
-#: Positions whose log likelihood is this far below the best get no hypothesis.
+#: Difference from the largest log likelihood above which a position gets no hypothesis.
 _WORSE: Final = 25.0
-#: Prior standard deviation of the speed: no train is faster than twice this [m/s].
+#: Prior standard deviations of speed and clock drift [m/s]; no train is faster than twice the first.
 _ANY_SPEED_MPS: Final = 50.0
 _ANY_DRIFT_MPS: Final = 1e3
-_FIRST_STEP_M: Final = 1.0  #: Displacement of the map over the epoch before the first [m].
-#: Sensor priors: a wheel diameter wrong by 2 %, an accelerometer's offset and mounting, a radar's angle.
+_FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement over the interval before the first epoch [m].
+#: Prior standard deviations of wheel scale (diameter), accelerometer offset with mounting, and radar scale (angle).
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
-#: Neighbouring positions: multiples of `BEND_M`, largest number, standard deviation of their speed [m/s], and fraction
-#: of the probability that they get.
+#: Neighbouring positions of a hypothesis: distances in units of `BEND_M`, number, standard deviation added to the speed
+#: [m/s], and total probability as a fraction of the probability of the hypothesis.
 _BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])
 _BESIDE: Final = len(_BESIDE_STEPS)
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
-#: Unknowns that a new hypothesis takes from a lost track; all others contain its error.
+#: Unknowns that a new hypothesis takes from a lost track; the position error of the track affects all other unknowns.
 _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 
 
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floats:
-    """Return the arc lengths that are consistent with the codes of an epoch, shape (C,) [m].
+    """Return the arc lengths that are consistent with the codes of an epoch, the most likely first, shape (C,) [m].
 
-    Local maxima of the likelihood with Student's t errors, the best first; none with fewer than `REDUNDANT` codes
-    beyond the unknowns.
+    They are maxima of the likelihood with Student's t errors, more than `start_separation_m` apart. The result is empty
+    with fewer than `REDUNDANT` redundant codes.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, ix.CODE] != 0
@@ -54,7 +54,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0)
-    # points between the vertices too, so that a sparse map is searched without gaps
+    # the points are independent of the vertices, so that a sparse map is searched without gaps
     arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
     points, _ = line.at(arc)
     likelihood = np.zeros(len(arc))
@@ -91,10 +91,10 @@ def begin(
     sigma_m: float = constants.START_SIGMA_M,
     known: tuple[Floats, Floats] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return mean and covariance of new hypotheses at positions [m], shapes (H, N), (H, N, N) and (H,).
+    """Return means (H, N) and covariances (H, N, N) of new hypotheses at positions `arc_m`, shape (H,).
 
-    `satellites` is the number of satellite errors in the state; `known` are mean and covariance of a lost track, (N,)
-    and (N, N): its sensor unknowns are kept, clocks and satellites restart.
+    `satellites` is the number of satellite errors in the state. `known` are mean (N,) and covariance (N, N) of a lost
+    track, of which the sensor unknowns are kept; clocks and satellite errors restart.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
@@ -106,7 +106,7 @@ def begin(
     variance[:, ix.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, ix.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, ix.MAP_UP] = line.sigma_height_m**2
-    # no prediction precedes the first epoch: the map's displacement over it is as good as unknown
+    # no prediction precedes the first epoch, so that the map displacement over the interval is almost unknown
     variance[:, [ix.STEP_RIGHT, ix.STEP_UP, ix.MAP_LENGTH_ERROR]] = _FIRST_STEP_M**2
     variance[:, ix.SLOW_CODE] = limits.slow_code_m**2
     variance[:, ix.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
@@ -125,16 +125,16 @@ def begin(
     return mean, covariance
 
 
-#: Probability of other positions where the velocity contradicts a single certain position: the map may be wrong there.
+#: Probability of other positions where the velocity contradicts a single certain position, since the map may be wrong.
 _ELSEWHERE: Final = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitHypothesis:
-    """One of the narrow hypotheses into which a wide hypothesis was split."""
+    """Narrow hypothesis that was split from a wide hypothesis."""
 
     parent: int  #: Index of the wide hypothesis.
-    #: Mean and covariance of the wide hypothesis; shapes (N,), (N, N).
+    #: Mean and covariance of the wide hypothesis, shapes (N,) and (N, N).
     mean: Floats
     covariance: Floats
     place_m: float  #: Arc length of the narrow hypothesis, with the standard deviation `START_SIGMA_M`.
@@ -144,31 +144,33 @@ class Sought(NamedTuple):
     """Result of the position search before an epoch."""
 
     lost: bool  #: True if the track was lost.
-    parent: Indices  #: Index of each hypothesis at the previous epoch; -1 for a new one; shape (H,).
-    splits: list[SplitHypothesis | None] | None  #: Hypotheses that were split from wide ones at this epoch.
+    parent: Indices  #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
+    splits: (
+        list[SplitHypothesis | None] | None
+    )  #: Split of each hypothesis, None if it is not split; None for no split.
 
 
-#: Means, covariances and records of H hypotheses; shapes (H, N), (H, N, N), (H,).
+#: Means (H, N), covariances (H, N, N) and records (H,) of H hypotheses.
 _Part: TypeAlias = tuple[Floats, Floats, Records]
 
 
 def _new_records(log_probability: Floats, origin_m: Floats, log_code: Floats | float = 0.0) -> Records:
-    """Return the `HYPOTHESIS` records of new hypotheses; arguments of shape (H,)."""
+    """Return the `HYPOTHESIS` records of new hypotheses, shape (H,) as the arguments."""
     records = np.zeros(len(origin_m), dtype=HYPOTHESIS)
     records["log_probability"], records["origin_m"], records["log_code"] = log_probability, origin_m, log_code
     return records
 
 
 def _join(state: TrackState, parts: list[_Part]) -> None:
-    """Set the hypotheses of the state, with probabilities that sum to 1."""
+    """Set the hypotheses of the state to all `parts`, and normalise their probabilities to a sum of 1."""
     state.mean, state.covariance, state.hypothesis = (np.concatenate(items) for items in zip(*parts, strict=True))
     state.hypothesis["log_probability"] -= np.logaddexp.reduce(state.hypothesis["log_probability"])
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits, reasons: int) -> Sought:
-    """Search positions before an epoch, and update the state, which is predicted to the epoch.
+    """Search positions before the update of an epoch, and add hypotheses to the state, which is predicted to the epoch.
 
-    `reasons` are bits from `index.LOST_TRACK` on; 0 without a hypothesis.
+    `reasons` are bits of `kernels.tracking.index` (`LOST_TRACK`, `GAP`, `CONTRADICTED`); ignored without a hypothesis.
     """
     if not state.hypotheses:
         arc = places(chunk, epoch, line, limits)
@@ -201,17 +203,17 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
 
 
 def _start_branches(state: TrackState) -> None:
-    """Reset time and distance on the branches."""
+    """Reset the time and the distance since the hypotheses began."""
     state.hypothesis["log_least"], state.hypothesis["log_recent"] = state.hypothesis["log_probability"], 0.0
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 
 
 def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
-    """Reset the monitors of the earlier positions, and withhold the level after a loss of track."""
+    """Reset the monitors that refer to earlier positions, and withhold the level after a loss of track."""
     _start_branches(state)
     hold = state.monitors.level_hold_s
     if lost and state.monitors.weak_code_s >= constants.LOST_CODE_S:
-        # Codes have contradicted the position propagated by motion: the next position comes from codes alone.
+        # Codes have contradicted the position propagated by motion, so the next position comes from codes alone.
         hold = max(hold, constants.STEP_HOLD_S)
     if weak:
         hold = max(hold, constants.LEVEL_START_S)
@@ -224,10 +226,10 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
 def _split_wide(
     state: TrackState, arc_m: Floats, wide: Masks, line: Line
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
-    """Return narrow hypotheses at positions within wide ones, and the origin of each hypothesis.
+    """Return narrow hypotheses at positions within wide hypotheses, and the split of each hypothesis (None for old).
 
-    Each is the wide hypothesis conditioned on a position with `START_SIGMA_M`; the probabilities follow from its
-    density at that position.
+    A narrow hypothesis is the wide hypothesis conditioned on a position with `START_SIGMA_M`. Its probability is
+    proportional to the wide density at this position.
     """
     parts: list[_Part] = []
     splits: list[SplitHypothesis | None] = [None] * state.hypotheses
@@ -254,28 +256,28 @@ def _split_wide(
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
-    """Return hypotheses at positions away from a lost track; `weak` means that its weights were low for long."""
+    """Return hypotheses at positions away from a lost track; `weak` if its weights have been low for a long time."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
-    # A hypothesis less probable than a new one has drifted from the position at which codes would start it.
+    # A hypothesis less probable than a new hypothesis has drifted from the position at which codes would start it.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)
     arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
-    # The old position is continued too, with an inflated variance so that codes can correct it; where the velocity
-    # alone contradicts it, the hypotheses continue unchanged.
+    # If the weights were low, the old position is kept with an inflated variance, so that codes can correct it. If only
+    # the velocity contradicts the position, the hypotheses continue unchanged.
     arc = np.concatenate([going, arc]) if weak else arc
     fresh = begin(arc, len(state.satellite), line, limits, known=(state.mean[best], state.covariance[best]))
     return (*fresh, _new_records(np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc))
 
 
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
-    """Add hypotheses slightly ahead of and behind separate hypotheses, the most probable first; return their number.
+    """Add hypotheses slightly ahead of and behind separate hypotheses, and return the number of added hypotheses.
 
     Where a line turns back within some tens of metres, Dopplers fit travel forward on one leg and backward on the other
-    equally well, and equations linearised before the bend do not reach beyond it. Each lap gets its own neighbouring
-    positions, with any speed; otherwise another lap would lose probability to those of the best one.
+    equally well, and equations linearised before the bend are not valid beyond it. Each lap gets its own neighbouring
+    positions, as otherwise the neighbours of the most probable lap would reduce the probability of other laps.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

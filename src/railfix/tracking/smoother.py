@@ -1,8 +1,8 @@
-"""Smoothed positions: the filter's estimates combined with all later measurements (docs/filter-equations.md).
+"""Smoothed positions, the filter estimates combined with all later measurements (docs/filter-equations.md).
 
-The adjoint form: G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
-doi:10.1080/00207177308932424. The measurement weights are the filter's; the hypotheses are those that led to the last
-one. Information from after the start of a hypothesis does not reach the epochs before it.
+The smoother has the adjoint form of G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
+doi:10.1080/00207177308932424. It uses the measurement weights of the filter, and at each epoch the hypothesis that led
+to the last hypothesis. Where a hypothesis begins, no later information reaches the epochs before.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from railfix.tracking.state import TrackState
 
 
 def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Propagate the information of later epochs on hypothesis h backward through an epoch's measurements."""
+    """Propagate the information of later epochs on hypothesis h backward through the measurements of an epoch."""
     from railfix.kernels.tracking.backward import before_measurements
 
     made = step.trace
@@ -32,7 +32,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
         )
     part = None if step.splits is None else step.splits[h]
     if part is not None:
-        # Ratio of the narrow to the wide density, as if the position had been measured.
+        # The ratio of the narrow to the wide density is treated as a measurement of the position.
         place = ix.ARC
         wide = part.covariance[place, place]
         back = np.eye(len(vector))
@@ -45,7 +45,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
 
 
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
-    """Return the transition matrix of all unknowns over an interval, shape (N, N); `mean` has shape (N,)."""
+    """Return the transition matrix (N, N) of all unknowns over the interval `dt` [s], for the state `mean` (N,)."""
     from railfix.kernels.tracking.backward import transition_matrix
 
     epoch = np.zeros(1, dtype=EPOCH)
@@ -57,18 +57,18 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 class BackwardInformation:
     """Information of all later epochs on the unknowns after an epoch."""
 
-    place_m: float  #: Arc length of the hypothesis that the later epochs continue; NaN for none.
-    #: Information vector and matrix of the unknowns; shapes (N,), (N, N).
+    place_m: float  #: Arc length of the hypothesis that later epochs continue; NaN for none.
+    #: Information vector (N,) and information matrix (N, N) of the unknowns.
     vector: Floats
     matrix: Floats
-    satellite: Strings  #: Shape (N - ix.SATELLITES,).
+    satellite: Strings  #: Satellites whose errors are unknowns, shape (N - ix.SATELLITES,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothed:
-    """Smoothed positions of T epochs; NaN where the filter has none."""
+    """Smoothed positions of T epochs; NaN where the filter has no position."""
 
-    #: Shape (T,).
+    #: Arc length, its standard deviation, and speed, shape (T,).
     arc_m: Floats
     sigma_m: Floats
     speed_mps: Floats
@@ -77,23 +77,23 @@ class Smoothed:
 def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
-    """Return the smoothed positions of a chunk (adjoint smoother: G. J. Bierman, 1973).
+    """Smooth the positions of a chunk (adjoint smoother: G. J. Bierman, 1973).
 
     Parameters
     ----------
     steps : list of Step
-        From `railfix.tracking.track`, one per epoch.
+        Trace of `railfix.tracking.track`, one step per epoch.
     before : TrackState
-        Before the chunk.
+        State before the chunk.
     later : BackwardInformation or None
-        From the chunk after; None at the end.
+        Information from the next chunk; None for the last chunk.
     limits : TrackingLimits
 
     Returns
     -------
     Smoothed
     BackwardInformation
-        For the chunk before.
+        Information for the previous chunk.
     """
     size = len(steps)
     satellite = steps[-1].satellite if size else before.satellite
@@ -140,7 +140,7 @@ def smooth_steps(
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return the vector and matrix for another set of satellites; 0 for satellites no longer in the later state."""
+    """Return vector and matrix for the given satellites; 0 for satellites that are not in the later state."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

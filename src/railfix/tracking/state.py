@@ -1,4 +1,4 @@
-"""State of the filter: hypotheses, each a Gaussian over the same unknowns."""
+"""State of the filter: hypotheses, which are Gaussian distributions of the same unknowns."""
 
 from __future__ import annotations
 
@@ -18,84 +18,84 @@ ANY_SPEED: Final = (-np.inf, np.inf)
 
 @dataclass(frozen=True, kw_only=True)
 class Monitors:
-    """Scalars of the state: adapted parameters and contradiction monitors."""
+    """Scalars of the state: adapted parameters, and monitors of contradictions."""
 
-    #: Times for which the mean weights of motion and of codes have been low [s].
+    #: Times for which the mean weights of motion measurements and of codes have been low [s].
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
-    #: Log ratios of the Doppler and phase variances to those of the limits.
+    #: Logarithms of the factors by which Doppler and phase variances exceed the variances of the limits.
     log_doppler_scale: float = 0.0
     log_phase_scale: float = 0.0
-    #: Mean of the position shifts that codes imply over the last epochs, in standard deviations, and its variance.
+    #: Mean over the last epochs of the position shift implied by codes, in standard deviations, and its variance.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0
-    #: Log ratio of the variance of map lengths to the assumed one, at least 0.
+    #: Logarithm of the factor by which the variance of map lengths exceeds the assumed variance, at least 0.
     map_log_variance: float = 0.0
-    #: Cumulative sum of the contradictions of the velocity, along and across (`railfix.kernels.tracking.monitors`).
+    #: Cumulative sum of velocity contradictions, along and across (`railfix.kernels.tracking.monitors`).
     contradiction: float = 0.0
     #: One less the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
-    step_s: float = 0.0  #: Time for which all codes have implied another position [s].
-    #: Remaining times for which the level is withheld, and for which the level along the line is withheld because other
-    #: positions were more probable than the risk [s].
+    step_s: float = 0.0  #: Time for which all codes have implied a different position [s].
+    #: Remaining times for which all levels are withheld, and for which the level along the line is withheld because
+    #: other positions were more probable than the risk [s].
     level_hold_s: float = 0.0
     ambiguity_hold_s: float = 0.0
-    #: Time and distance since the hypotheses began [s, m].
+    #: Time [s] and distance [m] since the hypotheses began.
     branch_s: float = 0.0
     branch_m: float = 0.0
-    distance_since_code_m: float = 0.0  #: Distance since codes were used [m].
-    direction: float = 0.0  #: Sign of the last speed whose direction was known.
-    #: Range of possible speeds after the measured ones (`railfix.kernels.tracking.model.narrow_speed_range`); unbounded
-    #: with several hypotheses [m/s].
+    distance_since_code_m: float = 0.0  #: Distance since the last used codes [m].
+    direction: float = 0.0  #: Sign of the last speed with a known direction.
+    #: Range of possible speeds after the measured speeds (`railfix.kernels.tracking.model.narrow_speed_range`);
+    #: unbounded with several hypotheses.
     least_speed_mps: float = ANY_SPEED[0]
     most_speed_mps: float = ANY_SPEED[1]
-    #: Times since `TrackState.origin` [s]: of the last epoch with used measurements, NaN before the first; and of the
-    #: last epoch with used codes (`TrackingLimits.code_period_s`), -inf if the next codes are used in any case.
+    #: Times since `TrackState.origin` of the last epoch with used measurements (NaN before the first), and of the last
+    #: epoch with used codes (`TrackingLimits.code_period_s`; -inf if the next codes are used in any case).
     measured_s: float = np.nan
     coded_s: float = -np.inf
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bank:
-    """Sub-filters of the most probable hypothesis, each excluding one source: B Gaussians over the same unknowns."""
+    """B sub-filters of the most probable hypothesis, each of which excludes one source of measurements."""
 
-    #: Source names: a satellite ("G05"), a constellation by the letter of its clock ("G"), a sensor ("wheel"), or one
-    #: of `railfix.tracking.bank.OTHERS` ("doppler").
+    #: Name of each excluded source: a satellite ("G05"), a constellation by its clock letter ("G"), a sensor ("wheel"),
+    #: or a key of `railfix.tracking.bank.OTHERS` ("doppler").
     without: tuple[str, ...]
-    mean: Floats  #: Shape (B, N).
-    covariance: Floats  #: Shape (B, N, N).
-    contradicted_s: Floats  #: Time for which its measurements have contradicted each sub-filter [s]; shape (B,).
+    mean: Floats  #: Means of the unknowns, shape (B, N).
+    covariance: Floats  #: Covariances of the unknowns, shape (B, N, N).
+    contradicted_s: Floats  #: Time for which a sub-filter has been contradicted by its own measurements, shape (B,).
 
 
 #: Record type of the state's scalars: the fields of `Monitors`, and the number of hypotheses.
 MONITORS: Final = record_of(dict.fromkeys(Monitors.__dataclass_fields__, float) | {"hypotheses": np.intp})
-#: Record type of a hypothesis, without its Gaussian.
+#: Record type of a hypothesis, without mean and covariance.
 HYPOTHESIS: Final = record_of({
-    "log_probability": float,  # logarithm of its probability
-    "log_code": float,  # part of it due to codes (`railfix.kernels.tracking.hypotheses`)
-    "log_least": float,  # recent minimum of `log_probability`: it rises with time (`constants.LEAST_RISE`)
+    "log_probability": float,  # logarithm of the probability
+    "log_code": float,  # part of `log_probability` due to codes (`railfix.kernels.tracking.hypotheses`)
+    "log_least": float,  # recent minimum of `log_probability`, which rises with time (`constants.LEAST_RISE`)
     # Recent code evidence against laps within the map error (`constants.RECENT_S`); not a probability.
     "log_recent": float,
-    "origin_m": float,  # arc length at its start [m]
+    "origin_m": float,  # arc length at the start of the hypothesis [m]
 })  # fmt: skip
 
 
 @dataclass(kw_only=True)
 class TrackState:
-    """State after an epoch: H hypotheses of N unknowns. Its arrays are never written to."""
+    """State after an epoch: H hypotheses of N unknowns. Its arrays are replaced, never modified in place."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
     origin: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the first epoch.
-    mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))  #: Units as in `index.py`; shape (H, N).
+    mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))  #: Shape (H, N), units as in `index.py`.
     covariance: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES, ix.SATELLITES)))  #: Shape (H, N, N).
-    hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: `HYPOTHESIS`; shape (H,).
-    #: Satellites whose errors are in the state; shape (N - ix.SATELLITES,).
+    hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: `HYPOTHESIS`, shape (H,).
+    #: Satellites whose errors are in the state, shape (N - ix.SATELLITES,).
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
-    #: Time at which each was last measured; shape (N - ix.SATELLITES,).
+    #: Time at which each satellite was last observed, shape (N - ix.SATELLITES,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Mean normalised innovation of each satellite's codes (`kernels.tracking.adaptation`); shape (N - ix.SATELLITES,).
+    #: Mean normalised innovation of each satellite's codes (`kernels.tracking.adaptation`), shape (N - ix.SATELLITES,).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
-    #: Clocks that have had an observation; shape (len(ix.CLOCKS),).
+    #: True for receiver clocks that have been observed, shape (len(ix.CLOCKS),).
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
     previous: Previous | None = None
     monitors: Monitors = field(default_factory=Monitors)
@@ -107,7 +107,7 @@ class TrackState:
         return len(self.hypothesis)
 
     def reset(self) -> None:
-        """Reset hypotheses, sub-filters, clocks and adapted parameters; the level stays withheld."""
+        """Reset hypotheses, sub-filters, clocks and adapted parameters; the level remains withheld."""
         width = ix.SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.hypothesis = self.hypothesis[:0]
@@ -121,7 +121,7 @@ class TrackState:
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:
-        """Keep the errors of some satellites (indices into `satellite`), and append the errors of new satellites."""
+        """Keep the errors of the satellites at the indices `kept`, and append the errors of the satellites `new`."""
         index = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + kept]).astype(np.intp)
         self.mean, self.covariance = _rearrange(self.mean, self.covariance, index, len(new))
         if self.bank is not None:
@@ -134,7 +134,7 @@ class TrackState:
 
 
 def _rearrange(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
-    """Return Gaussians over a subset of their unknowns and a number of new satellite errors."""
+    """Return means and covariances of the unknowns `index`, followed by `new` satellite errors of unit variance."""
     old = len(index)
     means, covariances = np.zeros((len(mean), old + new)), np.zeros((len(mean), old + new, old + new))
     means[:, :old], covariances[:, :old, :old] = mean[:, index], covariance[:, index[:, None], index]
