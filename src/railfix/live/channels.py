@@ -1,7 +1,7 @@
-"""Two channels: the same input through two processes, every message compared byte by byte (P1 2.1).
+"""Two-channel operation: two processes compute each message, and the messages are compared byte by byte (P1 2.1).
 
-The second channel is a separate process. Both get the same epochs, records and clock readings; each returns its
-messages with digests of its stages. At the first difference the output stops and the first stage that differs is named.
+Both channels receive the same epochs, records and clock readings. The second channel returns its messages, and digests
+of its processing stages. At the first difference the output stops, and the first stage that differs is named.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from railfix.pipeline.processor import EpochProcessor
 
 P = ParamSpec("P")
 
-#: First word of the second channel.
+#: First message of the second channel, sent when it can process calls.
 _READY: Final = "ready"
-#: Stages in the order of processing, with the arrays that are compared.
+#: Stages in the order of processing, with the arrays of `AntennaResult` that are compared.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -35,7 +35,7 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Return the digests of the stages and the message of each output."""
+    """Return, for each output, the SHA-256 digests of its stages and its encoded message, as hexadecimal digits."""
     return [
         {
             **{
@@ -65,7 +65,7 @@ def _digest(arrays: list[Any]) -> str:
 def _second_channel(
     connection: Connection, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str]
 ) -> None:
-    """Run the second process: execute lists of calls until the connection closes."""
+    """Execute the calls that the first channel sends, in lists, until the connection closes."""
     engine = LiveEngine(processor, settings, sensors)
     kernels.load()
     connection.send(_READY)
@@ -82,7 +82,7 @@ def _second_channel(
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
-    """Return the method of the engine, executed in this channel and then in the second."""
+    """Return a method of the engine that also records its call, for execution in the second channel."""
 
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
@@ -93,7 +93,10 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 
 
 class TwoChannels(LiveEngine):
-    """A `LiveEngine` with a second one in another process, which receives every call as well."""
+    """`LiveEngine` whose calls are repeated by a second engine in another process.
+
+    ChannelsDisagreeError: the second process does not start.
+    """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
@@ -103,7 +106,7 @@ class TwoChannels(LiveEngine):
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # Before any data: a later wait would delay the data, and the end by a signal.
+        # Wait before any data arrive: a later wait would delay the data, and the end of the session by a signal.
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
@@ -116,9 +119,9 @@ class TwoChannels(LiveEngine):
     push = _in_both(LiveEngine.push)
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return the messages due as `LiveEngine.poll`, after both channels have agreed.
+        """Return the outputs of `LiveEngine.poll`, if both channels agree.
 
-        ChannelsDisagreeError: when a message or a stage differs, or the second channel has ended.
+        ChannelsDisagreeError: a message or a stage differs, or the second channel has ended.
         """
         self._calls.append(("poll", (), {"now_ns": now_ns, "sent_ns": sent_ns}))
         try:
@@ -137,14 +140,14 @@ class TwoChannels(LiveEngine):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:
-        """End the second channel at once; it has no data to store."""
+        """Kill the second process, which has no data to store."""
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)
 
 
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:
-    """Raise ChannelsDisagreeError at the first difference between the outputs of two channels."""
+    """Raise ChannelsDisagreeError at the first difference between the digests of two channels."""
     if len(ours) != len(theirs):
         raise ChannelsDisagreeError(f"the channels disagree: {len(ours)} messages in one, {len(theirs)} in the other")
     for one, other in zip(ours, theirs, strict=True):

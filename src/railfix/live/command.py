@@ -1,4 +1,4 @@
-"""A live session from its inputs, and the tables of its results: implementation of ``railfix live``."""
+"""Implementation of ``railfix live``: a session with its inputs, outputs and result tables."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ResultTables:
         return self
 
     def add(self, output: LiveOutput) -> None:
-        """Write the rows of one output."""
+        """Add the rows of one output; rows are written in blocks."""
         if output.result is None or output.part == "message":
             return
         for name, table_of in TABLES.items():
@@ -82,8 +82,8 @@ class ResultTables:
         self._folder.__exit__(kind, error, trace)
 
 
-#: Longest distance from the reference location that an ETCS position report can state, without the position uncertainty
-#: [m].
+#: Longest distance from the reference location that an ETCS position report can express, less a margin for the position
+#: uncertainty [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
@@ -96,7 +96,7 @@ def _files_read(inputs: LiveInputs) -> list[Path]:
 
 
 def _check_outputs(inputs: LiveInputs) -> None:
-    """Raise OutputError if a file to be written is also read, or is written twice."""
+    """Raise OutputError if a file to be written is also read or is written twice, or if the log file is not a log."""
     named = [parse_file_target(text) for text in inputs.send]
     written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
     for k, path in enumerate(written):
@@ -108,10 +108,10 @@ def _check_outputs(inputs: LiveInputs) -> None:
 
 
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
-    """Run a session until its sources end, or SIGINT or SIGTERM; return summary lines, and whether SIGTERM ended it.
+    """Run a session until its sources end, or until SIGINT or SIGTERM.
 
-    SIGHUP reloads nothing: it is logged and counted. RailfixError: a source, sink, file or setting is invalid, or two
-    channels disagree.
+    Returns the lines of the summary, and whether SIGTERM ended the session. SIGHUP is logged and counted, and has no
+    other effect. RailfixError: a source, sink, file or setting is invalid, or two channels disagree.
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
@@ -171,7 +171,7 @@ async def _run_until_signal(session: Coroutine[Any, Any, object], metrics: Metri
 
     def hung_up() -> None:
         metrics.hangups += 1
-        log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
+        log.say("SIGHUP: nothing is reloaded; to change settings, map or vehicle, restart the program")
 
     def terminate() -> None:
         nonlocal terminated
@@ -195,7 +195,10 @@ def _hooks(
     *,
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
-    """Return hooks for result tables, state file, status line and sensor checks, and stored stream states if used."""
+    """Return the hooks for result tables, state file, status line and sensor checks, and the streams' stored states.
+
+    There are no stored states without a state file, or if it is not used.
+    """
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
 
     def say_balises(output: LiveOutput) -> None:
@@ -241,7 +244,7 @@ def _hooks(
         for observer in tuple(observers):
             try:
                 observer(output)
-            except OutputError as error:  # raised again when it is closed
+            except OutputError as error:  # raised again when the outlet is closed
                 observers.remove(observer)
                 log.say(f"{error}; this output has ended, the others go on")
 
@@ -250,19 +253,19 @@ def _hooks(
 
 
 def _close(outlet: Outlet[Any], log: SessionLog) -> None:
-    """Close an outlet; missing outputs are logged."""
+    """Close an outlet, and log the number of items that it has not written."""
     outlet.close()
     if outlet.dropped or outlet.failed:
         log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} refused {outlet.failure}")
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
-    """Return the line, and the epoch processor with everything known from the start."""
+    """Return the line, and an epoch processor with the data of all files that are read at the start."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
         raise SettingsError(
-            "--sbas names recorded messages; live they come with the receivers' streams (--sbas stream), and "
-            "--set sbas_prn=PRN names the satellite"
+            "--sbas gives recorded messages, which a live session does not read; use --sbas stream for messages from "
+            "the receivers' streams, and --set sbas_prn=PRN for the satellite"
         )
     units = units_of_ranges(tables, inputs.ranging_units, ranging=inputs.sensors.get("ranging"))
     navigation = no_navigation()
@@ -288,6 +291,6 @@ def _check_reference(line: OpenedLine, live: LiveSettings) -> None:
     ends = (0.0, float(line.track.chainage_m[-1]))
     if max(abs(end - live.reference_m) for end in ends) > _REACH_OF_REFERENCE_M:
         raise SettingsError(
-            f"--live reference_m={live.reference_m:g}: the line reaches from 0 to {ends[1]:.0f} m, a position report "
-            f"{_REACH_OF_REFERENCE_M:.0f} m from its reference; name a reference nearer to the line"
+            f"--live reference_m={live.reference_m:g}: the line extends from 0 to {ends[1]:.0f} m, position reports "
+            f"only to {_REACH_OF_REFERENCE_M:.0f} m from its reference location; give one that is nearer to the line"
         )

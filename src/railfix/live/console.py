@@ -1,7 +1,7 @@
-"""Display of a session: a log, and a status line if the terminal supports it.
+"""Log, status line, metrics and checks of a session.
 
-Counts and times of a session are served as Prometheus text over HTTP. Checks of on-board sensors against the
-satellites, and of the track against the positions, are logged.
+The metrics are served as Prometheus text over HTTP. The checks compare on-board sensors with satellite speeds, and the
+line with 3-D positions; their results are logged.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from railfix.run.sensor_checks import SensorChecks
 from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import Kind
 
-#: Number of lines that may wait for a terminal or a full disk.
+#: Number of log lines that may wait for a slow terminal or disk.
 _WAITING: Final = 1000
 
 
@@ -56,7 +56,7 @@ class _Terminal:
             self._live.start()
 
     def show(self, item: str | Text) -> None:
-        """Show a line, or renew the status."""
+        """Print a line of the log, or replace the status line."""
         if isinstance(item, str):
             self._console.print(item, markup=False, soft_wrap=True)
         elif self._live is not None:
@@ -76,7 +76,7 @@ class _Behind(logging.Handler):
         self._outlet, self._line = outlet, line
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Pass on one line or record."""
+        """Pass one line or record to the outlet."""
         if self._line is None:  # arguments may change before they are written
             record = copy.copy(record)
             record.msg, record.args = record.getMessage(), None
@@ -84,19 +84,19 @@ class _Behind(logging.Handler):
 
 
 class _Rotating(logging.handlers.RotatingFileHandler):
-    """A rotating file whose errors are raised, not printed."""
+    """Rotating log file whose write errors are raised, not printed."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802, ARG002 (the name and form of logging)
         """Raise the error that is being handled."""
         raise
 
 
-#: Beginning of a line of a log of a session.
+#: Time at the beginning of each line of a session's log.
 _LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
 
 
 def check_log_file(path: Path) -> None:
-    """Raise OutputError where an existing file is not the log of a session: nothing is appended to it."""
+    """Raise OutputError if an existing file is not a session's log, so that nothing is appended to it."""
     try:
         with path.open("rb") as file:
             begin = file.read(64)
@@ -111,8 +111,8 @@ def check_log_file(path: Path) -> None:
 class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
-    At `LiveSettings.log_bytes` the file is put aside as ``path.1``, and so on (OutputError when it cannot be opened). A
-    requested status line is shown where the standard error output is a terminal.
+    A file of `LiveSettings.log_bytes` is renamed to ``path.1``, an older file to ``path.2``, and so on. The status line
+    is shown only where the standard error output is a terminal. OutputError: the file cannot be opened.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:
@@ -144,12 +144,12 @@ class SessionLog:
         self._logger.info(sentence)
 
     def show(self, status: str) -> None:
-        """Renew the status line, if the terminal has one."""
+        """Replace the status line, if it is shown."""
         if self.shows_status:
             self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
     def close(self) -> None:
-        """Write the remaining lines; lines missing in the file are printed."""
+        """Write the remaining lines; the number of lines missing in the file is printed."""
         for handler in self._handlers:
             self._logger.removeHandler(handler)
         self._logger.propagate = True
@@ -162,21 +162,21 @@ class SessionLog:
         self._terminal.close()
 
 
-#: Number of messages over which time statistics are computed.
+#: Number of the latest values over which time statistics are computed.
 _LAST: Final = 1000
 
 
 @dataclass(kw_only=True)
 class Metrics:
-    """Counts and times of a session."""
+    """Counts and processing times of a session."""
 
     messages: Counter[MessageStatus] = field(default_factory=Counter)
-    epochs: Mapping[str, int] = field(default_factory=dict)  #: Outcomes of the epochs: `LiveEngine.counts`.
-    skipped: Counter[str] = field(default_factory=Counter)  #: Bytes and messages of the receivers that were not used.
-    lost: Counter[str] = field(default_factory=Counter)  #: Connections that broke, by source.
+    epochs: Mapping[str, int] = field(default_factory=dict)  #: Number of epochs by outcome, `LiveEngine.counts`.
+    skipped: Counter[str] = field(default_factory=Counter)  #: Number of unused bytes, messages and lines, by reason.
+    lost: Counter[str] = field(default_factory=Counter)  #: Number of broken connections, by source.
     sinks: Sequence[Sink] = ()
-    hangups: int = 0  #: SIGHUP received; nothing is reloaded by it.
-    #: Processing time of the last messages; times between them.
+    hangups: int = 0  #: Number of SIGHUP signals received, which have no other effect.
+    #: Processing time per output, and times between messages [s].
     processing_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
     between_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
 
@@ -184,7 +184,7 @@ class Metrics:
     _sent: float | None = None
 
     def took(self, seconds: float, outputs: Sequence[LiveOutput]) -> None:
-        """Count messages sent now, and their total processing time."""
+        """Count the messages of outputs that were processed in a total of `seconds`, and record their times."""
         now = time.monotonic()
         for output in outputs:
             self.processing_s.append(seconds / len(outputs))
@@ -215,7 +215,7 @@ class Metrics:
         return "\n".join(lines) + "\n"
 
     def summary(self) -> list[str]:
-        """Return a summary, one line per event, for the end of the session."""
+        """Return the lines of the summary at the end of a session."""
         lines = [f"{sum(self.messages.values()):,} messages"]
         lines += [f"  {status.name.lower()}: {number:,}" for status, number in sorted(self.messages.items())]
         lines += [f"epochs {fate}: {number:,}" for fate, number in sorted(self.epochs.items())]
@@ -242,7 +242,7 @@ def _counter(name: str, label: str, values: Mapping[str, int]) -> list[str]:
 
 
 async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
-    """Serve ``/metrics`` over HTTP; SettingsError when the address is not HOST:PORT, or cannot be listened at."""
+    """Serve ``/metrics`` over HTTP; SettingsError: the address is not HOST:PORT, or is not available."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         raise SettingsError(f"--metrics {address!r}: expected HOST:PORT, for example 127.0.0.1:9100")
@@ -255,7 +255,7 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
             head = f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: text/plain; version=0.0.4\r\n"
             writer.write(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
             await writer.drain()
-        except (OSError, ValueError):  # the client has gone, or does not speak HTTP
+        except (OSError, ValueError):  # the client has disconnected, or its request is not HTTP
             pass
         finally:
             writer.close()
@@ -263,24 +263,23 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
     try:
         return await asyncio.start_server(answer, host, int(port))
     except (OSError, OverflowError) as error:
-        raise SettingsError(f"--metrics {address}: cannot be listened at ({error})") from None
+        raise SettingsError(f"--metrics {address}: no server can be opened at this address ({error})") from None
 
 
-#: The sensors are checked after this time, the radar at this interval, with positions at least this far apart in time
-#: [ns].
+#: Time after which the sensors are checked, interval of the radar checks, least interval of the positions used [ns].
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
-#: Number of pieces of samples that are joined to one.
+#: Number of chunks of samples that are merged into one block.
 _PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
 
 
 class SensorWatch:
-    """Positions and speeds of the first antenna and the samples of the sensors, until they have been checked.
+    """Check of on-board sensors against the satellite positions and speeds of the first antenna.
 
-    `say` is called with a sentence on each sensor that contradicts the satellites
-    (`railfix.run.sensor_checks.SensorChecks`).
+    All sensors are checked once, after `WATCHED_NS` or at the end (`railfix.run.sensor_checks.SensorChecks`), and the
+    radar repeatedly. `say` is called with a sentence on each sensor that contradicts the satellites.
     """
 
     def __init__(self, processor: EpochProcessor, say: Callable[[str], None]) -> None:
@@ -320,11 +319,11 @@ class SensorWatch:
                 self.judge()
 
     def _hear(self, sensed: Sensed) -> None:
-        """Store samples, limited to the time for which they can be needed: there may be no position for hours."""
+        """Store samples; after twice `WATCHED_NS` without a check, check and drop them, to limit the memory."""
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
-            if len(self._samples) == _PIECES:  # a stream gives single rows, each with the memory of a hundred
+            if len(self._samples) == _PIECES:  # a single row of a stream needs the memory of a hundred rows
                 self._blocks.append(_join(self._samples))
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
@@ -354,7 +353,7 @@ class SensorWatch:
         self._speed_ns, self._speeds, self._shown = self._speed_ns[kept], self._speeds[kept], min(self._shown, 1)
 
     def judge(self) -> None:
-        """Compare the sensors with the satellite data so far, once."""
+        """Compare the sensors with the satellite positions and speeds so far; a second call has no effect."""
         if self._judged:
             return
         self._judged = True
@@ -378,7 +377,7 @@ def _times(time_ns: list[int]) -> Datetimes:
 
 
 def _join(parts: list[SensorSamples]) -> SensorSamples:
-    """Return all parts as one, joining neighbours first: each sample is copied a few times, not once per part."""
+    """Merge the parts in pairs, so that each sample is copied a few times and not once per part."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [early.merge(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
@@ -386,9 +385,9 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
 
 
 class PlaceWatch:
-    """Compare 3-D positions with the line until enough were collected, and report once if it lies elsewhere.
+    """Check that 3-D positions lie on the line, once an antenna has `ENOUGH_TO_STOP` of them.
 
-    `say` is called with the sentence with which `railfix run` ends in that case.
+    If they lie elsewhere, `say` is called with the message with which `railfix run` ends in this case.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:

@@ -1,7 +1,7 @@
-"""Live positioning: one result and one message per period from the epochs of one or two antennas.
+"""Live positioning: a result for each epoch of one or two antennas, and a message for each period.
 
-It applies the `EpochProcessor` of logs to one epoch at a time, and stores its state. It reads no files, and its memory
-is bounded: at most a few epochs wait for their pair, and expired records and SBAS messages are dropped.
+`LiveEngine` processes single epochs with the same `EpochProcessor` as logs, and keeps its state. It reads no files. Its
+memory is bounded: a limited number of epochs waits, and expired records and SBAS messages are dropped.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from railfix.pipeline.received import merge_navigation
 from railfix.pipeline.results import Result
 from railfix.ranges.sbas import SbasMessages
 
-#: A time after all epochs [ns].
+#: Time after all epochs [ns].
 END_NS: Final = 1 << 62
-#: Number of an antenna's epochs that may wait; with more, the clocks of the two antennas differ.
+#: Largest number of an antenna's epochs that wait; it is exceeded only if the receivers' clocks differ.
 _LONGEST_QUEUE = 100
 #: Distance after which the order of the antennas is checked again [m].
 _ORDER_STEP_M = 10.0
@@ -40,13 +40,13 @@ _ORDER_STEP_M = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """One message, and its result (None without input)."""
+    """Message, and the result of its epoch (None without input)."""
 
     message: TrainMessage
     result: Result | None
     place: TrainPlace | None = None  #: Position of the message; None without input.
-    #: Parts that are sent: both; the rows of the result alone, because the message of the period has been sent already;
-    #: or a delayed message alone.
+    #: Parts to be sent: message and rows of the result; rows alone, if the message is delayed or omitted; or a delayed
+    #: message alone.
     part: Literal["both", "rows", "message"] = "both"
 
 
@@ -55,8 +55,8 @@ class EngineState:
     """State from which a restarted session continues."""
 
     state: State
-    done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
-    last_tag: Mapping[str, int]  #: Last time tag of each antenna.
+    done_ns: int  #: Time tag of the last epoch, GPS time since 1980 [ns]; 0 before the first.
+    last_tag: Mapping[str, int]  #: Last time tag of each antenna [ns].
     #: Number of the last message, or a higher number that no message reaches before the next state is saved.
     sequence: int
     #: Direction of the train's front end along the chainage.
@@ -65,7 +65,7 @@ class EngineState:
 
 @dataclass(frozen=True, kw_only=True)
 class _FromSatellites:
-    """Records, SBAS messages and epochs of a base station; `heard` counts these arrivals."""
+    """Navigation records, SBAS messages and base-station epochs; `heard` is the number of arrivals up to the last."""
 
     heard: int
     navigation: Navigation | None = None
@@ -87,7 +87,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """An epoch that waits for its pair; `heard` counts the satellite data received before it."""
+    """Epoch that waits for its pair or for sensors; `heard` is the number of arrivals of satellite data before it."""
 
     epoch: Observations
     arrived_ns: int
@@ -95,24 +95,25 @@ class _Waiting:
 
     @property
     def tag_ns(self) -> int:
-        """Time tag, GPS time since 1980."""
+        """Time tag, GPS time since 1980 [ns]."""
         return int((self.epoch.time[0] - GPS_EPOCH).astype(np.int64))
 
 
 class LiveEngine:
-    """Positions of epochs as they arrive; compiled kernels are loaded at construction.
+    """Positioning of a train by epochs as they arrive; compiled kernels are loaded at construction.
 
     Attributes
     ----------
     counts : Counter of str
         Epochs by outcome: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
         "tag step", "restart", "no input", "superseded" (processed, but the message of the period was of a newer epoch),
-        "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and other sensors (no samples
-        up to the epoch in time).
+        "skipped, behind the receivers", "dropped, too many waiting", "base station out of order", "tachometer silent"
+        (no report up to the epoch in time) and likewise for other sensors.
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log: replacements of requested data and their end, restarts, outcome of a saved state.
+        Sentences for the log: replacements of requested data and their end, restarts, skipped epochs, the train's
+        direction, use of a saved state. The caller removes them.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
@@ -154,7 +155,7 @@ class LiveEngine:
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
 
     def add_base(self, epoch: Observations) -> None:
-        """Add an epoch of the base station; it is used from the next epoch on."""
+        """Add an epoch of the base station, used from the next epoch on; out of order it is counted and dropped."""
         if self._based_to is not None and epoch.time[0] <= self._based_to:
             self.counts["base station out of order"] += 1
             return
@@ -168,26 +169,26 @@ class LiveEngine:
             self._samples = self._samples.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
-        """Return the sensors without samples up to an epoch."""
+        """Return the sensors that have not reported up to an epoch's time tag."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
         last = self._from_satellites[-1] if self._from_satellites else None
-        if last is not None and last.heard > self._heard_at_push:  # no epoch was received between
+        if last is not None and last.heard > self._heard_at_push:  # no epoch was received since
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)
 
     def start(self, *, now_ns: int) -> None:
-        """Start the clock: from here on every period has a message, also before the first epoch."""
+        """Start the periods: each period after `now_ns` has a message, also before the first epoch."""
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session; `reserved` message numbers are skipped, in case of a crash."""
+        """Return the state for a restarted session, with a sequence number `reserved` above the last, for a crash."""
         sequence = self._sequence + reserved
-        if self._saved is not None:  # no epoch to continue from has been received
+        if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
         return EngineState(
             state=State() if self._state is None else self._state, done_ns=self._done_ns if self._state else 0,
@@ -195,15 +196,15 @@ class LiveEngine:
         )  # fmt: skip
 
     def resume(self, saved: EngineState) -> None:
-        """Continue from a saved state, if the first epoch comes within `LiveSettings.state_age_s` of its last one.
+        """Continue from a saved state, if the first epoch is at most `LiveSettings.state_age_s` after its last epoch.
 
-        Otherwise only its navigation records, SBAS messages and sequence number are used; `reports` states which case.
+        Otherwise only its navigation records, SBAS messages and sequence number are used. `reports` states the outcome.
         """
         self._sequence = max(self._sequence, saved.sequence)
         self._saved = saved if saved.done_ns else None
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
-        """Process an antenna's epoch, received at a time of the clock that is used for `poll`."""
+        """Add an antenna's epoch, received at `now_ns` by the clock of `poll`; ValueError: no such antenna."""
         if antenna not in self._waiting:
             raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)
@@ -227,7 +228,7 @@ class LiveEngine:
         queue.append(waiting)
 
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
-        """Use a saved state if an epoch with this tag may follow it."""
+        """Use a saved state, as far as the time tag of the first new epoch permits."""
         self._saved = None
         age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
@@ -243,12 +244,12 @@ class LiveEngine:
                 f"state file: not used but for ephemerides and the sequence number: its last epoch is "
                 f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
-        # Data known from the start of this session are merged with the data of the file.
+        # Navigation files of this session are merged with the data of the state file.
         known = self.processor.received.navigation
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether an epoch is new; restart after a receiver returns with older tags."""
+        """Return whether an epoch is to be processed; restart after `restart_epochs` rising tags before the last."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -272,7 +273,7 @@ class LiveEngine:
         return True
 
     def _restart(self) -> None:
-        """Restart after a receiver's restart, keeping only data received from satellites."""
+        """Restart positioning after a receiver's restart; only navigation records and SBAS messages are kept."""
         self.counts["restart"] += 1
         self.lag.reset()
         self.reports.append("a receiver came back with older time tags: positioning restarts")
@@ -283,11 +284,11 @@ class LiveEngine:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return the messages due, for complete pairs, epochs that waited long enough, and periods without input.
+        """Return the outputs due: of complete pairs, of epochs that waited long enough, and of a period without input.
 
-        `now_ns` is on the clock used for `push`, `sent_ns` the GPS time of sending for the message; one message
-        is then sent per period, for the newest epoch. Without it (recorded epochs, whose tags are the clock) every
-        epoch has its message; at `END_NS` all waiting epochs are due, and no period without input follows.
+        `now_ns` is a time of the clock used for `push`. With `sent_ns`, the GPS time of sending [ns], one message is
+        sent per period, for the newest epoch. Without it, for recorded epochs whose tags are the clock, every epoch has
+        a message. At `END_NS` all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -308,14 +309,13 @@ class LiveEngine:
         return numbered
 
     def _patience_ns(self) -> int:
-        """Return the longest time without a message: one and a half periods after an epoch, then one period."""
+        """Return the longest time without a message [ns]: 1.5 periods after an epoch, then one period."""
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
-        """Return outputs, at most the newest with a message, half a period after the last message at least.
+        """Return the outputs, the newest with its message if the last message is at least half a period old.
 
-        The newest message of too early epochs waits until one period after the last message, unless a newer message
-        replaces it.
+        An earlier message waits until one period after the last message, unless a newer message replaces it.
         """
         if self._due_ns is None:
             self._due_ns = now_ns - self._period_ns
@@ -341,12 +341,12 @@ class LiveEngine:
 
     @staticmethod
     def _get_tag(output: LiveOutput) -> int:
-        """Return the time tag of the newest epoch of an output."""
+        """Return the time tag of the newest epoch of an output [ns]."""
         assert output.result is not None
         return max(int((a.time[-1] - GPS_EPOCH).astype(np.int64)) for a in output.result.antennas.values())
 
     def wait_s(self, *, now_ns: int) -> float:
-        """Return the time after which `poll` has to be called again, if nothing arrives before [s]."""
+        """Return the time until the next call of `poll`, if nothing arrives before [s]."""
         times = [self.settings.period_s]
         if self._due_ns is not None:
             longest = self._patience_ns() if self._pending is None else self._period_ns
@@ -359,7 +359,7 @@ class LiveEngine:
         return max(0.0, min(times))
 
     def _pairs(self, now_ns: int) -> Iterator[dict[str, _Waiting]]:
-        """Yield epochs that can be processed, in order of their tags."""
+        """Yield the epochs to be processed together, by antenna, in order of their tags."""
         while True:
             heads = {name: queue[0] for name, queue in self._waiting.items() if queue}
             if not heads:
@@ -398,7 +398,7 @@ class LiveEngine:
         return self._locate(result)
 
     def _locate(self, result: Result) -> LiveOutput:
-        """Return the message of a result, with the direction of the train's front end up to it."""
+        """Return the output of a result, after an update of the direction of the train's front end."""
         place = locate_train(result, self.frame)
         before = self._running
         self._running = before.after(place.chainage_m, place.bound_m, place.moving)
@@ -408,7 +408,7 @@ class LiveEngine:
         return LiveOutput(message=message, result=result, place=place)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
-        """Return the samples since the previous epoch up to an epoch; later ones wait."""
+        """Return the samples from the previous epoch up to a time tag; later samples are kept for the next epoch."""
         time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._late_sensors(tag_ns)
         self.counts.update(f"{name} silent" for name in silent)
         samples = self._samples.between(np.datetime64("NaT", "ns"), time)
@@ -416,14 +416,14 @@ class LiveEngine:
         return replace(samples, silent=silent)
 
     def _tell_changes(self, notes: tuple[str, ...]) -> None:
-        """Report replacements of requested data since the received data changed, and replacements that have ended."""
+        """Report new replacements of requested data, and replacements that have ended."""
         if notes is not self._notes:
             self.reports.extend(note for note in notes if note not in self._notes)
-            self.reports.extend(f"no longer so: {note}" for note in self._notes if note not in notes)
+            self.reports.extend(f"no longer valid: {note}" for note in self._notes if note not in notes)
             self._notes = notes
 
     def _check_order(self, result: Result) -> None:
-        """Report once if the positions have the antennas in the wrong order."""
+        """Report once if the positions of the antennas are in the wrong order."""
         if self._order is None or len(result.antennas) < 2:
             return
         front, rear = (result.antennas[name] for name in ("front", "rear"))

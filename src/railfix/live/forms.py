@@ -1,4 +1,4 @@
-"""Forms of a message: encode one output as bytes.
+"""Message forms: functions that encode one output as bytes.
 
 ``json`` (one line per message), ``cbor`` (`railfix.io.train_message`; in files and streams each message is preceded by
 its length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (gpsd TPV report), ``etcs``
@@ -24,23 +24,26 @@ from railfix.pipeline.result_tables import passing_table, positions_table, train
 from railfix.pipeline.results import Result
 
 Form = Callable[[LiveOutput], bytes]
-#: Largest uncertainty in a position report, less a margin for the rounding of the distance [cm].
+#: Largest uncertainty that an ETCS position report can express, less a margin for the rounding of the distance [cm].
 _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
 def json_bytes(output: LiveOutput) -> bytes:
-    """Return the output as a JSON line."""
+    """Return the message as a JSON line."""
     return to_json(output.message).encode() + b"\n"
 
 
 def cbor_bytes(output: LiveOutput) -> bytes:
-    """Return CBOR preceded by its length in two bytes."""
+    """Return the message in CBOR, preceded by its length in two bytes."""
     data = encode(output.message)
     return len(data).to_bytes(2, "big") + data
 
 
 def nmea_bytes(output: LiveOutput) -> bytes:
-    """Return NMEA 0183 sentences GGA, RMC and GST of the position of the first antenna; nothing without input."""
+    """Return the NMEA 0183 sentences GGA, RMC and GST of the first antenna.
+
+    They are empty bytes without input. Without a position GGA and RMC have no coordinates, and there is no GST.
+    """
     place = _geodetic(output)
     if output.result is None:
         return b""
@@ -74,7 +77,7 @@ def gga_sentence(output: LiveOutput) -> bytes:
 
 
 def tpv_bytes(output: LiveOutput) -> bytes:
-    """Return a gpsd TPV report as a JSON line; heights are above the ellipsoid (altHAE)."""
+    """Return a gpsd TPV report as a JSON line, with the height above the ellipsoid (altHAE)."""
     place = _geodetic(output)
     report: dict[str, Any] = {"class": "TPV", "device": "railfix", "mode": 1, "time": _utc(output.message)[:23] + "Z"}
     if place is not None:
@@ -87,9 +90,9 @@ def tpv_bytes(output: LiveOutput) -> bytes:
 
 
 def etcs_form(settings: LiveSettings) -> Form:
-    """Return the form of SUBSET-026 position reports, packet 0, from the settings' reference location, as JSON lines.
+    """Return the form of SUBSET-026 position reports, packet 0, as JSON lines; `settings` has the reference location.
 
-    There is no report without a position of the front end, or if the uncertainty exceeds the packet's range (327 km).
+    There is no report without a bounded position of the front end, or if its bound exceeds the packet's range (327 km).
     """
 
     def etcs_bytes(output: LiveOutput) -> bytes:
@@ -104,7 +107,7 @@ def etcs_form(settings: LiveSettings) -> Form:
     return etcs_bytes
 
 
-#: Result tables, each None if an epoch has no rows for it.
+#: Functions that return the result tables; a table without rows is None.
 TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
     "positions": positions_table,
     "train": lambda result: train_table(result) if result.fusion else None,
@@ -122,12 +125,12 @@ def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
     return rows_bytes
 
 
-#: Forms with rows of `TABLES`.
+#: Forms that encode the rows of `TABLES`.
 ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.items()}
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
-    """Return the rows as JSON lines with all digits; null for missing numbers, words for infinities."""
+    """Return the rows as JSON lines with all digits; NaN is encoded as null, infinities as "inf" and "-inf"."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
     lines = []
     for row in texts.iter_rows(named=True):
@@ -152,7 +155,7 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
 
 
 def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
-    """Return latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the first antenna."""
+    """Return latitude, longitude [deg], ellipsoidal height and sigma [m] of the first antenna; None without them."""
     place = output.place
     if place is None or place.geodetic is None or not math.isfinite(place.sigma_m):
         return None
@@ -166,7 +169,7 @@ def _utc(message: TrainMessage) -> str:
 
 
 def _angle(value: float, digits: int) -> str:
-    """Return degrees and minutes in NMEA format, ddmm.mmmmmmm."""
+    """Return the magnitude of an angle [deg] in NMEA format, ddmm.mmmmmmm; degrees have `digits` digits."""
     minutes = round(abs(value) * 60.0, 7)
     return f"{int(minutes // 60):0{digits}d}{minutes % 60:010.7f}"
 
@@ -179,11 +182,11 @@ def _sentence(body: str) -> bytes:
 
 
 def wants(form: Form, output: LiveOutput) -> bool:
-    """Return whether a form applies to an output: table forms if it has rows, all others if it has a message."""
+    """Return whether a form applies to an output: table forms encode its rows, all other forms its message."""
     return output.part != ("message" if form in ROW_FORMS.values() else "rows")
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:
-    """Return a message for a target that separates messages: without the length that streams need."""
+    """Return a message without the length that precedes it in streams, for a target that separates messages."""
     data = form(output)
     return data[2:] if form is cbor_bytes else data

@@ -20,9 +20,9 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: Sigmas of the speed's bound: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
+#: Bound of the speed in sigmas: 1e-7 two-sided, the initial value of the protection level (P1 2.4).
 _SPEED_K = 5.33
-#: Widening of bounds for chainages rounded to centimetres [m].
+#: Increase of bounds for chainages rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
@@ -33,7 +33,7 @@ _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIV
 
 
 def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, time_ns: int) -> TrainMessage:
-    """Return the message of a period in which nothing was received; the sender numbers it."""
+    """Return the message of a period without input; `time_ns` is the tag of the last epoch, the number is set later."""
     return TrainMessage(
         train=settings.train,
         sequence=0,
@@ -53,23 +53,22 @@ class TrainPlace:
     #: Chainage of the reference point; NaN without a position.
     chainage_m: float
     sigma_m: float
-    #: Bound of its error, and the protection level included in it; infinite where no bound exists.
+    #: Bound of the position error, and the protection level that it contains [m]; infinite without a bound.
     bound_m: float
     level_m: float
     status: MessageStatus
-    moving: int  #: Direction of the speed against chainage, 0 where the speed is too small.
+    moving: int  #: Direction of motion, 1 toward rising chainage, -1 toward falling, 0 if too slow or unknown.
     #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna at this position; None without a
     #: position.
     geodetic: tuple[float, float, float] | None
 
 
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the position of the train by the antenna with the best bound, reduced to the reference point.
+    """Return the position of the train by the antenna with the lowest protection level, at the reference point.
 
-    The position is computed by the filter along the track where it runs, otherwise by the single epoch. The bound is
-    the filter's over- and under-reading amount where it has a protection level (`tracking.level`); otherwise the
-    protection level of the single epoch, widened by the distance of the filter's position from it, so that it is valid
-    for both.
+    The position is computed by the filter along the track where it runs, otherwise from the single epoch. The bound is
+    the filter's over- and under-reading amount where the filter has a protection level (`tracking.level`). Otherwise it
+    is the single-epoch protection level plus the distance between the two positions, so that it is valid for both.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
     return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
@@ -99,7 +98,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     # The bound of a position that failed a check does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
-    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # without a bound no position is sent
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # such a position is sent without a bound
         bound = math.inf
     moving = int(track.direction[-1]) if track is not None and len(track) else 0
     return TrainPlace(
@@ -109,7 +108,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
 
 
 def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tuple[float, float, float] | None:
-    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna for a position of an antenna."""
+    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna; None where unknown."""
     source = result.fusion[name] if _has_place(result.fusion.get(name)) else result.antennas[name]
     values = np.array([source.latitude_deg[-1], source.longitude_deg[-1], source.height_m[-1]])
     if name != frame.first:
@@ -120,11 +119,11 @@ def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tup
 def create_message(
     result: Result, place: TrainPlace, settings: LiveSettings, frame: TrainFrame, running: int
 ) -> TrainMessage:
-    """Return the message of one processed epoch; the sender numbers it.
+    """Return the message of one processed epoch; its number and time of sending are set later.
 
-    `running` is the direction of the train's front end. The message has the front end's chainage and the bounds of the
-    position, wider where either end of the train may be ahead. Where the front end is unknown, it has the reference
-    point's chainage and bounds. A doubtful position has no bounds.
+    `running` is the direction of the train's front end. The message has the front end's chainage and bounds, which are
+    wider where either end of the train may be ahead. Where the front end is unknown, the message has the chainage and
+    bounds of the reference point. A doubtful position has no bounds.
     """
     antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
@@ -156,7 +155,7 @@ def create_message(
 
 
 def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return the fields that identify the train, and the names of unknown fields."""
+    """Return the fields of the train's direction and length, and the flags of its unknown properties."""
     length, front = frame.length_m, frame.ends(running).front_m
     unknown = Unknown(0)
     for what, known in (
@@ -193,13 +192,13 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the antennas' worst suspected interference at the last epoch; None without this check."""
+    """Return the worst suspected interference of all antennas at the last epoch; None without this check."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
-    """Return the measurements used by the filter at the last epoch, besides codes."""
+    """Return the sources, other than codes, that the filter used at the last epoch."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
@@ -214,7 +213,7 @@ def _has_place(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
 
 
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
-    """Return the position [m], NaN without one, and its status."""
+    """Return the chainage of an antenna [m], NaN without a position, and its status."""
     place = float(antenna.chainage_m[-1])
     if not _has_place(track):
         if not math.isfinite(place):
@@ -237,7 +236,7 @@ def _has_passed(antenna: AntennaResult) -> bool:
 
 
 def _level_m(antenna: AntennaResult) -> float:
-    """Return the protection level of the last epoch; infinite without one."""
+    """Return the single-epoch protection level of the last epoch [m]; infinite without one."""
     if antenna.protection is None:
         return math.inf
     level = float(antenna.protection.level.level_m[-1])
@@ -245,5 +244,5 @@ def _level_m(antenna: AntennaResult) -> float:
 
 
 def _up_cm(value_m: float) -> int:
-    """Return metres as centimetres, rounded up."""
+    """Return metres as centimetres, rounded up, at least 0."""
     return max(0, math.ceil(value_m * 100.0 - 1e-9))

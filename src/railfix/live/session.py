@@ -37,7 +37,7 @@ _LONGEST_QUEUE: Final = 64
 #: Period of the status line [s].
 _STATUS_S: Final = 0.5
 
-#: Name of the source that is a base station.
+#: Name of the base station's source.
 BASE: Final = "base"
 
 _LOG: Final = logging.getLogger("railfix.live")
@@ -46,14 +46,14 @@ _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """Optional parts of a session."""
+    """Optional callbacks of a session, and its metrics."""
 
     observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
     sensed: Callable[[Sensed], None] | None = None  #: Called with the completed samples of each sensor source.
     #: Called every `LiveSettings.state_every_s`, in idle time, with the state for a restart.
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None  #: Called with a text for the status line, twice a second.
-    metrics: Metrics = field(default_factory=Metrics)  #: Metrics of the session, which are returned.
+    metrics: Metrics = field(default_factory=Metrics)  #: Metrics of the session, returned at its end.
 
 
 async def run_session(
@@ -67,7 +67,7 @@ async def run_session(
     date: np.datetime64 | None = None,
     streams: Mapping[str, ReceiverState] | None = None,
 ) -> Metrics:
-    """Process sources until all have ended.
+    """Process sources until all have ended, and return the metrics of the session.
 
     Parameters
     ----------
@@ -75,14 +75,14 @@ async def run_session(
         Source of each antenna, and of a base station (`BASE`); see `railfix.live.sources.read_source`.
         RINEX observation files are replayed as well.
     speed : float or None
-        Replay speed of recorded files relative to real time. None: as fast as possible; the time tags are then the
-        clock (set `LiveSettings.no_input` to "skip" for exactly one message per epoch).
+        Replay speed of recorded files relative to real time. With None, files are replayed as fast as possible, and
+        the time tags are the clock (set `LiveSettings.no_input` to "skip" for exactly one message per epoch).
     sensors : mapping of str to str, optional
-        Streams of on-board sensors (`railfix.live.stream`) by name; tables from files are given to the engine before.
+        Streams of on-board sensors (`railfix.live.stream`) by name; tables from files are added to the engine before.
     date : datetime64, optional
         Time within half a week of RTCM 3 streams, whose observations have no week number; now for live streams.
     streams : mapping of str to ReceiverState, optional
-        State of the receivers' streams to continue from.
+        States from which the receivers' streams continue, by source name.
 
     Raises
     ------
@@ -90,9 +90,9 @@ async def run_session(
         A source cannot be opened, or breaks and is not opened again; or the first line of a sensor's stream is not the
         header of that sensor's table.
     OutputError
-        A sink of a replay cannot be written; raised at the end, when the other sinks are complete, or if none is left.
+        A sink of a replay cannot be written; raised when the other sinks are complete, or at once if no sink is left.
     ChannelsDisagreeError
-        Two channels differ.
+        Messages or stages of two channels differ.
     """
     hooks = hooks or Hooks()
     session = _Session(engine=engine, sinks=sinks, metrics=hooks.metrics, hooks=hooks)
@@ -130,7 +130,7 @@ async def run_session(
 
 @dataclass(kw_only=True)
 class _Session:
-    """Running session, with its parts, the states of its streams, and monotonic times of the last actions.
+    """Running session: its parts, the states of its streams, and monotonic times of the last actions [s].
 
     `read_to_ns` has the latest tag received from each source that has not ended, -1 before the first; `place` is the
     last position as a GGA sentence, for a virtual base station.
@@ -143,7 +143,7 @@ class _Session:
     streams: dict[str, ReceiverState] = field(default_factory=dict)
     read_to_ns: dict[str, int] = field(default_factory=dict)
     place: bytes = b""
-    #: Time of sending, GPS time since 1980 [ns], by the computer, or by files that are replayed at their own pace.
+    #: Function that returns the time of sending, GPS time since 1980 [ns]: of the computer, or of a paced replay.
     clock: Callable[[], int] = field(default_factory=lambda: gps_now_ns)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
@@ -151,12 +151,12 @@ class _Session:
     ended: dict[str, OutputError] = field(default_factory=dict)  #: Sinks that could not be written.
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
-        """Process the items of the pumps until all have ended; a restart can continue from there."""
+        """Process the items of the pumps until all antennas' sources have ended, and save the state at the end."""
         read_to_ns, due = self.read_to_ns, 0
         self.reserved_from = self.engine.export_state().sequence
         self.save(reserved=self.reserved)
         try:
-            while read_to_ns.keys() - {BASE}:  # a base station's stream alone has no end
+            while read_to_ns.keys() - {BASE}:  # a base station's stream may have no end
                 for pump in pumps:
                     if pump.done() and queue.empty():
                         pump.result()  # an error of a source ends the session, after the items before it
@@ -178,7 +178,7 @@ class _Session:
                         tag_ns = self.take(name, received, None if replay else now)
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
                 if self.engine.lag.skipped and not queue.empty() and now < due:
-                    continue  # skipped epochs need no answer of a second channel
+                    continue  # skipped epochs need no answer from a second channel
                 due = now + round(5e8 * self.engine.settings.period_s)
                 # In a replay the clock is the tag up to which all files have been read, so that no pair is separated.
                 clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, self.clock())
@@ -193,7 +193,7 @@ class _Session:
         self.save()
 
     async def pump(self, name: str, source: str, turn: _Pace | _InTurn | None, queue: _Queue) -> None:
-        """Move the completed items of a source into the queue, then None; recorded epochs wait for their turn."""
+        """Move the completed items of a source into the queue, then None; epochs from files wait for their turn."""
         async for received in self.received(name, source):
             if turn is not None and received.epochs:
                 await turn.wait(name, received.epochs[-1].time[-1])
@@ -203,7 +203,7 @@ class _Session:
         await queue.put((name, None))
 
     async def listen(self, sensor: str, source: str, queue: _Queue) -> None:
-        """Move the completed samples of a sensor into the queue; when it has ended, no epoch waits for it."""
+        """Move a sensor's completed samples into the queue; after the stream's end no epoch waits for the sensor."""
         lines = SensorLines(sensor=sensor, source=hidden(source))
         async for part in read_source(source, self.engine.settings):
             if isinstance(part, bytes):
@@ -223,7 +223,7 @@ class _Session:
                 self.tell(name, source, item)
 
     def tell(self, name: str, source: str, item: Connected | Lost) -> None:
-        """Log and count the events of a connection."""
+        """Log the event of a connection, and count losses."""
         if isinstance(item, Lost):
             self.metrics.lost[hidden(source)] += 1
             _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), item.reason, item.wait_s)
@@ -232,9 +232,9 @@ class _Session:
             _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
     def take(self, name: str, received: ReceivedData, now_ns: int | None) -> int:
-        """Pass the completed items of one source to the engine; without a clock the epochs arrive at their tags.
+        """Pass the completed items of one source to the engine, and return the last epoch's tag [ns], -1 without one.
 
-        Returns the tag of the last epoch [ns], -1 without one.
+        Without `now_ns` the tags of the epochs are their times of arrival.
         """
         self.streams[name] = received.after
         skipped = self.metrics.skipped
@@ -259,7 +259,7 @@ class _Session:
         return tag_ns
 
     def emit(self, now_ns: int, sent_ns: int | None) -> list[LiveOutput]:
-        """Pass due outputs to the sinks."""
+        """Pass the outputs that are due to the sinks, and return them."""
         began = time.perf_counter()
         outputs = self.engine.poll(now_ns=now_ns, sent_ns=sent_ns)
         if outputs:
@@ -277,7 +277,7 @@ class _Session:
         return outputs
 
     def send(self, sink: Sink, output: LiveOutput) -> None:
-        """Pass an output to a sink; a sink that cannot be written has ended, the others continue.
+        """Pass an output to a sink; a sink that cannot be written ends.
 
         OutputError: no sink is left.
         """
@@ -302,19 +302,19 @@ class _Session:
 
     @property
     def reserved(self) -> int:
-        """Return the number of messages in ten state periods, so that no number is sent twice after a crash."""
+        """Number of messages in ten state periods, reserved so that no sequence number is sent twice after a crash."""
         settings = self.engine.settings
         return math.ceil(10.0 * settings.state_every_s / settings.period_s)
 
     def save(self, *, reserved: int = 0) -> None:
-        """Pass on the state for a restart, where requested."""
+        """Pass the state for a restart to `Hooks.save`, if given."""
         if self.hooks.save is not None:
             streams = {name: state.after_break() for name, state in self.streams.items()}
             self.hooks.save(SavedSession(engine=self.engine.export_state(reserved=reserved), streams=streams))
 
 
 class _Pace:
-    """Common pace of all files: waits until a time tag is due, counted from the earliest first tag."""
+    """Common pace of all files, which delays epochs until they are due relative to the earliest first tag."""
 
     def __init__(self, speed: float, files: Sequence[str]) -> None:
         self._speed = speed
@@ -340,7 +340,7 @@ class _Pace:
         return int((min(self._first) - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64)) + round(elapsed_s * 1e9)
 
     def ended(self, name: str) -> None:
-        """Note that the first tag of a file is known, or that it has none."""
+        """Record that the first tag of a file is known, or that the file has no epochs."""
         self._to_come.discard(name)
         if not self._to_come and not self._all_known.is_set():
             self._began = asyncio.get_running_loop().time()
@@ -354,7 +354,7 @@ class _InTurn:
         self._read_to_ns = read_to_ns
 
     async def wait(self, name: str, tag: np.datetime64) -> None:
-        """Wait until no other file is behind this one, and a base station's file has been read up to the tag."""
+        """Wait until no other file is behind this file, and a base station's file has been read up to the tag."""
         tag_ns = int((tag - GPS_EPOCH).astype(np.int64))
         while self._read_to_ns[name] > min(self._read_to_ns.values()) or (
             name != BASE and self._read_to_ns.get(BASE, tag_ns) < tag_ns
@@ -362,7 +362,7 @@ class _InTurn:
             await asyncio.sleep(0)
 
     def ended(self, name: str) -> None:
-        """Do nothing: ended sources are not in the table."""
+        """Do nothing, as ended sources are removed from `read_to_ns`."""
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:

@@ -20,43 +20,43 @@ class LiveSettings(Settings):
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
     #: Longest wait for the other antenna's epoch after a pair's first epoch has arrived.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    #: Longest wait for on-board sensor samples up to an epoch; samples still missing since the previous epoch are then
-    #: not used.
+    #: Longest wait for on-board sensor samples up to an epoch; the epoch is then processed without the sensor.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"  #: Whether a period without input has a message.
-    #: Consecutive epochs with tags before the last one after which the receiver is considered restarted.
+    #: Number of consecutive epochs with tags earlier than the last after which a receiver is considered restarted.
     restart_epochs: int = Field(default=3, ge=1)
     #: Whether a connection that broke is opened again, with waits that double from `reconnect_first_s` to
-    #: `reconnect_longest_s`; off, the session ends with its sources. The first connection must succeed in any case.
+    #: `reconnect_longest_s`; otherwise the session ends when its sources end. The first connection must always succeed.
     reconnect: Literal["on", "off"] = "on"
 
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     #: A connection without a byte for this time is considered broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: Period at which the train's position (GGA) is sent to the base station's caster, for a virtual station; 0: never.
+    #: Period at which the train's position (GGA) is sent to the base station's caster, for a virtual station; it is not
+    #: sent with 0.
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    #: Certificates (PEM) of casters over TLS, in addition to the system's certificates.
+    #: File with certificates (PEM) that are trusted for casters over TLS, in addition to the system's certificates.
     ntrip_certificates: Path | None = None
     #: Number of messages that may wait for a slow target; further messages to it are dropped and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Delay above the shortest observed delay at which epochs are skipped up to the present, with a log line; not for
+    #: Delay of epochs relative to the shortest observed delay at which epochs are skipped, with a log line; not for
     #: recorded epochs.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Period at which the state file is written.
-    #: Longest time from the last epoch of a state file to the first new one; after a longer time only ephemerides and
+    #: Longest time from the last epoch of a state file to the first new epoch; after a longer time only ephemerides and
     #: the sequence number are used.
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
-    #: Size at which a log file is rotated, and number of rotated files.
+    #: Size at which a log file is rotated [bytes], and number of rotated files.
     log_bytes: int = Field(default=1_000_000, ge=1000)
     log_files: int = Field(default=5, ge=1, le=1000)
-    #: Identities for the message.
+    #: Identities of train and line in messages.
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
-    #: Direction along the chainage of the train's leading end at the start; 0 where unknown. None: from the vehicle
-    #: file. A train that runs the other way for 50 m has changed ends.
+    #: Direction along the chainage of the train's leading end at the start, 0 where unknown. None: from the vehicle
+    #: file. A train that has run 50 m in the other direction has changed ends.
     facing: Literal[-1, 0, 1] | None = None
-    #: Distance of the train's front end ahead of the front antenna. None: from the vehicle file, by its length.
+    #: Distance of the train's front end ahead of the front antenna. None: computed from the vehicle file.
     front_offset_m: float | None = Field(default=None, ge=0.0)
     length_m: float | None = Field(default=None, gt=0.0)  #: Train length. None: from the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
@@ -64,13 +64,13 @@ class LiveSettings(Settings):
     reference_m: float = 0.0  #: Chainage of this reference location.
 
 
-#: Sensors on board.
+#: On-board sensors.
 Sensor = Literal["tachometer", "inertial", "radar", "ranging", "balises"]
 SENSORS: tuple[Sensor, ...] = ("tachometer", "inertial", "radar", "ranging", "balises")
 
 
 class LiveInputs(Settings):
-    """Inputs of a live session; see ``railfix live --help``."""
+    """Inputs of a live session, the options of ``railfix live``."""
 
     front: str = input_option(
         "Stream of the front antenna's receiver: a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, "
@@ -79,19 +79,19 @@ class LiveInputs(Settings):
     )
     track: tuple[Path, ...] = input_option("Track map; repeat it for a route.", metavar="TRACK")
     rear: str | None = input_option("Source of the rear antenna.", None, metavar="SOURCE")
-    vehicle: Path | None = input_option("Vehicle of the antennas.", None, metavar="TOML")
+    vehicle: Path | None = input_option("Vehicle file with the positions of the antennas.", None, metavar="TOML")
     nav: tuple[Path, ...] = input_option("Navigation files known from the start.", (), metavar="FILE")
     base: str | None = input_option(
-        "Stream of a base station: RTCM 3 (MSM, and 1005 or 1006 with its position) or as of --front.",
+        "Stream of a base station: RTCM 3 (MSM, and 1005 or 1006 with its position), or the formats of --front.",
         None,
         metavar="SOURCE",
     )
     base_place: str | None = option(
-        "Position of the base station; by default from its stream or header.", None, metavar="LAT,LON,HEIGHT"
+        "Position of the base station; by default it is read from the stream or header.", None, metavar="LAT,LON,HEIGHT"
     )
     tachometer: str | None = input_option(
-        "Pulses of a tachometer: the rows of the table of `railfix run` as lines of CSV, header first, from a "
-        "source as of --front; or the whole table, a file. A row with the time alone reports that there "
+        "Pulses of a tachometer: rows of the table of `railfix run` as lines of CSV, header first, from a "
+        "source as for --front, or the whole table as a file. A row that has only the time reports that there "
         "was no pulse.",
         None,
         metavar="SOURCE",
@@ -114,7 +114,7 @@ class LiveInputs(Settings):
         "Replay files this many times as fast as recorded; by default without pause.", None, metavar="TIMES", ge=0.01
     )
     channels: Literal["1", "2"] = option("2: a second process checks every message; a difference ends the output.", "1")
-    metrics: str | None = option("Serve Prometheus text at /metrics.", None, metavar="HOST:PORT")
+    metrics: str | None = option("Serve metrics as Prometheus text at /metrics.", None, metavar="HOST:PORT")
     state: Path | None = option(
         "Write the state regularly into this file, and continue from it after a restart.", None, metavar="FILE"
     )
@@ -128,18 +128,18 @@ class LiveInputs(Settings):
 
     @property
     def antennas(self) -> tuple[Literal["front", "rear"], ...]:
-        """Antennas with a stream."""
+        """Names of the antennas that have a stream."""
         return ("front",) if self.rear is None else ("front", "rear")
 
     @property
     def sources(self) -> dict[str, str]:
-        """Streams by antenna, and of the base station."""
+        """Sources of the antennas and of the base station, by name."""
         given = {"front": self.front, "rear": self.rear, "base": self.base}
         return {name: source for name, source in given.items() if source is not None}
 
     @property
     def sensors(self) -> dict[Sensor, str]:
-        """Streams or tables of the sensors on board that are given."""
+        """Sources or tables of the on-board sensors that are given, by name."""
         return {name: source for name in SENSORS if (source := getattr(self, name)) is not None}
 
     @property

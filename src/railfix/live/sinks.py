@@ -1,7 +1,8 @@
-"""Sinks of messages, ``FORM@TARGET``, with queues before slow targets.
+"""Message sinks, given as ``FORM@TARGET``, with a queue for each target that may be slow.
 
-Forms: see `railfix.live.forms`. Targets: ``-`` (standard output), a file, ``udp://HOST:PORT`` (one datagram per
-message), ``tcp-server://HOST:PORT`` (all clients that connect), ``mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC``.
+The forms are functions of `railfix.live.forms`. The targets are ``-`` (standard output), a file, ``udp://HOST:PORT``
+(one datagram per message), ``tcp-server://HOST:PORT`` (all connected clients) and
+``mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC``.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ class Outlet(Generic[Item]):
     """Target with its own queue and thread, in which `send` processes one item.
 
     `full` selects the action when the queue is full: drop and count the item ("drop", live), or wait ("wait", replay of
-    recorded files). `dropped` counts dropped items, `failed` items that the target refused; `failure` is the reason for
-    the last refusal, blank after an accepted item.
+    recorded files). `dropped` is the number of dropped items, `failed` the number of items that the target refused, and
+    `failure` the reason for refusing the last item, blank if the item was accepted.
     """
 
     def __init__(self, name: str, send: Callable[[Item], None], *, waiting: int, full: str = "drop") -> None:
@@ -50,7 +51,7 @@ class Outlet(Generic[Item]):
         self._thread.start()
 
     def send(self, item: Item) -> None:
-        """Pass on one item; OutputError if the target refuses items and none may be lost."""
+        """Add one item to the queue; OutputError with "wait", if the target has refused the last item."""
         if self._defect is not None:
             raise self._defect
         if self._full == "wait":
@@ -77,11 +78,11 @@ class Outlet(Generic[Item]):
                 self.failed += 1
 
     def close(self) -> None:
-        """Wait for the remaining items, some seconds at most; the rest is counted as dropped.
+        """Wait some seconds for the remaining items; items that still wait are counted as dropped.
 
-        OutputError: as `send`.
+        OutputError: as for `send`.
         """
-        with suppress(queue.Full):  # then the thread is abandoned below
+        with suppress(queue.Full):  # a thread that does not end is abandoned below
             self._items.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
@@ -90,11 +91,11 @@ class Outlet(Generic[Item]):
             raise OutputError(f"{self.name}: {self.failure}")
 
 
-#: Bytes that may wait for a slow reader of a TCP sink; with more, the reader is disconnected.
+#: Number of bytes that may wait for a client of a TCP sink; a client with more bytes is disconnected.
 _LARGEST_BACKLOG: Final = 1 << 20
 #: Longest wait for the answer of an MQTT broker [s].
 _ANSWER_S: Final = 10.0
-#: Longest wait at the end for messages that a broker has not accepted [s].
+#: Longest wait for unsent messages when an MQTT target is closed [s].
 _LEFT_S: Final = 2.0
 _HELP: Final = (
     "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, passings, TARGET -, a file, "
@@ -103,7 +104,7 @@ _HELP: Final = (
 
 
 class Sink(Protocol):
-    """Receiver of outputs that never waits, and counts the outputs that its reader has missed."""
+    """Target of outputs, which counts the outputs that its reader has missed."""
 
     name: str  #: Name in counts and messages.
     dropped: int  #: Number of messages dropped for a slow reader.
@@ -119,7 +120,7 @@ class Sink(Protocol):
 
 @dataclass
 class ByteTarget:
-    """A file or the standard output, unbuffered: a message reaches its reader at once, without holding a lock."""
+    """File or standard output, written without a buffer, so that messages reach their reader at once."""
 
     form: Form
     file: IO[bytes]
@@ -132,7 +133,7 @@ class ByteTarget:
             data = data[self.file.write(data) :]
 
     def close(self) -> None:
-        """Close the file, and remove it where no message came; the standard output stays open."""
+        """Close the file, and remove it if it is empty; the standard output stays open."""
         if self.path is not None:
             self.file.close()
             if self.path.is_file() and not self.path.stat().st_size:
@@ -148,7 +149,7 @@ class UdpTarget:
     socket: socket.socket = field(default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
 
     def send(self, output: LiveOutput) -> None:
-        """Send one datagram, none if the form yields no bytes."""
+        """Send one datagram; nothing is sent if the form yields no bytes."""
         if data := whole_message(self.form, output):
             self.socket.sendto(data, self.address)
 
@@ -158,7 +159,10 @@ class UdpTarget:
 
 
 class MqttTarget:
-    """Target that publishes messages under an MQTT topic, at most once; a broken connection is opened again."""
+    """MQTT target, which publishes with QoS 0 (at most once); a broken connection is opened again.
+
+    OutputError: the broker cannot be reached, or refuses the connection.
+    """
 
     def __init__(self, form: Form, url: str, *, waiting: int) -> None:
         with needs_extra("mqtt://"):
@@ -186,7 +190,7 @@ class MqttTarget:
             raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker refuses the connection ({answer})")
 
     def send(self, output: LiveOutput) -> None:
-        """Publish one message, none if the form yields no bytes.
+        """Publish one message; nothing is published if the form yields no bytes.
 
         OutputError: no connection, or the broker is too slow.
         """
@@ -201,7 +205,7 @@ class MqttTarget:
         if len(self._sent) >= self._waiting:
             raise OutputError("the broker does not keep up")
         sent = self._client.publish(self.topic, data, qos=0)
-        if sent.rc:  # the connection broke since
+        if sent.rc:  # the connection has broken meanwhile
             raise OutputError("the broker is not connected")
         self._sent.append(sent)
 
@@ -219,19 +223,19 @@ class MqttTarget:
 
 
 class OutletSink(Outlet[LiveOutput]):
-    """A target with its own queue, closed with it."""
+    """Sink with a queue before its target, which is closed with the sink."""
 
     def __init__(self, name: str, target: Any, *, waiting: int, full: str) -> None:
         super().__init__(name, target.send, waiting=waiting, full=full)
         self._target = target
 
     def send(self, item: LiveOutput) -> None:
-        """Pass on one output, if the form applies to it."""
+        """Add one output to the queue, if the form applies to the output."""
         if wants(self._target.form, item):
             super().send(item)
 
     def close(self) -> None:
-        """Send the remaining outputs, and close the target; OutputError as `Outlet.close`."""
+        """Send the remaining outputs, and close the target; OutputError as for `Outlet.close`."""
         try:
             super().close()
         finally:
@@ -239,7 +243,7 @@ class OutletSink(Outlet[LiveOutput]):
 
 
 class TcpServerSink:
-    """TCP server whose clients receive the messages from their connection on; too slow clients are disconnected."""
+    """TCP server that sends each client the messages since it connected; slow clients are disconnected."""
 
     def __init__(self, form: Form, name: str) -> None:
         self.form, self.name = form, name
@@ -249,7 +253,7 @@ class TcpServerSink:
         self._readers: set[asyncio.StreamWriter] = set()
 
     async def start(self, host: str, port: int) -> None:
-        """Listen."""
+        """Open the server; OSError: the address is not available."""
         self.server = await asyncio.start_server(self._connect, host, port)
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -257,7 +261,7 @@ class TcpServerSink:
         try:
             while await reader.read(1024):
                 pass
-        except OSError:  # the reader has closed the pipe, as at the end of its data
+        except OSError:  # the client has closed the connection
             pass
         finally:
             self._readers.discard(writer)
@@ -294,8 +298,8 @@ async def open_sink(
 ) -> Sink:
     """Open the sink of a text ``FORM@TARGET``; `full` as for `Outlet`.
 
-    SettingsError: when the text names no form or target. OutputError: when the target cannot be opened, or is a file
-    that exists already.
+    SettingsError: the text has no valid form or target. OutputError: the target cannot be opened, or is an existing
+    file and `overwrite` is "refuse".
     """
     settings = settings or LiveSettings()
     name, at, target = text.partition("@")

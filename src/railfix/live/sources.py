@@ -22,7 +22,7 @@ from railfix.live.settings import LiveSettings
 Item = TypeVar("Item")
 #: Function that returns the present position as a GGA sentence, empty without a position.
 Place = Callable[[], bytes]
-#: Sends to the other end of a connection until cancelled.
+#: Function that writes to the other end of a connection until it is cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
 
 _BLOCK = 4096
@@ -30,25 +30,25 @@ _FORMS = (
     "a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), "
     "or - (standard input)"
 )
-#: NTRIP, plain and over TLS.
+#: Schemes of NTRIP without and with TLS.
 _NTRIP = ("ntrip", "ntrips")
 #: Longest wait for a connection, and for the first line of an answer [s].
 _CONNECT_S = 10.0
-#: Longest wait for a byte of a serial line in one call [s].
+#: Longest wait for a byte in one read of a serial line [s].
 _SERIAL_S = 0.05
 #: Wait for bytes that have already arrived [s].
 _ONCE_MORE_S = 0.02
-#: Wait for a first position to send to a caster [s].
+#: Longest interval between attempts to send a first position to a caster [s].
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
-_TELLING_BYTES: Final = 16  #: Number of first content bytes that identify wrong kinds.
+_TELLING_BYTES: Final = 16  #: Number of leading content bytes that identify wrong content types.
 _OK: Final = 200  #: HTTP status of a successful answer.
 
 
 @dataclass(frozen=True)
 class Connected:
-    """Event of an opened connection; `broken` is the number of earlier losses."""
+    """Event of an opened connection; `broken` is the number of earlier breaks."""
 
     broken: int
 
@@ -83,7 +83,7 @@ def is_file(source: str) -> bool:
 
 
 def hidden(source: str) -> str:
-    """Return a source without its password, to be shown."""
+    """Return a source with its password masked, for messages and logs."""
     parts = urlsplit(source)
     return source if parts.password is None else source.replace(f":{parts.password}@", ":***@", 1)
 
@@ -91,10 +91,11 @@ def hidden(source: str) -> str:
 async def read_source(
     source: str, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
+    """Yield bytes of a source as they arrive, and events of its connection.
 
-    `place` returns the present GGA sentence, which is sent to a caster every `LiveSettings.gga_s`; none while it is
-    empty. InputFileError: when the source cannot be opened, or breaks and is not opened again.
+    A connection that breaks is opened again, if `LiveSettings.reconnect` is "on". `place` returns the present GGA
+    sentence, which is sent to a caster every `LiveSettings.gga_s` unless it is empty. InputFileError: the source cannot
+    be opened, or its connection breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
@@ -117,7 +118,7 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a connection, reopened after growing waits; empty bytes report that it is open."""
+    """Yield bytes of a connection, which is reopened after growing waits; `opened` yields empty bytes once open."""
     broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
     while True:
         reason = "the other end has closed the connection"
@@ -151,8 +152,8 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
     """Return the result of a call, or raise TimeoutError.
 
-    The result is checked once more at the end: data that arrived while this program was busy are used.
-    (`asyncio.wait_for` may lose a cancellation that comes at the same moment.)
+    The call is repeated once after the time has passed, for data that arrived while this program was busy.
+    (`asyncio.wait_for` may lose a cancellation that arrives at the same time.)
     """
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
@@ -164,14 +165,17 @@ async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
 async def _tcp(
     source: str, request: bytes, silence_s: float, *, tls: ssl.SSLContext | None = None, send: Send | None = None
 ) -> AsyncIterator[bytes]:
-    """Yield empty bytes once connected, then received bytes; `send` writes to the other end meanwhile."""
+    """Yield empty bytes once connected, then received bytes, while `send` writes to the other end.
+
+    InputFileError: the connection cannot be opened, breaks, or is silent for `silence_s`.
+    """
     parts = urlsplit(source)
     try:
         async with asyncio.timeout(_CONNECT_S):
             reader, writer = await asyncio.open_connection(parts.hostname, parts.port, ssl=tls)
     except ssl.SSLCertVerificationError as error:
         why = f"its certificate is not accepted ({error.verify_message})"
-        hint = "; a certificate of its own goes into --live ntrip_certificates=FILE"
+        hint = "; if it is a private certificate, give it by --live ntrip_certificates=FILE"
         raise InputFileError(hidden(source), why + hint) from None
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
@@ -198,10 +202,10 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """Yield the bytes of a mount point of an NTRIP caster, version 2, or version 1 if the caster answers with it.
+    """Yield the bytes of an NTRIP caster's mount point, by version 2, or by version 1 if the caster answers with it.
 
-    With `LiveSettings.gga_s` the caster receives the train's position for a virtual station: in the request where it is
-    known (NTRIP 2), and then as lines.
+    With `LiveSettings.gga_s` the train's position is sent for a virtual station: in the request if the position is
+    known (NTRIP 2), and later as lines.
     """
     if settings.gga_s == 0.0:
         place = None
@@ -234,9 +238,9 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
 
 
 class _Answer:
-    """Answer of a caster: HTTP 1.1 by h11 (NTRIP 2), or ``ICY 200 OK`` and bytes (NTRIP 1).
+    """Decoder of a caster's answer: HTTP 1.1 by h11 (NTRIP 2), or ``ICY 200 OK`` and bytes (NTRIP 1).
 
-    `begun`: the mount point sends a stream; `ended`: the caster has ended it.
+    `begun` states that the mount point sends a stream, `ended` that the caster has ended the stream.
     """
 
     def __init__(self, source: str) -> None:
@@ -250,7 +254,10 @@ class _Answer:
         self._plain = self.begun = self.ended = False
 
     def request(self, sentence: bytes) -> bytes:
-        """Return the request, with the position for the caster."""
+        """Return the request for the mount point, with a GGA sentence if it is not empty.
+
+        SettingsError: the source does not give a valid request.
+        """
         parts = urlsplit(self._source)
         head = [
             ("Host", f"{parts.hostname}:{parts.port}"), ("Ntrip-Version", "Ntrip/2.0"),
@@ -268,7 +275,7 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content of further bytes; InputFileError if the mount point has no stream."""
+        """Return the content in further bytes of the answer; InputFileError if the mount point has no stream."""
         if self._first is not None:
             self._first += data
             if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:
@@ -310,7 +317,7 @@ class _Answer:
             raise self._broken
 
     def _check_head(self, response: Any) -> None:
-        """Raise InputFileError if an answer is not a stream: refused, a source table, a page, or compressed."""
+        """Raise InputFileError if the answer is an error, a source table, a page of HTML, or compressed."""
         if response.status_code != _OK:
             raise _refuse(self._source, f"{response.status_code} {response.reason.decode('latin-1')}".encode())
         head = {bytes(name).lower(): bytes(value).lower().strip() for name, value in response.headers}
@@ -323,7 +330,7 @@ class _Answer:
             raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not requested")
 
     def _check_content(self, content: bytes) -> None:
-        """Raise InputFileError if the first bytes are not a receiver's."""
+        """Raise InputFileError if the first bytes are compressed, a page of HTML, or a source table."""
         if content.startswith(b"\x1f\x8b"):
             raise self._no_stream("compressed content (gzip), which was not requested")
         if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
@@ -339,7 +346,7 @@ class _Answer:
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """Return a TLS context with the system's certificates, and the certificates of a file."""
+    """Return a TLS context with the system's certificates, and those of a PEM file; SettingsError: it has none."""
     context = ssl.create_default_context()
     if certificates is not None:
         try:
@@ -365,7 +372,11 @@ def _baud(source: str) -> int:
 
 
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
-    """Yield empty bytes once the line is open, then received bytes; a thread reads, so that no byte overflows."""
+    """Yield empty bytes once the serial line is open, then received bytes.
+
+    A thread reads, so that no bytes are lost while the program is busy. InputFileError: the line cannot be opened,
+    breaks, or is silent for `silence_s`.
+    """
     with needs_extra(f"source {source!r}: a serial line"):
         import serial
     try:

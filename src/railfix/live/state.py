@@ -1,8 +1,8 @@
-"""State file: the state from which a restarted session continues, written regularly, checked before use.
+"""State file, from which a restarted session continues; it is written regularly, and checked before use.
 
-A JSON line identifies the state: versions, hashes of map, vehicle and settings, length and SHA-256 of the rest; the
-state itself follows. It is read back only if all of these are equal, and contains only plain values, arrays and data
-classes of this package (`railfix.live.state_values`): no content is executed.
+Its first line, in JSON, has versions, hashes of map, vehicle and settings, and the length and SHA-256 of the state that
+follows. A state is used only if all of them agree with the session. It contains only plain values, arrays and data
+classes of this package (`railfix.live.state_values`), and reading it executes no content.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Loaded:
 def belongs_to(
     files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Return the inputs that a state must agree with to be used: files by role, settings, and antennas."""
+    """Return entries that must agree for a state to be used: versions, antennas, hashes of files and settings."""
     own = f"{railfix.__version__} ({source_commit()})"
     return {
         "version": f"railfix {own}, numpy {np.__version__}, Python {platform.python_version()}",
@@ -62,7 +62,7 @@ def belongs_to(
 
 
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
-    """Write a complete state file, or keep the previous file and raise OutputError."""
+    """Write a complete state file with the entries of `belongs_to`, or keep the previous file and raise OutputError."""
     content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     part = path.with_name(f".{path.name}.part")
@@ -77,9 +77,9 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 
 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
-    """Read a state file, if there is one that belongs to this session (`belongs_to`).
+    """Read a state file; its state is used only if its entries agree with those of this session (`belongs_to`).
 
-    OutputError: the file is not a state file, and the session would overwrite it.
+    OutputError: the file is not a state file, and would be overwritten by the session.
     """
     try:
         data = path.read_bytes()

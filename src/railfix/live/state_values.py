@@ -1,7 +1,7 @@
-"""Values of a live state as JSON and arrays, and back: nothing is executed while they are read.
+"""Encoding of a live state as JSON and arrays, and its decoding, which executes no content.
 
-Plain values, arrays, containers, enumerations, named tuples and data classes of this package are written. A data class
-is rebuilt by its own constructor from its fields, so that its checks apply to the file's values.
+Plain values, arrays, containers, enumerations, named tuples and data classes of this package are supported. A data
+class is decoded by its constructor, so that the constructor's checks apply to the file's values.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-#: Containers by their names in the file.
+#: Types of containers by their names in the file.
 _MAPPINGS: Final[dict[str, Any]] = {
     "dict": dict, "proxy": MappingProxyType, "counter": Counter, "ordered": OrderedDict,
 }  # fmt: skip
@@ -28,11 +28,11 @@ _SEQUENCES: Final[dict[str, Any]] = {"list": list, "tuple": tuple, "set": set, "
 
 
 class StateFormatError(ValueError):
-    """A value that cannot be part of a state, or bytes that are not a state."""
+    """Error of a value that cannot be part of a state, or of bytes that are not a state."""
 
 
 def encode(value: Any) -> bytes:
-    """Return a value of a state as the bytes of a NumPy archive; StateFormatError: it contains an unsupported value."""
+    """Return a state as the bytes of a NumPy archive; StateFormatError: the state contains an unsupported value."""
     arrays: list[np.ndarray[Any, Any]] = []
     tree = json.dumps(_encode(value, arrays))
     file = io.BytesIO()
@@ -41,7 +41,7 @@ def encode(value: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """Return the value that `encode` has written; StateFormatError: the bytes are not a state."""
+    """Return the state that `encode` has encoded; StateFormatError: the bytes are not a state."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return _decode(json.loads(stored["tree"].tobytes()), stored)
@@ -118,7 +118,7 @@ def _decode(tree: Any, stored: Mapping[str, Any]) -> Any:
     if name == "of":
         values = {field: _decode(one, stored) for field, one in more["fields"].items()}
         return _find(content, _is_value)(**values)
-    raise StateFormatError(f"{name} is no kind of a value")
+    raise StateFormatError(f"{name} is not a kind of value")
 
 
 def _is_value(kind: Any) -> bool:
@@ -131,7 +131,7 @@ def _name(kind: Any) -> str:
 
 
 def _find(name: str, fits: Any) -> Any:
-    """Return a class of this package by its name; StateFormatError where it is not of the requested kind."""
+    """Return a class of this package by its name; StateFormatError: there is none for which `fits` returns True."""
     module, _, own = str(name).partition(":")
     if module.split(".")[0] == "railfix" and own.isidentifier():
         found = getattr(import_module(module), own, None)

@@ -1,9 +1,9 @@
 """Epochs, navigation records, SBAS messages and sensor samples decoded from a source's data as they arrive.
 
-Samples arrive as lines, the rows of a CSV table. The first line names the columns, as in the tables of ``railfix run``;
-it may be repeated after a break. A row with the time alone reports that nothing was measured up to this time: a
-tachometer at standstill sends such rows instead of pulses. `Lag` is the delay of a session behind its receivers, and
-selects the epochs to skip to return to the present.
+Samples arrive as lines, the rows of a CSV table. The first line has the names of the columns, as in the tables of
+``railfix run``; it may be repeated after a break. A row that has only the time reports that nothing was measured up to
+this time, for example by a tachometer at standstill. `Lag` measures the delay of a session relative to its receivers,
+and selects the epochs to be skipped if the delay is too long.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class ReceiverState:
 
 @dataclass(frozen=True, kw_only=True)
 class ReceivedData:
-    """Items completed by a chunk of bytes."""
+    """Epochs, records and messages completed by a chunk of bytes, and the counts of skipped data."""
 
-    epochs: tuple[Observations, ...]  #: One epoch each, with the channels observed in it.
+    epochs: tuple[Observations, ...]  #: Observations of one epoch each, with the channels observed in the epoch.
     navigation: Navigation | None = None
     sbas: SbasFrames | None = None
     skipped_bytes: int = 0
@@ -62,9 +62,9 @@ class ReceivedData:
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
     """Yield the items completed by a chunk of a receiver's bytes, in stream order, independent of the chunk boundaries.
 
-    Each item ends with the message that completes an epoch, so that its navigation records precede its epoch.
-    The state for the next chunk is `ReceivedData.after` of the last item; there is always an item. Epochs with
-    repeated or older time tags are kept: `LiveEngine.push` decides on their use.
+    An item ends with the message that completes an epoch, or with the chunk, so that navigation records received before
+    an epoch are used for the epoch. The state for the next chunk is `ReceivedData.after` of the last item; there is at
+    least one item. Epochs with repeated or older time tags are included, and dropped by `LiveEngine.push`.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
@@ -76,7 +76,7 @@ def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
 
 
 def epoch_ends(buffer: Bytes) -> Indices:
-    """Return offsets after messages that complete an epoch: RXM-RAWX, MeasEpoch, last MSM."""
+    """Return the offsets after messages that complete an epoch: RXM-RAWX, MeasEpoch, last MSM of an epoch."""
     frames = find_frames(buffer, at_end=False)
     raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
     last = msm[rtcm.completes_epoch(frames, msm)]
@@ -103,7 +103,7 @@ def _receive(data: bytes, state: ReceiverState) -> ReceivedData:
 
 
 def single_epochs(observations: Observations) -> tuple[Observations, ...]:
-    """Return observations epoch by epoch, each with the channels that have a value in it."""
+    """Return the observations of each epoch, with the channels that have a value in the epoch."""
     epochs = []
     for k in range(len(observations)):
         part = observations[k : k + 1]
@@ -124,7 +124,7 @@ Item = TypeVar("Item")
 
 
 def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState:
-    """Return the state of a stream before its first byte; `date` as for `railfix.live.run_session`."""
+    """Return the state of a stream before its first byte; for `date` see `railfix.live.run_session`."""
     if date is None and not is_file(source):
         date = np.datetime64(time.time_ns(), "ns")  # leap seconds are irrelevant here
     return ReceiverState() if date is None else ReceiverState(stream=StreamState(time=date.astype("datetime64[ns]")))
@@ -133,7 +133,7 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """Yield the completed items of a source, and the breaks of its connection; `place`: see `read_source`."""
+    """Yield the completed items of a source, and the events of its connection; for `place` see `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and find_kind(path) != "receiver":
         for piece in scan_observations(path, epochs=200):
@@ -170,7 +170,7 @@ async def next_arrival(
 
 #: Time after every epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
-#: Columns without which a row contains only its time.
+#: Columns that must have a number in every row with values.
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
@@ -186,18 +186,18 @@ class Sensed:
     samples: SensorSamples = field(default_factory=SensorSamples)
     #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a complete table.
     until: np.datetime64
-    skipped: int = 0  #: Lines that are not rows, or whose time is before the previous row's.
+    skipped: int = 0  #: Number of lines that are not rows, or whose time is before the previous row's time.
 
     def count_unsurveyed(self, units: GroundUnits | None) -> int:
-        """Count the unused ranges to ground units without surveyed positions."""
+        """Count the ranges to ground units without surveyed positions, which are not used."""
         return int(np.count_nonzero(~np.isin(self.samples.ranging.station, () if units is None else units.name)))
 
 
 @dataclass(kw_only=True)
 class SensorLines:
-    """Rows of one sensor's stream."""
+    """Decoder of the rows of one sensor's stream."""
 
-    #: Sensor of `railfix.motion.samples.SENSORS`, and its source for the messages.
+    #: Sensor of `railfix.motion.samples.SENSORS`, and the name of its source in error messages.
     sensor: str
     source: str
     columns: tuple[str, ...] = ()  #: Names of the columns; empty before the header line.
@@ -205,11 +205,11 @@ class SensorLines:
     rest: bytes = b""  #: Incomplete last line.
 
     def after_break(self) -> None:
-        """Begin a new line where the connection broke."""
+        """Drop the incomplete line after a break of the connection."""
         self.rest = b""
 
     def take(self, data: bytes) -> Sensed:
-        """Process a chunk of bytes with arbitrary boundaries.
+        """Return the samples completed by a chunk of bytes with arbitrary boundaries.
 
         InputFileError: the first line is not the header of this sensor's table.
         """
@@ -247,7 +247,7 @@ class SensorLines:
         return tuple(cells)
 
     def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
-        """Return the time and values of a row, without values if it has the time alone; None for another line."""
+        """Return the time and values of a row, no values for a row with only a time; None for an invalid line."""
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))
@@ -275,10 +275,10 @@ class SensorLines:
         return SensorSamples(**samples)
 
 
-#: Largest drift of the computer's clock against the receivers' time; the stored shortest delay grows at this rate.
+#: Largest drift of the computer's clock relative to GPS time; the stored shortest delay grows at this rate.
 DRIFT: Final = 1e-4
-#: A delay that is constant within `STEADY_S` for this time [s] and number of skipped epochs is in the tags, not in the
-#: session: a session's delay decreases, or increases if the computer is too busy even to skip.
+#: A delay that is constant within `STEADY_S` for `ADMITTED_S` [s] and `STEADY_EPOCHS` skipped epochs is an offset of
+#: the tags. The delay of a session would decrease, or increase if the computer is too busy even to skip epochs.
 ADMITTED_S: Final = 2.0
 STEADY_S: Final = 0.2
 STEADY_EPOCHS: Final = 5
@@ -286,10 +286,10 @@ STEADY_EPOCHS: Final = 5
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs above the shortest observed delay, so that the clocks need not agree."""
+    """Delay of epochs relative to the shortest observed delay, for which the clocks need not agree."""
 
-    behind_s: float  #: With a larger delay epochs are skipped until it is a quarter of this limit; infinite: never.
-    skipped: int = 0  #: Epochs skipped since the session fell behind.
+    behind_s: float  #: Delay above which epochs are skipped until the delay is a quarter of it [s]; may be infinite.
+    skipped: int = 0  #: Number of epochs skipped since the delay exceeded the limit.
     reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
     _shortest_ns: float | None = None
     _at_ns: int = 0
@@ -298,11 +298,11 @@ class Lag:
     _steady: int = 0
 
     def reset(self) -> None:
-        """Reset the shortest delay, as the tags have a new origin."""
+        """Reset the shortest delay after a change of the tags' origin."""
         self._shortest_ns, self.skipped = None, 0
 
     def skips(self, tag_ns: int, now_ns: int) -> bool:
-        """Return whether an epoch is too old to be processed now."""
+        """Update the delay with an epoch, and return whether the epoch is to be skipped."""
         delay_ns = now_ns - tag_ns
         shortest = float(delay_ns) if self._shortest_ns is None else self._shortest_ns
         shortest = min(float(delay_ns), shortest + DRIFT * (now_ns - self._at_ns))

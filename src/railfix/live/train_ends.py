@@ -14,20 +14,20 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: Distance run against the leading end after which the train has changed ends; longer than any rolling back [m].
+#: Distance run away from the leading end after which the train has changed ends; longer than any rolling back [m].
 CHANGED_ENDS_M: Final = 50.0
 
 
 class Ends(NamedTuple):
-    """Ends of a train along the line, from its reference point in the running direction [m]; NaN where unknown.
+    """Positions of a train's ends relative to its reference point along the line [m]; NaN where unknown.
 
-    Without a running direction the ends may be on either side.
+    Without a running direction each end may be on either side.
     """
 
-    front_m: float  #: Middle of the possible positions of the front end.
+    front_m: float  #: Middle of the possible positions of the front end, positive ahead.
     spread_m: float  #: Largest distance of the front end from this middle.
-    foremost_m: float  #: No part of the train is farther ahead.
-    rearmost_m: float  #: No part of the train is further behind.
+    foremost_m: float  #: Largest distance of any part of the train ahead of the reference point.
+    rearmost_m: float  #: Largest distance of any part of the train behind the reference point.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class TrainFrame:
     """Reference point of a train, and its ends.
 
     The reference point is the middle between the bogies of the vehicle that carries the antennas. Without a vehicle
-    file it is the first antenna itself; the position of another antenna does not determine it then.
+    file the reference point is the first antenna, and positions of a second antenna are not used.
     """
 
     trajectories: Mapping[str, Trajectory]
@@ -49,9 +49,9 @@ class TrainFrame:
 
     @classmethod
     def of(cls, trajectories: Mapping[str, Trajectory], settings: LiveSettings) -> Self:
-        """Return the frame of a train by its vehicle file and the settings, which outrank it.
+        """Return the frame of a train from its vehicle file and the settings, which take precedence.
 
-        SettingsError: the train is shorter than its front end is ahead of the reference point.
+        SettingsError: the front end is farther ahead of the reference point than the train is long.
         """
         first = next(iter(trajectories.values()))
         on_vehicle = first.body_chainage_m is not None
@@ -83,7 +83,7 @@ class TrainFrame:
         """Sentences on unknown properties of the train, and the settings that provide them."""
         notes = []
         if not self.running:
-            notes.append("the direction in which the train's front end looks is unknown until it has run 50 m: give a "
+            notes.append("the direction of the train's front end is unknown until the train has run 50 m: give a "
                          "vehicle file, or --live facing")  # fmt: skip
         if not math.isfinite(self.front_m):
             notes.append(
@@ -98,7 +98,7 @@ class TrainFrame:
         return tuple(notes)
 
     def reference_m(self, name: str, arc_m: float) -> float:
-        """Return the chainage of the reference point for an antenna's position [m]; NaN where unknown."""
+        """Return the chainage of the reference point for an antenna's position along the line [m]; NaN if unknown."""
         trajectory = self.trajectories[name]
         if trajectory.body_chainage_m is not None:
             return float(trajectory.body_at(arc_m))
@@ -110,14 +110,14 @@ class TrainFrame:
         return next(iter(self.trajectories))
 
     def first_antenna_ecef_m(self, name: str, arc_m: float) -> Floats:
-        """Return the position of the first antenna for a position of any antenna, shape (3,) [m]; NaN where unknown."""
+        """Return the first antenna's position (ECEF), shape (3,) [m], from any antenna's position along the line."""
         first, trajectory = self.trajectories[self.first], self.trajectories[name]
         if name != self.first:
             arc_m = float(first.arc_of_body(trajectory.body_at(arc_m)))
         return first.at_arc(np.float64(arc_m))
 
     def ends(self, running: int) -> Ends:
-        """Return the ends of a train running in a direction; with 0, unknown, each end may be on either side."""
+        """Return the ends of a train that runs in a direction, 1 or -1; with 0 each end may be on either side."""
         front, rear = self.front_m, self.rear_m
         if running and self.facing:
             front, rear = (front, rear) if running == self.facing else (rear, front)
@@ -134,8 +134,9 @@ class TrainFrame:
 class RunningEnd:
     """Direction of the train's leading end along the chainage, from the vehicle file and from motion.
 
-    The train has changed ends, or a previously unknown leading end is determined, once its reference point lies
-    `CHANGED_ENDS_M` and both bounds beyond the farthest position in the other direction, while it moves that way.
+    The train has changed ends, or an unknown leading end is determined, once the reference point is more than
+    `CHANGED_ENDS_M` and both bounds from the farthest position in the opposite direction, and the train moves away from
+    this position.
     """
 
     direction: int  #: 1 toward rising chainage, -1 toward falling, 0 where unknown.
@@ -146,11 +147,11 @@ class RunningEnd:
     last_m: float = math.inf  #: Last chainage; infinite before the first.
 
     def after(self, reference_m: float, bound_m: float, moving: int) -> RunningEnd:
-        """Return the direction after an epoch with a position and its bound; `moving` is the direction of its speed."""
+        """Return the state after an epoch, the same state without a bound; `moving` is the direction of motion."""
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # a gap, or one turn of a closed line
+        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # a gap, or one lap of a closed line
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction
         if moving > 0 and direction != 1 and reference_m - bound_m - low > CHANGED_ENDS_M:
@@ -162,7 +163,7 @@ class RunningEnd:
         return replace(self, direction=direction, low_m=low, high_m=high, last_m=reference_m)
 
     def sentence(self, before: RunningEnd) -> str | None:
-        """Return a sentence for the log if the direction has changed."""
+        """Return a sentence for the log if the direction has changed since the state `before`, otherwise None."""
         if self.direction == before.direction:
             return None
         side = "rising" if self.direction > 0 else "falling"

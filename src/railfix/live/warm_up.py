@@ -33,8 +33,8 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import TrackState
 
-#: Settings and numbers of epochs that together call every kernel except those of `_look_beyond`; the second has too few
-#: satellites for 3-D positions.
+#: Settings and numbers of epochs that together call every kernel except the kernels of `_look_beyond`; with the second
+#: settings there are too few satellites for 3-D positions.
 _SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -43,10 +43,10 @@ _WITH_FILTER: Final[tuple[dict[str, Any], int]] = ({"filter": "track", "protecti
 
 
 def prepare_kernels() -> bool:
-    """Compile the kernels without cached machine code, with a message on a terminal; return whether there were any.
+    """Compile the kernels that have no cached machine code; return whether any were compiled.
 
-    Epochs of the demonstration are processed in one call and one by one: kernels are compiled for the arrays of both
-    cases. InputFileError: neither the package nor the clone has the files of the demonstration.
+    Epochs of the demonstration are processed in one call and one by one, so that kernels are compiled for the arrays of
+    both cases. A message is written to a terminal. InputFileError: the files of the demonstration are missing.
     """
     if kernels.is_compiled():
         return False
@@ -71,7 +71,7 @@ def prepare_kernels() -> bool:
 
 
 def compile_filter() -> None:
-    """Compile the recursion of the filter along the track; it is kept on disk for other processes."""
+    """Compile the recursion of the filter along the track; the machine code is cached on disk for other processes."""
     nothing = np.full((1, 1), np.nan)
     epochs = GnssEpochs(
         time=np.array(["2024-01-01"], dtype="datetime64[ns]"), satellite=np.array(["G01"]),
@@ -110,7 +110,7 @@ def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations])
 
 
 def _look_beyond() -> None:
-    """Search for positions beyond a level: the line does not turn near these epochs."""
+    """Call the kernels for positions beyond a level; the demonstration does not, as its line is straight there."""
     nothing, clock = np.zeros((1, 1)), np.zeros(1, dtype=np.intp)
     model = ModelArrays(
         nothing, clock, np.zeros((1, 1, 1)), np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.zeros((3, 3)), nothing
@@ -122,7 +122,7 @@ def _look_beyond() -> None:
 
 
 def _first_epochs(log: Path, count: int) -> Observations:
-    """Read the first epochs of a compact RINEX 3 log: plain Python would need a long time for the whole file."""
+    """Read the first epochs of a compact RINEX 3 log; without compiled kernels the whole file would take long."""
     lines = hatanaka.decompress(log).decode("ascii").splitlines(keepends=True)
     begins = [number for number, line in enumerate(lines) if line.startswith(">")]
     with TemporaryDirectory() as folder:
