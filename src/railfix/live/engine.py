@@ -241,7 +241,7 @@ class LiveEngine:
             side = "before" if age_s > 0.0 else "after"
             allowed = f"up to {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
             self.reports.append(
-                f"state file: not used but for ephemerides and the sequence number: its last epoch is "
+                f"state file: only its ephemerides and sequence number are used: its last epoch is "
                 f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
         # Navigation files of this session are merged with the data of the state file.
