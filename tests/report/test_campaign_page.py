@@ -39,7 +39,7 @@ def test_errors_of_the_runs_and_the_worst_epoch(tmp_path: Path) -> None:
     runs, failed, worst = found.tables
     rows = {row[0]: dict(zip(runs.head, row, strict=True)) for row in runs.rows}
     assert [rows["A"][head] for head in ("error p50 m", "error p95 m", "largest m")] == ["1.00", "1.00", "1.00"]
-    assert [rows["B"][head] for head in ("error p50 m", "largest m", "over the level")] == ["2.00", "70.00", "1"]
+    assert [rows["B"][head] for head in ("error p50 m", "largest m", "errors over level")] == ["2.00", "70.00", "1"]
     assert [rows["B"][head] for head in ("level p50 m", "level p95 m", "rate %", "ok %")] == [
         "15.00", "20.00", "100.00", "90.00",
     ]  # fmt: skip
@@ -48,10 +48,10 @@ def test_errors_of_the_runs_and_the_worst_epoch(tmp_path: Path) -> None:
     first = dict(zip(worst.head, worst.rows[0], strict=True))
     assert (first["run"], first["error m"], first["level m"]) == ("B", "+70.00", "20.00")
     assert first["time, GPS"] == "2024-03-05 01:02:30.000"
-    assert "--at '2024-03-05 01:02:30' --antenna front" in first["to explain it"]
+    assert "--at '2024-03-05 01:02:30' --antenna front" in first["command to explain"]
     assert [chart.name for chart in found.charts] == ["campaign-plan", "campaign-error", "campaign-level"]
     assert any(layer.label == "error 10 m and more" and len(layer.x) == 1 for layer in found.charts[0].layers)
-    assert "the worst run is B: 95 % within 2.00 m, largest 70.00 m" in found.sentences
+    assert "the worst run is B, with 95 % within 2.00 m and a largest value of 70.00 m" in found.sentences
     assert len(found.sentences) <= 5
 
     page = write_campaign_page(found, tmp_path / "campaign.html", title="three <runs>")

@@ -98,7 +98,7 @@ def test_the_command_prints_and_writes_the_epoch(results: Path, tmp_path: Path) 
         "filter: chainage",
         "filter's level:",
         "single epoch's level:",
-        "most weight: without",
+        "largest effect: without",
         "elevation_mask",
     ):
         assert words in done.output

@@ -327,8 +327,8 @@ def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) ->
     row = table.filter(pl.col("antenna") == "front", pl.col("conventional_chainage_m").is_not_null())["row"][50]
     moved = pl.when(pl.col("row") == row).then(pl.col("chainage_m") + 99.0).otherwise(pl.col("chainage_m"))
     for status, sentence in (
-        ("ok", "The largest error on the map exceeds the conventional one: "),
-        ("inconsistent", "further positions failed a check and have its status ("),
+        ("ok", ", exceeds the largest error of conventional positions, "),
+        ("inconsistent", "further positions failed a check (status: "),
     ):
         marked = pl.when(pl.col("row") == row).then(pl.lit(status)).otherwise(pl.col("status").cast(pl.String))
         table.with_columns(chainage_m=moved, status=marked).drop("row").write_parquet(mine / "positions.parquet")

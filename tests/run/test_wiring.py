@@ -318,9 +318,9 @@ def test_assumptions_of_the_level_have_each_its_own_figure() -> None:
     assert shown["risk per hour"] == "1e-07"
     assert shown["independent samples per hour"] == "360"
     assert shown["risk per sample"] == "2.5e-10"
-    assert shown["K of the whole risk"].startswith("6.25 ")
+    assert shown["K factor of the whole risk"].startswith("6.25 ")
     assert [shown[f"prior of a {name}"] for name in ("local fault", "wrong map")] == ["1e-05", "3e-05"]
-    assert shown["prior of one side of the track"] == "2e-05"
+    assert shown["prior of faults on one side of the track"] == "2e-05"
     assert shown["prior of a satellite fault"] == "5e-05 (G); 6e-05 (E)"
 
 

@@ -1,4 +1,4 @@
-"""Report on runs: one HTML page with its tables and charts, readable without a network."""
+"""Reports on runs: HTML pages with tables and charts that open without a network connection."""
 
 import lazy_loader
 

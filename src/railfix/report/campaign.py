@@ -1,4 +1,4 @@
-"""All runs of a campaign on one page: lines, errors and levels by run, and the worst epochs with their explanations."""
+"""Report on all runs of a campaign: lines, errors and protection levels by run, and explained worst epochs."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 
-#: Number of listed epochs; minimum time between two of a run [s]; number of pieces of the line in which each run is
-#: drawn.
+#: Maximum number of listed epochs, time interval from which at most one epoch of a run is listed [s], and number of
+#: pieces of the line in which each run is drawn.
 _WORST: Final = 10
 _EVENT_S: Final = 60
 _PIECES: Final = 400
-#: Number of runs in the charts by run, those with the largest values; the table has all runs.
+#: Maximum number of runs in the charts by run, which show the runs with the largest values; the table has all runs.
 _BARS: Final = 40
 #: Quantities by which the worst epochs are selected, in order of preference.
 _QUANTITIES: Final = ("error_m", "protection_level_m", "along_sigma_m")
@@ -42,22 +42,27 @@ _FIGURES: Final[Sequence[Column]] = (
     ("error p50 m", "error_m_p50", number),
     ("error p95 m", "error_m_p95", number),
     ("largest m", "error_m_max", number),
-    ("over the level", "over_level", count),
+    ("errors over level", "over_level", count),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignReport:
-    """Results of a campaign."""
+    """Content of the page on a campaign."""
 
-    sentences: tuple[str, ...]  #: At most five sentences: number of runs, accuracy, the worst, failures.
-    tables: tuple[Table, ...]  #: Tables of the runs, of failed runs, of the worst epochs.
+    sentences: tuple[str, ...]  #: At most five sentences on the number of runs, failures, accuracy and the worst run.
+    tables: tuple[
+        Table, ...
+    ]  #: Tables of all runs, failed runs (if any) and the worst epochs (if there are positions).
     charts: tuple[Chart, ...]
     notes: tuple[str, ...]  #: Notes on runs that could not be compared with their reference.
 
 
 def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
-    """Summarise the runs of a campaign (`run_campaign`), and explain their worst epochs."""
+    """Summarise the runs of a campaign and write the explanations of the worst epochs into ``out / "explain"``.
+
+    `runs` is the table of `run_campaign`, `out` the folder of the campaign.
+    """
     fields = runs.columns[: runs.columns.index("status")]
     rows, epochs, notes = [], [], []
     for row in runs.iter_rows(named=True):
@@ -75,7 +80,10 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
     quantity = next((name for name in _QUANTITIES if len(done) and done[f"{name}_p95"].is_not_null().any()), "")
     named: list[Column] = [(field, field, str) for field in fields]
     columns: list[Column] = [*named, ("status", "status", str), *_FIGURES]
-    caption = "Runs; rate and ok: single epochs with observations; the rest: the filter along the track where it is on"
+    caption = (
+        "Runs. Rate and ok refer to single epochs with observations; sigma, level and error refer to the filter along "
+        "the track, or to single epochs if the filter was off"
+    )
     tables = [listing("runs", whole, columns, caption)]
     if len(failed := whole.filter(status="failed")):
         tables.append(listing("failed", failed, [*named, ("error", "error", str)], f"Failed runs: {len(failed):,}"))
@@ -90,7 +98,7 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
 
 
 def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Path:
-    """Write a campaign as one HTML page that opens without a network; return its path."""
+    """Write the report on a campaign as one HTML page that opens without a network connection; return its path."""
     runs, *rest = report.tables
     # failed runs come first
     blocks: list[Block] = [*rest, runs, *([Notes("Notes", report.notes)] if report.notes else [])]
@@ -100,7 +108,10 @@ def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Pa
 
 
 def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Return the rows of the filter, or of single epochs without one, with their errors where there is a reference."""
+    """Return the positions of the filter, or of single epochs if it was off, with errors if there is a reference.
+
+    The second value has a note if the reference cannot be used.
+    """
     name = next((table for table in list_position_tables(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)
     table = read_table(folder, name, columns=cs.by_name("protection_level_m", require_all=False))[1]
     table = table.with_columns(pl.col("antenna", "status").cast(pl.String))
@@ -116,7 +127,7 @@ def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[st
 
 
 def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
-    """Return the percentiles of the size of each quantity, and the number of errors above their level."""
+    """Return percentiles of the absolute value of each quantity, and the number of errors above their level."""
     found: dict[str, float | int | None] = {}
     for name in _QUANTITIES:
         size = np.abs(floats(table, name)) if name in table.columns else np.empty(0)
@@ -129,9 +140,7 @@ def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
 
 
 def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the epoch with the largest error (without errors, level or sigma) of each piece of the line and
-    antenna.
-    """
+    """Return the worst epoch of each antenna in each piece of the line, by the first known of `_QUANTITIES`."""
     quantity = next(name for name in _QUANTITIES if name in table.columns and table[name].is_not_null().any())
     placed = table.filter(pl.col("chainage_m").is_not_null(), pl.col(quantity).is_not_null())
     length = float(np.ptp(placed["chainage_m"].to_numpy())) if len(placed) else 0.0
@@ -143,7 +152,10 @@ def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
 
 
 def _worst(pieces: pl.DataFrame, quantity: str, out: Path) -> Table:
-    """Return the worst epochs, apart in time, with links to their explanations."""
+    """Return a table of the worst epochs, with links to their explanations, which are written to files.
+
+    An epoch of a run without observations has no explanation.
+    """
     ranked = pieces.filter(pl.col(quantity).is_finite()).sort(pl.col(quantity).abs(), descending=True)
     event = pl.col("time_gpst").dt.truncate(f"{_EVENT_S}s").alias("event")
     worst = ranked.unique(["run", event], keep="first", maintain_order=True).head(_WORST)
@@ -167,11 +179,11 @@ def _worst(pieces: pl.DataFrame, quantity: str, out: Path) -> Table:
     columns: list[Column] = [
         ("run", "run", str), ("antenna", "antenna", str), ("time, GPS", "time_gpst", str), ("status", "status", str),
         ("chainage m", "chainage_m", count), ("error m", "error_m", signed), ("sigma m", "along_sigma_m", number),
-        ("level m", "protection_level_m", number), ("to explain it", "command", str),
+        ("level m", "protection_level_m", number), ("command to explain", "command", str),
     ]  # fmt: skip
-    caption = f"Worst epochs, at most one of a run in {_EVENT_S} s"
+    caption = f"Worst epochs, at most one per run in {_EVENT_S} s"
     if not all(links):
-        caption += '; those of runs with observations (options: observations = "write") link to their explanation'
+        caption += '; epochs of runs with observations (option observations = "write") link to an explanation'
     table = listing("worst", shown, columns, caption)
     return replace(table, links=links, code=[len(columns) - 1])
 
@@ -191,7 +203,7 @@ def _charts(done: pl.DataFrame, pieces: pl.DataFrame, quantity: str) -> list[Cha
 def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[str]:
     failed = len(whole) - len(done)
     lines = [
-        f"{len(done):,} of {plural(whole, 'run')} done, {int(done['epochs'].sum() or 0):,} epochs of their antennas"
+        f"{len(done):,} of {plural(whole, 'run')} done, with {int(done['epochs'].sum() or 0):,} epochs of all antennas"
     ]
     if failed:
         lines.append(f"{plural(failed, 'run')} failed; the first: {whole.filter(status='failed')['error'][0]}")
@@ -201,10 +213,12 @@ def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[s
         wide, largest = (number(worst[f"{quantity}_{end}"], unit=" m") for end in ("p95", "max"))
         half = number(done[f"{quantity}_p95"].median(), unit=" m")  # type: ignore[arg-type]
         lines.append(f"the {word} of 95 % of the epochs is within {half} in half of the runs")
-        lines.append(f"the worst run is {worst['run']}: 95 % within {wide}, largest {largest}")
+        lines.append(f"the worst run is {worst['run']}, with 95 % within {wide} and a largest value of {largest}")
     if quantity == "error_m":
         over = int(done["over_level"].sum())
-        lines.append(f"{over:,} errors are over their level" if over else "no error is over its level")
+        lines.append(
+            f"{over:,} errors exceed their protection level" if over else "no error exceeds its protection level"
+        )
     elif quantity:
-        lines.append("no reference was given: `reference` in the campaign file gives the errors")
+        lines.append("no reference was given; with `reference` in the campaign file, errors are computed too")
     return lines

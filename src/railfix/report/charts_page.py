@@ -1,4 +1,4 @@
-"""Pages of charts and tables: templates, charts as plain values, the page of a network of tracks."""
+"""HTML pages of charts and tables: templates, conversion of charts to JSON, and the page of a network of tracks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from railfix.track.network_read import NetworkQuality
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-#: Unsigned 16-bit number of an unknown value.
+#: Unsigned 16-bit number that encodes an unknown value.
 _UNKNOWN: Final = 65535
 _OF_CHART: Final = (
     "title", "x_label", "y_label", "x_scale", "y_scale", "y_linear", "x_range", "y_range", "equal",
@@ -44,7 +44,7 @@ _OF_CHART: Final = (
 
 
 def script_json(value: Any) -> str:
-    """Return JSON text of plain values that is safe inside a script element; ValueError for NaN outside an array."""
+    """Return plain values as JSON text that is safe in a script element; ValueError if they contain NaN or infinity."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for mark, code in (("<", "\\u003c"), (">", "\\u003e"), ("\u2028", "\\u2028"), ("\u2029", "\\u2029")):
         text = text.replace(mark, code)
@@ -52,15 +52,16 @@ def script_json(value: Any) -> str:
 
 
 def pack_array(values: NDArray[Any], kind: str = "f") -> str:
-    """Return an array as base 64, little endian, after the letter of its type: 32-bit float, unsigned of 16 or 32
-    bits.
+    """Return the letter of a type, followed by an array of this type in base 64, little endian.
+
+    The types are 32-bit float (f) and unsigned integers of 16 (h) and 32 (i) bits.
     """
     dtype = {"f": "<f4", "h": "<u2", "i": "<u4"}[kind]
     return kind + base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode("ascii")
 
 
 def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
-    """Return a chart as plain values; `epochs_from`: origin of ``epoch_s`` of its points, if not `Chart.start`."""
+    """Return a chart as plain values; `epochs_from` is the origin of ``epoch_s`` of its points."""
     values: dict[str, Any] = {name: getattr(chart, name) for name in _OF_CHART}
     values |= {"axis": chart.common_axis, "layers": [_layer(layer) for layer in chart.layers]}
     if chart.start is not None:
@@ -71,12 +72,12 @@ def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict
 
 
 def since_1970(time: np.datetime64) -> float:
-    """Return a time as seconds, to the microsecond."""
+    """Return a time in seconds since 1970-01-01, rounded to microseconds."""
     return round(float(seconds(time - _EPOCH_ZERO)), 6)
 
 
 def _layer(layer: Layer) -> dict[str, Any]:
-    """Return a layer as plain values by the names of its fields."""
+    """Return a layer as plain values by the names of its fields; fields that are None are omitted."""
     values: dict[str, Any] = {"label": layer.label, "colour": layer.colour, "kind": layer.kind}
     if isinstance(layer, Cells):
         return values | _cells(layer)
@@ -88,7 +89,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 
 def _cells(layer: Cells) -> dict[str, Any]:
-    """Return cells that are not empty; all have equal widths."""
+    """Return the cells that are not empty as plain values; all cells must have the same size."""
     column, row = np.nonzero(layer.counts)
     return {
         "x0": float(layer.x_edges[0]),
@@ -105,7 +106,7 @@ def _cells(layer: Cells) -> dict[str, Any]:
 
 
 def sky_values(sky: SkyEpochs) -> dict[str, Any]:
-    """Return satellites in view as plain values, with angles and C/N0 in hundredths."""
+    """Return satellites in view as plain values, with angles in 0.01 deg and C/N0 in 0.01 dB-Hz."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
         "epoch": pack_array(sky.epoch_s),
@@ -126,13 +127,16 @@ def sky_values(sky: SkyEpochs) -> dict[str, Any]:
     return values
 
 
-#: Depth of the coordinates above a line of points, by type of geometry.
+#: Number of levels of nested lists above a list of points, by type of geometry (RFC 7946).
 _DEPTH: Final = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
 _IGNORED: Final = ("Point", "MultiPoint")
 
 
 def read_background(path: Path) -> tuple[Floats, ...]:
-    """Read lines and outlines of a GeoJSON file, each (P, 2) [deg]; InputFileError where it has none."""
+    """Read the lines and outlines of a GeoJSON file, each as longitude and latitude of shape (P, 2) [deg].
+
+    InputFileError: the file is not GeoJSON, or has neither lines nor polygons.
+    """
     node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
     if not lines:
@@ -141,7 +145,7 @@ def read_background(path: Path) -> tuple[Floats, ...]:
 
 
 def _lines(path: Path, node: Any) -> Iterator[Floats]:
-    """Yield every line below a GeoJSON object."""
+    """Yield the coordinates of every line in a GeoJSON object and the objects in it."""
     kind = node.get("type") if isinstance(node, dict) else None
     if kind == "FeatureCollection":
         for feature in node.get("features") or ():
@@ -172,13 +176,13 @@ def _coordinates(path: Path, value: Any, depth: int) -> Iterator[Floats]:
     yield line
 
 
-#: Content security policy of the page: it loads nothing.
+#: Content security policy of the pages, which load no other files.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True)
 class Text:
-    """Text of a kind: "sentence", "absent" (the reason for a missing part) or "command"."""
+    """Paragraph of a page; `kind` is "sentence", "absent" (the reason for a missing part) or "command"."""
 
     kind: str
     text: str
@@ -200,7 +204,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Folded:
-    """Folded part of the page."""
+    """Part of a page that is folded under its title."""
 
     kind: ClassVar[str] = "folded"
     title: str
@@ -212,15 +216,15 @@ Block = Table | Text | Notes | Folded
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """Chart or sky plot in the page."""
+    """Chart or sky plot in a page."""
 
-    number: int
+    number: int  #: Number of the figure in the page, from 0.
     chart: Chart | SkyEpochs
-    json: Markup
-    width: str
-    sky: str  #: Id of the sky plot that shows the epoch of a click; empty without one.
-    zoomed_with: str  #: Charts with the same word share the range of their x axis.
-    linked: str  #: Charts with the same word show the same epochs.
+    json: Markup  #: Values of the chart for the script of the page.
+    width: str  #: Style class of the width: "wide" or "half".
+    sky: str  #: Element id of the sky plot in which a click shows its epoch; "" if there is no sky plot.
+    zoomed_with: str  #: Figures with the same text share the range of their x axis; "" for none.
+    linked: str  #: Figures with the same text show the same epochs; "" for none.
 
     @property
     def is_sky(self) -> bool:
@@ -230,7 +234,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class PagePart:
-    """Figures under a heading."""
+    """Figures under a heading; `absent` has the reasons for missing figures."""
 
     title: str
     figures: Sequence[Figure]
@@ -238,7 +242,7 @@ class PagePart:
 
 
 def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block], *, lead: Sequence[Block] = ()) -> str:
-    """Return the HTML of a page of sentences, charts, and tables under them."""
+    """Return the HTML of a page with the blocks `lead`, followed by the charts and the tables."""
     numbers = count()
     figures = PagePart(title="", figures=[figure(chart, numbers) for chart in charts])
     return render("charts.html.j2", title, charts=figures, tables=tables, lead=lead)
@@ -254,7 +258,7 @@ def read_template(name: str) -> Template:
 
 
 def render(template: str, title: str, **content: Any) -> str:
-    """Return the HTML of a page of this package, with its style and scripts."""
+    """Return the HTML of a page from a template of this package, with style sheet and scripts."""
     return read_template(template).render(
         title=title,
         created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -282,7 +286,7 @@ def _resource(name: str) -> Markup:
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Charts under one heading, and reasons for missing ones; `start` is the origin of `Points.epoch_s`."""
+    """Charts under one heading; `absent` has reasons for missing charts, `start` is the origin of `Points.epoch_s`."""
 
     title: str
     charts: tuple[Chart | SkyEpochs, ...]
@@ -300,7 +304,12 @@ def figure(
     linked: str = "",
     width: str = "",
 ) -> Figure:
-    """Return a chart with its values, linked with the sky plot and the charts of an axis that belong to it."""
+    """Return the figure of a chart with its values for the script of the page.
+
+    `numbers` gives the number of the figure, `group` the origin of the epochs of its points. Clicks on points with
+    epochs are shown in the sky plot `sky`. `anchor` is a prefix for the name of a shared x axis; `linked` is as for
+    `Figure`.
+    """
     values: dict[str, Any]
     if isinstance(chart, SkyEpochs):
         values, chosen_in, axis, width = sky_values(chart), sky, "", "wide"
@@ -317,14 +326,17 @@ def figure(
     )  # fmt: skip
 
 
-#: Largest number of listed tracks.
+#: Maximum number of listed tracks and findings.
 _LISTED: Final = 5_000
 
 
 def write_network_page(
     network: Network, quality: NetworkQuality, out: Path, *, run: tuple[PlanLog, Matched] | None = None
 ) -> None:
-    """Write a page on a network, with the positions of a run in its frame; it opens without an internet connection."""
+    """Write the HTML page of a network with the findings of its check, and the matched positions of a run if given.
+
+    The positions are in the frame of the network. OutputError: the file cannot be written.
+    """
     title = f"{quality.tracks:,} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches:,} switches"
     write_whole(
         out, charts_page(title, [network_plan(network, quality, run)], _tables(network, quality, run)), what="page"
@@ -337,8 +349,8 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
     dead_ends = sum(f.kind == "dead end" for f in quality.findings)
     blocks: list[Block] = [
         Sentence(
-            f"{quality.ends:,} ends without a connection, {plural(quality.parts, 'separate part')}, "
-            f"{len(quality.findings):,} findings, {dead_ends:,} of them dead ends."
+            f"{quality.ends:,} ends have no connection; the network has {plural(quality.parts, 'separate part')} and "
+            f"{len(quality.findings):,} findings, including {dead_ends:,} dead ends."
         )
     ]
     if run is not None:
@@ -347,9 +359,9 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
         np.add.at(seen, matched.track[on], 1)
         blocks.append(
             Sentence(
-                f"{len(on):,} positions, {share(float(on.mean()), 1)} on a track, "
-                f"{share(float((np.abs(matched.offset_m) <= 5.0).mean()), 1)} within 5 m of it, "
-                f"{share(float((matched.probability < 0.9).mean()), 1)} with a probability below 0.9."
+                f"{len(on):,} positions were matched: {share(float(on.mean()), 1)} are on a track, "
+                f"{share(float((np.abs(matched.offset_m) <= 5.0).mean()), 1)} are within 5 m of their track, and "
+                f"{share(float((matched.probability < 0.9).mean()), 1)} have a track probability below 0.9."
             )
         )
     if network.notes:
@@ -360,11 +372,11 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
         blocks.append(
             Table(
                 name="findings",
-                # a click moves the plan to the finding
+                # a click on the link moves the plan to the finding
                 links=[f"#plan:{east:.1f},{north:.1f}" for east, north in plane],
                 head=("kind", "latitude", "longitude", "finding"),
                 rows=[(f.kind, f"{f.latitude_deg:.6f}", f"{f.longitude_deg:.6f}", f.sentence) for f in listed],
-                caption=f"Findings: {len(quality.findings):,}, {dead_ends:,} of them dead ends",
+                caption=f"Findings: {len(quality.findings):,}, including {dead_ends:,} dead ends",
                 numeric=(1, 2),
             )
         )
@@ -383,7 +395,7 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
                 for k, name in enumerate(network.names[:_LISTED])
             ],
             caption=f"Tracks: {len(network.tracks):,}"
-            + (f", the first {_LISTED:,} of them" if len(network.tracks) > _LISTED else ""),
+            + (f"; the first {_LISTED:,} are listed" if len(network.tracks) > _LISTED else ""),
             numeric=(1, 4),
         )
     )

@@ -1,9 +1,8 @@
-"""Explanation of one epoch of a run: its position, the outcome of each satellite, the causes of sigma and level, and
-the effect of each satellite.
+"""Explanation of one epoch of a run: position, outcome of each satellite, contributions to sigma and protection level.
 
-Everything is read from the tables of the run. The position without a satellite is computed from the residuals by
-weighted least squares along, across and above the line, with the map's error as a prior and one free clock per
-constellation, linearised at the position (P1 2.2(3)).
+Everything is read from the tables of the run. The effect of a satellite is the change of the single-epoch position if
+the satellite is omitted. It is computed from the residuals by weighted least squares along, across and above the line,
+linearised at the position, with the map error as a prior and one free clock per clock group (P1 2.2(3)).
 """
 
 from __future__ import annotations
@@ -27,39 +26,40 @@ from railfix.evaluate.evaluation_inputs import RunFolder, read_run
 from railfix.report.charts_page import page_style, read_template
 from railfix.track import Trajectory, read_track
 
-#: Meanings of the statuses of a single epoch.
+#: Explanation of each status of a single epoch.
 SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
     "off_map": "beyond an end of the map, or too far from the position without the map",
-    "map_end": "at an end of the map: by the ranges the position is slightly beyond it",
+    "map_end": "moved to an end of the map; by the ranges it is slightly beyond that end",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
     "no_observation": "no position: the antenna has no observation",
     "inconsistent": "the ranges are inconsistent, and no exclusion resolves it",
-    "antennas_disagree": "the positions of the two antennas are not as far apart as the antennas are",
-    "uncertain": "its standard deviation is over the limit",
+    "antennas_disagree": "its distance from the other antenna's position disagrees with the antenna spacing",
+    "uncertain": "its standard deviation exceeds the limit",
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
     "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
     "spoofing_suspected": "the signals may be those of a spoofer (column interference_causes)",
 }
-#: Meanings of the statuses of the filter.
+#: Explanation of each status of the filter.
 FILTER_STATUS: Final[Mapping[str, str]] = {
     "tracking": "one position, from measurements of this epoch",
     "several_branches": "several positions are possible; the most probable one is given",
     "coasting": "predicted: no measurement of this epoch was accepted",
     "lost": "measurements contradict the track: positions are searched for again",
-    "expired": "no position: dead reckoning for too long",
+    "expired": "no position: dead reckoning has lasted too long",
     "not_started": "no position yet: no epoch so far had redundant codes",
-    "off_map": "no position: the satellites have put the train away from the line for some time",
-    "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
+    "off_map": "no position: the satellite positions have been off the line for some time",
+    "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
+    "another track",
     "antennas_disagree": "its distance from the other antenna's position disagrees with the antenna spacing",
     "doubtful": "measurements contradict the position or its bound: its error is not bounded",
     "spoofing_suspected": "the signals may be those of a spoofer: its error is not bounded",
 }
-#: Columns of `Explanation.satellites` that are computed here.
+#: Columns of `Explanation.satellites` with the effect of omitting the satellite.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")
 _COLUMNS: Final = (
     "satellite", "signal", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "residual_m", "reason_text",
@@ -67,7 +67,7 @@ _COLUMNS: Final = (
 )  # fmt: skip
 
 
-#: Number of epochs shown before and after the explained one, and their columns in ``positions`` and ``train``.
+#: Number of epochs shown before and after the explained epoch, and their columns in ``positions`` and ``train``.
 _AROUND: Final = 5
 _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "status")
 
@@ -76,23 +76,28 @@ _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "stat
 class Explanation:
     """Explanation of one epoch of one antenna."""
 
-    run: Path
+    run: Path  #: Results folder.
     antenna: str
     time: np.datetime64  #: GPS time of the epoch.
-    asked: str  #: The requested time.
-    #: Rows of ``positions`` and ``train``; `track` is empty if the filter was off.
+    asked: str  #: Requested time as given.
+    #: Rows of the epoch in ``positions`` and ``train``; `track` is empty if the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
-    #: Every observation, used ones first, with elevation, residual, outcome, and its weight and innovation in the
-    #: filter. For used observations also the shift of the single-epoch position along the line without it, and the
-    #: standard deviation without it [m]; null if there would be no position.
+    #: One row per observation, used observations first, with elevation, residual, outcome, and weight and innovation in
+    #: the filter. Columns `WITHOUT` of a used observation have the shift of the single-epoch position along the line
+    #: and its standard deviation if the observation is omitted [m]; null if there would be no position.
     satellites: pl.DataFrame
-    sentences: tuple[str, ...]  #: Sentences on position, sigma, level and status.
-    neighbours: pl.DataFrame  #: Rows of ``positions`` and ``train`` of the epochs around it: `_NEIGHBOURS`.
+    sentences: tuple[str, ...]  #: Sentences on position, sigma, protection level and status.
+    #: Columns `_NEIGHBOURS` of ``positions`` and ``train`` (prefix ``filter_``) at the epochs before and after.
+    neighbours: pl.DataFrame
 
 
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
-    """Explain the epoch of one antenna nearest to a GPS time, ``hh:mm:ss`` of the first day or with the date."""
+    """Explain the epoch of one antenna that is nearest to the GPS time `at`, ``hh:mm:ss`` or with a date before it.
+
+    The default antenna is the first. A time without a date may be on any day of the run. InputFileError: the run wrote
+    no observations. SettingsError: the antenna or the time is invalid. MismatchError: no epoch is within a minute.
+    """
     folder = read_run(run)
     if not (run / "observations.parquet").is_file():
         raise InputFileError(run / "observations.parquet", "there is no such file; repeat the run with --observations")
@@ -130,7 +135,7 @@ def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanat
 
 
 def _nearest(times: Any, at: str) -> int:
-    """Return the row nearest to the requested time."""
+    """Return the index of the time nearest to the requested time; raises the errors of `explain_epoch`."""
     text = at.strip()
     days = np.unique(times.astype("datetime64[D]")) if ":" in text and "-" not in text else [None]
     try:
@@ -147,7 +152,7 @@ def _nearest(times: Any, at: str) -> int:
 
 
 def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
-    """Return the unit vectors along, across and above the line at the position, in ECEF, from the nearest section."""
+    """Return the ECEF unit vectors along, across and above the nearest section of the line as rows, shape (3, 3)."""
     line = Trajectory.from_antenna_path(read_track(folder.tracks))
     arc, _ = line.nearest(np.array([[single[name] for name in ("x_m", "y_m", "z_m")]]))
     along, across, _ = line.get_axes(line.segment_at(arc)[0])[0]
@@ -155,7 +160,7 @@ def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
 
 
 def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
-    """Return the standard deviations of the map across and above the line."""
+    """Return the standard deviations of the map across and above the line [m], from the settings or the map."""
     settings, facts = folder.record.get("settings_used") or {}, folder.track_facts
     return tuple(  # type: ignore[return-value]
         float(settings.get(f"map_{name}_sigma_m") or facts[f"sigma_{name}_m"]) for name in ("plan", "height")
@@ -165,7 +170,10 @@ def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
 def _without_each(
     satellites: pl.DataFrame, single: Mapping[str, Any], axes: Floats, map_sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Return the shift of the position along the line without each used satellite, and its sigma without it."""
+    """Return shift and sigma of the position along the line [m] if a satellite is omitted, for each row.
+
+    The values are NaN for unused satellites, and where the others do not determine the position.
+    """
     used = (satellites["reason_text"] == "used").to_numpy() & satellites["residual_m"].is_not_null().to_numpy()
     elevation, azimuth = (np.radians(satellites[name].to_numpy()) for name in ("elevation_deg", "azimuth_deg"))
     local = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
@@ -186,7 +194,7 @@ def _without_each(
 def _solve(
     design: Floats, sigma_m: Floats, residual_m: Floats, clocks: Strings, map_sigma_m: tuple[float, float]
 ) -> tuple[float, float] | None:
-    """Return the step along the line and its sigma; None if the ranges do not determine it."""
+    """Return the least-squares step along the line and its sigma [m]; None if the ranges do not determine it."""
     groups = np.unique(clocks)
     if len(residual_m) < len(groups) + 1:
         return None
@@ -200,7 +208,7 @@ def _solve(
 
 
 def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: pl.DataFrame) -> list[str]:
-    """Return lines on position, sigma, level and status."""
+    """Return sentences on position, sigma, protection level, status and satellites."""
     lines = []
     if track:
         text = f"filter: {_place(track)}; {track['status']}: {FILTER_STATUS.get(track['status'], 'see the reference')}"
@@ -232,7 +240,9 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
     if len(weighty):
         name, shift, sigma = (weighty[column][0] for column in ("satellite", *WITHOUT))
         moved = number(shift, 2, " m", sign="+")
-        lines.append(f"most weight: without {name} the single position moves by {moved}, sigma {sigma:.2f} m")
+        lines.append(
+            f"largest effect: without {name} the single-epoch position moves by {moved}, with sigma {sigma:.2f} m"
+        )
     return lines
 
 
@@ -265,11 +275,11 @@ def _level_of_single(single: Mapping[str, Any]) -> str:
         for name in ("fault_free", "one_fault", "two_faults")
         if single[f"protection_{name}_m"] is not None
     )
-    return f"{level:.1f} m, set by {cause.replace('_', ' ')} (by themselves: {parts})"
+    return f"{level:.1f} m, set by {cause.replace('_', ' ')} (each part alone: {parts})"
 
 
 def write_explanation(explanation: Explanation, path: Path) -> Path:
-    """Write an explanation as one HTML page with the sky of the epoch; return its path."""
+    """Write an explanation as one HTML page with a sky plot; return its path. OutputError: it cannot be written."""
     sky = []
     for row in explanation.satellites.drop_nulls(("elevation_deg", "azimuth_deg")).iter_rows(named=True):
         radius, azimuth = max(90.0 - row["elevation_deg"], 0.0), np.radians(row["azimuth_deg"])
@@ -283,5 +293,5 @@ def write_explanation(explanation: Explanation, path: Path) -> Path:
 
 
 def time_text(time: np.datetime64) -> str:
-    """Return a time as text, to milliseconds."""
+    """Return a time as text to the millisecond, with a space between date and time of day."""
     return str(time)[:23].replace("T", " ")

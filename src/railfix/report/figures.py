@@ -1,4 +1,4 @@
-"""Charts of a run in the order of the page, and the reasons for missing ones."""
+"""Charts and tables of protection levels of a run in the order of the page, and reasons for missing charts."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from railfix.report.plots.screens import list_screens, missing_columns, screen_o
 from railfix.report.plots.signals import CN0_COLUMNS, SKY_COLUMNS, SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.report.runs import ReportedRun
 
-#: Largest number of listed epochs with an error above the level.
+#: Maximum number of listed epochs with an error above the protection level.
 WORST: Final = 20
 NO_LEVELS: Final = "The run has no protection levels (protection is off)."
 _KINDS: Final = {
@@ -41,8 +41,8 @@ _KINDS: Final = {
     "separation": "solution separation; hypotheses of satellite and local faults",
 }
 _EXPLAINED: Final = (
-    "Usable levels: status ok and no alarm; every other position counts as having an infinite level. Every finite "
-    "level is counted, whatever its status"
+    "In rows of usable levels, a position with another status than ok or with an alarm counts as having an infinite "
+    "level. In rows of all levels, every finite level is counted, whatever the status"
 )
 
 
@@ -66,24 +66,24 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
     sigmas = f"error model {model}" if model is not None else str(stated.get("sigmas", "not recorded"))
     rows = [
         ("kind", f"{kind}: {_KINDS.get(kind, 'not recorded')}"),
-        ("standing", prior_basis_text(stated)),
-        ("errors without a fault", sigmas),
+        ("basis of the priors", prior_basis_text(stated)),
+        ("fault-free errors", sigmas),
         ("alarm limit", _value(stated.get("alarm_limit_m"), " m")),
         ("risk per hour", _value(stated.get("risk_per_hour"))),
         ("independent samples per hour", _value(stated.get("samples_per_hour"))),
         ("risk per sample", _value(stated.get("risk_per_sample"))),
-        ("K of the whole risk", _value(stated.get("k_of_whole_risk"), " sigma, two-sided")),
+        ("K factor of the whole risk", _value(stated.get("k_of_whole_risk"), " sigma, two-sided")),
         ("prior of a satellite fault", _priors(stated.get("satellite_prior"))),
         ("prior of a local fault", _value(stated.get("local_prior"))),
-        ("prior of one side of the track", _value(stated.get("side_prior"))),
+        ("prior of faults on one side of the track", _value(stated.get("side_prior"))),
         ("prior of a wrong map", _value(stated.get("map_prior"))),
-        ("false alarms", _value(stated.get("false_alarm"))),
+        ("probability of a false alarm", _value(stated.get("false_alarm"))),
     ]
     return Table(name="assumptions", head=["", "assumption of the protection level"], rows=rows)
 
 
 def _priors(priors: Any) -> str:
-    """Return priors by constellation, equal ones merged."""
+    """Return a text of priors with the constellations to which each value applies."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}
@@ -97,15 +97,16 @@ def _value(value: Any, unit: str = "") -> str:
 
 
 def _availability(run: ReportedRun) -> Table:
-    """Return the percentiles and availability of the levels of a run without a reference."""
+    """Return a table of percentiles and availability of the protection levels of a run without a reference."""
     options = EvaluationOptions()
     limits = sorted({*options.alarm_limits_m, run.folder.alarm_limit_m or run.config.alarm_limit_m})
     return Table(
         name="availability",
         head=["antenna", "levels", "limit, m", "epochs", "finite", "p50", "p95", "available", "15 s", "60 s"],
         rows=list(_rows_available(run, limits, options)),
-        caption=f"Fraction of all epochs that are available, and of windows beginning at an available epoch that stay "
-        f"available. {_EXPLAINED} Levels in metres; without a reference they are not compared with errors",
+        caption=f"Fraction of all epochs that are available, and of the windows of 15 s and 60 s beginning at an "
+        f"available epoch that stay available. {_EXPLAINED}. Levels are in metres; without a reference they are not "
+        "compared with errors",
         numeric=range(2, 10),
     )
 
@@ -131,21 +132,24 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
                 ]
 
 
-#: Number of epochs with the largest errors in the sky plot.
+#: Number of epochs with the largest errors, of each kind of position, that the sky plot includes.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
     "No reference was given (--reference), so there are no errors, figures of merit and Stanford diagrams; intervals "
-    "are those between the positions."
+    "are computed between positions."
 )
 NO_OBSERVATIONS: Final = (
     "The run wrote no observations (railfix run --observations), so there are no charts of the sky, of C/N0 and of "
     "the screens."
 )
-NO_TIMES: Final = "run.json has no processing times, so there is no chart of them."
+NO_TIMES: Final = "run.json has no processing times, so there is no chart of processing times."
 
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
-    """Return the plan of the line and errors over chainage of one antenna, or protection levels without a reference."""
+    """Return the plan of the line, and a chart over chainage, for one antenna.
+
+    The chart shows errors, or protection levels if there is no reference, or intervals if there are no levels either.
+    """
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     if errors is not None:
         beside = error_over_chainage(errors, filtered=run.filter_rows(antenna))
@@ -157,7 +161,7 @@ def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) 
 
 
 def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart:
-    """Return the plan, coloured by error, by protection level without a reference, or by status without either."""
+    """Return the plan with positions coloured by error, else by protection level, else by status."""
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     level = floats(positions, "protection_level_m")
     return plan(
@@ -175,8 +179,9 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
 def antenna_groups(
     run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
 ) -> Iterator[Group]:
-    """Yield the charts of one antenna; `sky` is the largest number of epochs of the sky plot, `background` has lines
-    below the plan [deg].
+    """Yield the charts of one antenna; `sky` is the maximum number of epochs of the sky plot.
+
+    `background` is as for `railfix.report.report_page`.
     """
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     start = find_start(positions)
@@ -210,7 +215,7 @@ def antenna_groups(
         curve=run.curve,
         mask_deg=run.config.elevation.mask_deg if "elevation" in run.config.screens else None,
     )
-    absent = () if curves else ("No observation has both an elevation and a C/N0, so there is no chart of them.",)
+    absent = () if curves else ("No observation has both an elevation and a C/N0, so there is no chart of C/N0.",)
     yield Group(title="C/N0 over elevation", charts=_keep(*curves), start=start, absent=absent)
     yield _screens(run, antenna, positions, observations, start)
 
@@ -234,7 +239,7 @@ def _screens(
 
 
 def run_group(run: ReportedRun) -> Group:
-    """Return the charts of all antennas of a run together."""
+    """Return the chart of processing time, which all antennas of a run have in common."""
     chunks = run.record.get("chunks") or {}
     start = find_start(run.folder.positions)
     if not all(chunks.get(name) for name in ("first_epoch_gpst", "epochs", "positioning_s")):
@@ -265,14 +270,14 @@ def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: flo
 
 
 def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
-    """Return the errors at the rows of the positions."""
+    """Return the error of each position, shape (rows,) [m]; NaN without an error."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")
 
 
 def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
-    """Return the epochs of the largest errors, on the map and conventional."""
+    """Return the epochs with the largest errors on the map and of conventional positions; None without errors."""
     if errors is None:
         return None
     times = errors["time_gpst"].to_numpy()
@@ -284,7 +289,7 @@ def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
 
 
 def _tunnels(errors: pl.DataFrame | None) -> list[tuple[float, float]]:
-    """Return chainages between which the reference's environment is a tunnel [m]."""
+    """Return the first and last chainage [m] of each stretch in which the environment of the reference is a tunnel."""
     if errors is None:
         return []
     known = errors.filter(pl.col("chainage_m").is_not_null()).sort("chainage_m")

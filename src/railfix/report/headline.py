@@ -1,4 +1,4 @@
-"""Top of the page: one sentence on the run, five key figures, and the comparison with the conventional position."""
+"""Top of the report: a verdict on each run, five key figures, and a comparison with conventional positions."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from railfix.run.verdict import POSITIONS, judge_run
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFigure:
-    """Key figure: name, single-epoch value, filter value, and conventional value or a remark."""
+    """Key figure of a run."""
 
     name: str
-    value: str
-    filtered: str = ""
-    beside: str = ""
+    value: str  #: Value of single epochs; of the filter if `filtered` is empty and the figure has one value only.
+    filtered: str = ""  #: Value of the filter along the track; "" without it.
+    beside: str = ""  #: Value of conventional positions, or a remark.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Headline:
-    """Verdict, five key figures with their basis, and remarks on one antenna of a run."""
+    """Summary of one antenna of a run."""
 
-    verdict: str
+    verdict: str  #: Sentences on availability and accuracy.
     figures: tuple[KeyFigure, ...]
-    compared: str
-    remarks: tuple[str, ...]
+    compared: str  #: Definitions of the positions that the figures describe.
+    remarks: tuple[str, ...]  #: Sentences on the longest outage, large errors, and failed checks.
 
 
 def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> Headline:
-    """Return the verdict and key figures of one antenna, against the reference if there is one."""
+    """Return the headline of one antenna of a run; the figures are errors if the run has a reference."""
     if evaluation is not None:
         passed = get_figures(evaluation, run, antenna, "constrained_ok")
         if passed.get("errors"):
@@ -47,16 +47,14 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
 
 
 def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> Headline:
-    """Return the headline with the figures of the evaluation; `passed` has the single epochs that passed every
-    check.
-    """
+    """Return the headline with errors; `passed` has the figures of the single epochs that passed every check."""
     other = get_figures(evaluation, run, antenna, "conventional")
     filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
     whose = "Single epochs have" if filtered else "The train has"
     verdict = (
         f"{whose} a position on the line that passed every check in {share(passed['rate'], 1)} of the epochs with "
-        f"satellite signals; 95 % of these errors are below {number(passed['p95_m'], 1)} m, and the largest is "
-        f"{number(passed['max_m'], 1)} m (conventional: {number(other.get('p95_m'), 1)} m and "
+        f"satellite signals; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and the "
+        f"largest is {number(passed['max_m'], 1)} m (conventional positions: {number(other.get('p95_m'), 1)} m and "
         f"{number(other.get('max_m'), 1)} m)."
     )
     if filtered:
@@ -78,16 +76,21 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
         for name, text in texts.items()
     ]  # fmt: skip
     ranges = "unscreened ranges, as in P1" if run.conventional is not None else "the same screened ranges"
-    large = "Large: the filter along the track, at all epochs. Single epochs" if filtered else "Large"
+    large = (
+        "The large figures refer to the filter along the track at all epochs. Figures of single epochs"
+        if filtered
+        else "The large figures"
+    )
     stated = _verdict_figures(run, antenna)
     level = list(stated.values())[-1]
     return Headline(
         verdict=verdict,
         figures=(*figures, stated[POSITIONS], replace(level, beside=_count_beyond(run, antenna, evaluation, passed))),
         compared=(
-            f"Errors along the line. {large}: positions on the map, each epoch by itself, that passed every check. "
-            f"Conventional: every 3-D single point from {ranges}, moved to the nearest point of the line. The table "
-            "of figures of merit also compares both at the same epochs."
+            f"All errors are along the line. {large} refer to positions on the map, computed from one epoch each, that "
+            f"passed every check. Conventional positions are 3-D single-point positions from {ranges}, moved to the "
+            "nearest point of the line. The table of figures of merit also compares the positions on the map with the "
+            "conventional positions at the same epochs."
         ),
         remarks=(
             *(_longest_outage(run, antenna, evaluation) if filtered else ()),
@@ -98,7 +101,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
 
 
 def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
-    """Return the key figures of the verdict on an antenna by their names; none without the antenna."""
+    """Return the key figures of the verdict on an antenna by name; empty if the record lacks the antenna."""
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None:
         return {}
@@ -109,7 +112,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
-    """Return the number of usable errors above their level, or without levels the ratio of errors to sigma."""
+    """Return the number of errors above the protection level at usable positions; without levels, errors over sigma."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         len(evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna))
@@ -118,36 +121,36 @@ def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed
     ]
     if not counts:
         return f"95 % of errors within {number(passed.get('normalised_p95'), 1)} sigma"
-    return "errors above the level, at usable positions: " + ", filtered ".join(f"{count:,}" for count in counts)
+    return "errors above the level at usable positions: " + "; of the filter: ".join(f"{count:,}" for count in counts)
 
 
 def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:
-    """Yield a sentence on the filter in the longest stretch without satellites."""
+    """Yield a sentence on the errors of the filter in the longest stretch without satellites, if there is one."""
     if evaluation.outages is not None:
         passed = evaluation.outages.filter(run=run.name_in(evaluation, "train"), antenna=antenna)
         for row in passed.sort("travelled_m", descending=True, nulls_last=True).head(1).iter_rows(named=True):
             yield (
-                f"The longest of {len(passed)} stretches without satellites ({row['environment']}, "
-                f"{number(row['duration_s'], 1)} s and {number(row['travelled_m'], 0)} m, carried by "
-                f"{row['carried_by'].replace('+', ' and ') or 'dead reckoning'}) is passed with at most "
-                f"{number(row['outage_max_m'], 2)} m of error, {number(row['end_error_m'], 2)} m at its end with a "
-                f"stated sigma of {number(row['end_sigma_m'], 1)} m."
+                f"In the longest of {len(passed)} stretches without satellites ({row['environment']}, "
+                f"{number(row['duration_s'], 1)} s, {number(row['travelled_m'], 0)} m, positions by "
+                f"{row['carried_by'].replace('+', ' and ') or 'dead reckoning'}), the error is at most "
+                f"{number(row['outage_max_m'], 2)} m; it is {number(row['end_error_m'], 2)} m at the end, where the "
+                f"stated sigma is {number(row['end_sigma_m'], 1)} m."
             )
 
 
 def _larger_error(passed: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """Return a sentence on the largest error on the map where it exceeds the conventional one."""
+    """Return a sentence if the largest error on the map exceeds the largest error of conventional positions."""
     if not other.get("errors") or passed["max_m"] <= other["max_m"]:
         return []
     return [
-        f"The largest error on the map exceeds the conventional one: {number(passed['max_m'], 1)} m at chainage "
-        f"{number(passed['max_at_chainage_m'], 0)} m, {number(other['max_m'], 1)} m at chainage "
-        f"{number(other['max_at_chainage_m'], 0)} m."
+        f"The largest error on the map, {number(passed['max_m'], 1)} m at chainage "
+        f"{number(passed['max_at_chainage_m'], 0)} m, exceeds the largest error of conventional positions, "
+        f"{number(other['max_m'], 1)} m at chainage {number(other['max_at_chainage_m'], 0)} m."
     ]
 
 
 def _describe_marked(errors: pl.DataFrame | None) -> list[str]:
-    """Return a sentence on the positions that failed a check."""
+    """Return sentences on the positions that failed a check; empty if there are none."""
     if errors is None:
         return []
     marked = errors.filter("in_reference", "positioned", "reference_good", ~pl.col("status").is_in(PASSED))
@@ -156,9 +159,9 @@ def _describe_marked(errors: pl.DataFrame | None) -> list[str]:
     statuses = ", ".join(status.replace("_", " ") for status in marked["status"].unique(maintain_order=True))
     largest = number(float(np.abs(floats(marked, "error_m")).max()), 1, " m")
     return [
-        f"{len(marked):,} further positions failed a check and have its status ({statuses}); their "
+        f"{len(marked):,} further positions failed a check (status: {statuses}); their "
         "largest "
-        f"error is {largest}. They are drawn, but not counted above."
+        f"error is {largest}. They are drawn, but not included in the figures above."
     ]
 
 
@@ -168,10 +171,10 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
         text = "No epoch has a position on the line."
     else:
         rate = share(found.leading.positions / found.leading.epochs, 1)
-        epochs = "epochs, including those without satellites," if found.filter else "epochs with observations"
+        epochs = "epochs, including those without satellites" if found.filter else "epochs with observations"
         text = (
             f"The train has a position on its line in {rate} of {epochs}; the stated standard deviation is at most "
-            f"{number(found.leading.sigma_p95_m, 1)} m for 95 % of these."
+            f"{number(found.leading.sigma_p95_m, 1)} m for 95 % of these positions."
         )
     return Headline(
         verdict=text,

@@ -1,4 +1,4 @@
-"""The report: one HTML page with its tables and charts."""
+"""Report on runs as one HTML page with tables and charts."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Errors in the table of all runs: kind of position and table of the evaluation, by their name in the heading.
+#: Kind of position and table of the evaluation whose errors are in the table of all runs, by name in the heading.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -46,7 +46,7 @@ _JUDGED: Final = {
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
-    """Return one row per run and antenna: rates and, with a reference, the errors of the key figures."""
+    """Return a table with one row per run and antenna: settings, rates, sigma and, with a reference, errors."""
     head = ["run", "antenna", "settings", "epochs", "rate", "ok", "sigma p95"]
     judged = [name for kind in _JUDGED for name in (f"{kind} p95", "largest")] if evaluation else []
     rows = []
@@ -70,13 +70,14 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                     row += [number(figures.get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
-        "settings: preset and changed settings; rate: fraction of the epochs with observations that have a position; "
-        "sigma p95: stated standard deviation along the line, in metres"
+        "Settings are the preset and the changed settings. The rate is the fraction of the epochs with observations "
+        "that have a position. Sigma p95 is the 95th percentile of the stated standard deviation along the line, in "
+        "metres"
     )
     if evaluation:
         caption += (
-            "; 95th percentile and largest of the errors along the line in metres: of the filter at all epochs, of "
-            "single epochs that passed every check, and of conventional positions"
+            ". The last columns are the 95th percentile and the largest of the errors along the line, in metres, of "
+            "the filter at all epochs, of single epochs that passed every check, and of conventional positions"
         )
     columns = range(3, len(head) + len(judged))
     return Table(name="summary", head=[*head, *judged], rows=rows, caption=caption, numeric=columns)
@@ -88,7 +89,7 @@ def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
 
 
 def provenance(run: ReportedRun) -> list[Block]:
-    """Return the command, versions, inputs with hashes, line, notes."""
+    """Return tables and texts on the origin of a run: command, versions, line, inputs with hashes, and notes."""
     record = run.record
     written = datetime.fromtimestamp((run.folder.path / "run.json").stat().st_mtime, tz=UTC)
     versions: Mapping[str, Any] = record.get("versions") or {}
@@ -123,20 +124,20 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 
 def settings(run: ReportedRun) -> list[Block]:
-    """Return the requested and the used settings."""
+    """Return a table of the given and the used settings; given settings come first and are highlighted."""
     asked = flat_settings(run.record.get("settings_asked") or {})
     used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
     names += [name for name in used if name not in asked]
     rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
     return [
-        Sentence(f"{len(asked)} of {len(used)} settings were given; the others are defaults."),
+        Sentence(f"{len(asked)} of {len(used)} settings were given; the others have their default values."),
         Table(name="settings", head=["setting", "asked", "used"], rows=rows, marked=range(len(asked))),
     ]
 
 
 def budget(run: ReportedRun) -> list[Block]:
-    """Return epochs by status, and pseudoranges by the first reason for their rejection."""
+    """Return tables of signs of interference, epochs by status, and pseudoranges by first rejection reason."""
     antennas = _antennas(run)
     signs = [
         [name, sign, count(seen["epochs"]), str(seen["first"])]
@@ -156,12 +157,12 @@ def budget(run: ReportedRun) -> list[Block]:
 
 
 def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """Return the figures of merit of one run, on the map and conventional."""
+    """Return the tables of figures of merit of one run, for positions on the map and conventional positions."""
     return _with_groups(select_evaluation(evaluation, run.name_in(evaluation)))
 
 
 def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """Return figures of the filter along the track: all epochs, with and without satellites, outages, probabilities."""
+    """Return the tables of figures of merit of the filter along the track, or a sentence if the run has no filter."""
     name = run.name_in(evaluation, "train")
     if not name:
         return [Absent("The run has no filter along the track (railfix run --filter off).")]
@@ -186,7 +187,7 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)
 
 
-#: Minimum number of epochs of an antenna's sky plot.
+#: Minimum number of epochs to which the sky plot of an antenna is reduced in a page with many antennas.
 _LEAST_SKY: Final = 200
 
 
@@ -200,10 +201,10 @@ def write_report(
     title: str = "",
     options: EvaluationOptions | None = None,
 ) -> Path:
-    """Write the report on runs into the file `out`, which is replaced by the complete page or not at all.
+    """Write the report on runs as an HTML page and return its path; a failed write leaves an existing file unchanged.
 
-    `references`, `conventional` and the errors are as for `railfix.report.read_runs`; `background` is a GeoJSON file
-    with lines to draw below the plan. OutputError: the page cannot be written.
+    `references`, `conventional` and the raised errors are as for `railfix.report.read_runs`. `background` is a GeoJSON
+    file with lines that are drawn below the plan. OutputError: the page cannot be written.
     """
     folders, others, unscreened = (
         [Path(name) for name in path_names(names)] if names else [] for names in (runs, references, conventional)
@@ -221,7 +222,10 @@ def write_page(
     background: Sequence[Floats] = (),
     title: str = "",
 ) -> Path:
-    """Write the report on runs that have been read; see `write_report`."""
+    """Write the report on runs that have been read (`read_runs`) as an HTML page, and return its path.
+
+    `background` is as for `report_page`. OutputError: the page cannot be written.
+    """
     write_whole(out, report_page(runs, evaluation, background=background, title=title), what="report")
     return out
 
@@ -229,12 +233,13 @@ def write_page(
 def report_page(
     runs: Sequence[ReportedRun], evaluation: Evaluation | None, *, background: Sequence[Floats] = (), title: str = ""
 ) -> str:
-    """Return the HTML of the report; `background` has lines below the plan as longitude and latitude, each of shape (P,
-    2) [deg].
+    """Return the HTML of the report.
+
+    `background` has lines that are drawn below the plan, each as longitude and latitude of shape (P, 2) [deg].
     """
     numbers = counter()
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
-    # with many antennas each gets a smaller chart
+    # with many antennas, the sky plot of each antenna has fewer epochs, which limits the size of the page
     epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
     return render(
         "page.html.j2",
@@ -267,7 +272,7 @@ def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers:
         for antenna in run.folder.antennas
         if (errors := run.get_errors(antenna)) is not None
     }
-    # one run has its own chart over chainage
+    # the errors of a single run are already in its own chart over chainage
     charts = [error_ranges(series), *([errors_of_runs(series)] if len(runs) > 1 else [])]
     return PagePart(title="", figures=[figure(chart, numbers) for chart in charts if not chart.empty])
 
@@ -281,7 +286,7 @@ def _run(
     sky: int,
     background: Sequence[Floats],
 ) -> dict[str, Any]:
-    """Return the template's values for one run."""
+    """Return the values of one run for the template; `sky` is the maximum number of epochs of a sky plot."""
     anchor, first = f"run{number}", run.folder.antennas[0]
     errors: list[Folded] = []
     if evaluation is not None:

@@ -1,4 +1,4 @@
-"""Input of a report: folders of runs, and their errors where there is a reference."""
+"""Inputs of a report: results folders of runs, and the errors of runs with a reference."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from railfix.track import Track
 
 _OBSERVATIONS: Final = "observations.parquet"
 _NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
-#: Columns of the report in addition to those of every table: of the positions, of the filter, of the errors.
+#: Columns that the report reads: additional columns of the positions, and columns of the filter and of the errors.
 _POSITIONS: Final = cs.contains("protection_level", "protection_status", "protection_cause", "_fault") | cs.by_name(
     "kilometrage_m", "n_rejected", "raim_statistic", "raim_threshold", "raim_level_m", "protection_kind",
     *(column.name for screen in SCREENS for column in screen.columns if column.table == "positions"),
@@ -47,54 +47,55 @@ _ERRORS: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedRun:
-    """Run with the content of its part of the report."""
+    """Run with the data for its part of the report."""
 
     name: str  #: Name of the folder, with as many parent folders as distinguish the runs.
     folder: RunFolder
     config: Config  #: Settings that were used.
-    observations: pl.LazyFrame | None  #: Observations; None if the run wrote none.
-    #: Columns of `railfix.evaluate.EPOCH_COLUMNS` that the report uses, and levels: of the single-epoch positions, and
-    #: of the filter along the track; None without a reference or without a filter.
+    observations: pl.LazyFrame | None  #: Table of observations; None if the run wrote none.
+    #: Errors and protection levels per epoch (columns of `railfix.evaluate.EPOCH_COLUMNS`): `errors` of the
+    #: single-epoch positions, `filtered` of the filter along the track; None without a reference, or if the filter was
+    #: off.
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
-    train: pl.DataFrame | None  #: Times, positions and sigmas by the filter along the track, None without it.
-    reference: str  #: Path of the reference; empty without a reference.
-    conventional: Path | None  #: Run of the conventional positions, if it is a different run.
-    track: Track | None  #: Track; None if its files cannot be read.
-    curve: Cn0Curve | None
-    notes: tuple[str, ...]
+    train: pl.DataFrame | None  #: Times, positions and sigmas of the filter along the track; None if it was off.
+    reference: str  #: Path of the reference; "" without a reference.
+    conventional: Path | None  #: Run whose conventional positions are shown; None for the run itself.
+    track: Track | None  #: Track of the run; None if its files cannot be read.
+    curve: Cn0Curve | None  #: C/N0 curve that the run used; None if it used none, or if it cannot be read.
+    notes: tuple[str, ...]  #: Notes in addition to the notes of the run.
 
     def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
-        """Return the name that an evaluation gives to a position table of this run; empty if it has no such table."""
+        """Return the name of a position table of this run in an evaluation; "" if the evaluation lacks the table."""
         mine = (run for run in evaluation.runs if run.path.resolve() == self.folder.path.resolve())
         return next((run.name for run in mine if run.table == table), "")
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """``run.json``."""
+        """Content of ``run.json``."""
         return self.folder.record
 
     def get_positions(self, antenna: str) -> pl.DataFrame:
-        """Return the rows of one antenna in order of time."""
+        """Return the single-epoch positions of one antenna in order of time."""
         return self.folder.positions.filter(antenna=antenna)
 
     def get_errors(self, antenna: str) -> pl.DataFrame | None:
-        """Return the errors of one antenna; None without a reference."""
+        """Return the errors of the single-epoch positions of one antenna; None without a reference."""
         return None if self.errors is None else self.errors.filter(antenna=antenna)
 
     def filter_rows(self, antenna: str) -> pl.DataFrame | None:
-        """Return the filter's rows; None without the filter."""
+        """Return the errors of the filter for one antenna; None without a reference, or if the filter was off."""
         return None if self.filtered is None else self.filtered.filter(antenna=antenna)
 
     def get_train(self, antenna: str) -> pl.DataFrame | None:
-        """Return the filtered positions; None without the filter."""
+        """Return the positions of the filter for one antenna; None if the filter was off."""
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
 def get_figures(
     evaluation: Evaluation, run: ReportedRun, antenna: str, position: str, table: str = POSITIONS_TABLE
 ) -> dict[str, Any]:
-    """Return the figures of merit of one antenna and kind of position; empty where none exist."""
+    """Return the figures of merit of one antenna and kind of position; an empty dictionary if there are none."""
     name = run.name_in(evaluation, table)
     rows = evaluation.figures.filter(grouping="all", epochs_of="own", run=name, antenna=antenna, position=position)
     return rows.row(0, named=True) if len(rows) == 1 else {}
@@ -107,15 +108,15 @@ def read_runs(
     conventional: Sequence[Path] = (),
     options: EvaluationOptions | None = None,
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
-    """Read runs, and evaluate them where there is a reference; None replaces the evaluation without references.
+    """Read runs, and evaluate them if there are references; without references the evaluation is None.
 
-    `references`: none, one for all runs, or one for each in order. `conventional`: none, or for each run in order
-    another run on the same log, whose conventional positions are shown; a run with the elevation and C/N0 screens only
-    gives the unscreened positions of P1. The evaluation's table of epochs is empty, because the runs have the columns
-    of the report.
+    `references` has no reference, one for all runs, or one for each run in order. `conventional` is empty, or has for
+    each run in order another run on the same log, whose conventional positions are shown; a run with only the elevation
+    and C/N0 screens gives the unscreened positions of P1. The table of epochs of the evaluation is empty, because the
+    runs contain the columns of the report.
 
-    InputFileError, MismatchError: a file is not as expected, or a reference is not that of the run.
-    SettingsError: the number of references or of conventional runs does not fit, or a run is given twice.
+    InputFileError, MismatchError: a file is missing or malformed, or a reference does not match the run.
+    SettingsError: there is no run, the number of references or conventional runs is wrong, or a run is given twice.
     """
     if not paths:
         raise SettingsError("no run to report on; name the folders that railfix run wrote")
@@ -199,7 +200,7 @@ def _observations(path: Path) -> pl.LazyFrame | None:
 
 
 def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[str, ...]]:
-    """Return the C/N0 curve of the run, or a note that it is not drawn."""
+    """Return the C/N0 curve that the run used, and a note if the curve cannot be read."""
     if config.cn0_curve is None:
         return None, ()
     path = next(iter(folder.input_paths("cn0_curve")), Path(config.cn0_curve))
@@ -210,8 +211,8 @@ def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[st
 
 
 def _track(folder: RunFolder) -> tuple[Track | None, tuple[str, ...]]:
-    """Return the track of the run, or a note that the line is drawn from the positions."""
+    """Return the track of the run, and a note if the track cannot be read."""
     try:
         return read_run_track(folder), ()
     except RailfixError as error:
-        return None, (f"the line is drawn where there are positions, because the track cannot be read: {error}",)
+        return None, (f"the line is drawn through the positions, because the track cannot be read: {error}",)

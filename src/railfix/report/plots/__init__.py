@@ -1,10 +1,9 @@
-"""Pictures, of numbers in tables and arrays.
+"""Charts of tables and arrays, drawn with matplotlib or shown in the HTML pages of `railfix.report`.
 
-Each chart has two functions: one makes a `Chart` (`error_over_time`), the other draws it with matplotlib
-(`plot_error_over_time`), into the axes given as `ax` or into a new figure, like pandas. Both return the axes. The
-report of `railfix.report` shows the same charts.
+Each chart has two functions: `error_over_time`, for example, returns a `Chart`, and `plot_error_over_time` draws this
+chart with matplotlib into the axes `ax`, or into a new figure, and returns the axes.
 
-matplotlib is imported when a picture is drawn, never with the package.
+matplotlib is imported when a chart is drawn, not when this package is imported.
 """
 
 from typing import Final

@@ -1,4 +1,4 @@
-"""Charts of whole runs: of a campaign, of processing time, of satellite service along a line."""
+"""Charts of whole runs: runs of a campaign, processing time, and satellite service along a line."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from railfix.report.plots.line import ECEF, ERROR_CLASSES, LEVEL_CLASSES, LocalF
 if TYPE_CHECKING:
     import polars as pl
 
-#: Quantities by their column: text of the legend, limits of the classes [m], and the colour of bars.
+#: Name, limits of the classes [m] and colour of bars of each quantity, by its column.
 _QUANTITIES = {
     "error_m": ("error", ERROR_CLASSES, CONSTRAINED),
     "protection_level_m": ("level", LEVEL_CLASSES, FILTERED),
@@ -41,7 +41,10 @@ _QUANTITIES = {
 
 
 def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
-    """Plan of the positions (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by a quantity, the largest last."""
+    """Return a plan of the positions (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by classes of a quantity.
+
+    `quantity` is a column of ``_QUANTITIES``; larger values are drawn over smaller ones.
+    """
     named, edges, _ = _QUANTITIES[quantity]
     placed = points(places, *ECEF)
     rows = np.isfinite(placed[:, 0])
@@ -56,25 +59,26 @@ def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
         where = f" Origin at latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}."
     return Chart(
         name="campaign-plan", title="Lines of the runs", x_label="east [m]", y_label="north [m]", layers=tuple(layers),
-        caption=f"Each run in pieces of the line; a point is the epoch with the largest {named} of its piece.{where}",
+        caption=f"The line of each run is divided into pieces; a point is the epoch with the largest {named} in a "
+        f"piece.{where}",
         equal=True,
     )  # fmt: skip
 
 
 def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Floats, quantity: str) -> Chart:
-    """Return the bars of a quantity by run, from `low` to `high` with a mark at `middle`, each of shape (runs,) [m]."""
+    """Return a chart with one bar per run from `low` to `high` and a mark at `middle`, each of shape (runs,) [m]."""
     named, _, colour = _QUANTITIES[quantity]
     top = float(np.nanmax(high[np.isfinite(high)], initial=0.0)) or 1.0
     bars = RangeBars(label=named, colour=colour, names=tuple(names), low=low, mid=middle, high=high)
     return Chart(
         name=f"campaign-{named.split()[0]}", title=f"{named.capitalize()} by run", x_label=f"{named} [m]", y_label="",
         x_range=(0.0, 1.04 * top), layers=(bars,),
-        caption="From the median to the largest; the mark is the 95th percentile.",
+        caption="Each bar extends from the median to the largest value; the mark is the 95th percentile.",
     )  # fmt: skip
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
-    """Return the processing time per epoch over the run, as means of the ``chunks`` of ``run.json``."""
+    """Return a chart of the mean processing time per epoch in each chunk of a run; `chunks` is from ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)
@@ -85,10 +89,10 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
     return Chart(
         name="processing-time",
         title="Time per epoch",
-        caption=f"Mean of each of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of all antennas, at "
-        f"the time of the first; reading and writing not included. Mean over the run: {whole:.3f} ms per "
-        "epoch and antenna. A chunk is positioned as a whole; in live operation, epoch by epoch, each "
-        "epoch takes longer.",
+        caption=f"Mean in each of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of all antennas, at "
+        f"the time of the first epoch, without reading and writing. The mean over the run is {whole:.3f} ms per "
+        "epoch and antenna. A chunk is positioned as a whole; live operation, which positions each epoch "
+        "separately, takes longer per epoch.",
         x_label="GPS time",
         y_label="ms per epoch",
         layers=(
@@ -101,7 +105,10 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
 
 
 def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
-    """Return satellites, reflections, fractions of epochs and levels of `compute_service` by chainage."""
+    """Return charts of used satellites, 3-D offsets from the line, fractions of epochs, and levels over chainage.
+
+    `service` is the table of `compute_service`, `limit_m` the alarm limit [m].
+    """
     level = [("median", "level_median_m", BLUE), ("exceeded in 5 % of epochs", "level_p95_m", RED)]
     ends = np.array([service["from_m"].min(), service["to_m"].max()], dtype=float)
     limit = Curve(label="alarm limit", colour=GREEN, x=ends, y=np.full(2, limit_m), dash="dashed")
@@ -133,7 +140,7 @@ def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
 
 
 def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str, limit_m: float) -> None:
-    """Draw the charts of `service_charts` into one picture."""
+    """Write the charts of `service_charts` as one picture (PNG or SVG); OutputError if it cannot be written."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 10), layout="constrained")
@@ -145,7 +152,7 @@ def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str
 
 
 def _steps(service: pl.DataFrame, label: str, column: str, colour: str) -> Curve:
-    """Return a column as constant by stretch, with gaps where values are missing."""
+    """Return a curve of a column that is constant in each stretch, with gaps where values are missing."""
     begin, end = service["from_m"].to_numpy(), service["to_m"].to_numpy()
     value = service[column].cast(float).fill_null(float("nan")).to_numpy()
     value = np.where(np.isfinite(value), value, np.nan)

@@ -1,8 +1,8 @@
-"""Charts: axes with layers of numbers, independent of the drawing program.
+"""Charts as axes with layers of numbers, independent of the library that draws them.
 
-The functions of `railfix.report.plots` make charts from tables and arrays, long series thinned without changing their
-appearance; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
-a page, so a notebook and the report show the same numbers.
+Functions of `railfix.report.plots` return charts of tables and arrays; long series are thinned without changing their
+appearance. `railfix.report.plots.draw_chart` draws a chart with matplotlib, and `railfix.report` includes it in a page,
+so that a notebook and the report show the same numbers.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.timescale import seconds
 from railfix.evaluate.evaluation_inputs import floats, words
 
-#: Colours distinguishable with colour blindness (Okabe and Ito), with a contrast of 3 to 1 or more on white.
+#: Colours that can be distinguished with colour blindness (Okabe and Ito), with a contrast of at least 3:1 on white.
 BLUE: Final[str] = "#0072b2"
 RED: Final[str] = "#d55e00"
 GREEN: Final[str] = "#00805e"
 PURPLE: Final[str] = "#a3487e"
 BLACK: Final[str] = "#000000"
 GREY: Final[str] = "#767676"
-#: Positions on the map, of the filter along the track, and conventional, in every chart.
+#: Colours of positions on the map, of the filter along the track, and of conventional positions in all charts.
 CONSTRAINED: Final[str] = BLUE
 FILTERED: Final[str] = GREEN
 CONVENTIONAL: Final[str] = RED
-#: Ordered classes, from small (dark blue) to large (dark red), none grey as the line is.
+#: Colours of ordered classes, from small (dark blue) to large (dark red); none is grey, the colour of the line.
 ORDERED: Final[tuple[str, ...]] = ("#0b559f", "#3d8ec4", "#a88400", "#e0762f", "#b30000")
-#: Classes without an order.
+#: Colours of classes without an order.
 CYCLE: Final = (BLUE, RED, GREEN, PURPLE, BLACK, "#8c6d00", "#56b4e9", GREY)
 
 Shape = Literal["dot", "square", "cross", "ring"]
@@ -40,13 +40,13 @@ Scale = Literal["linear", "symlog", "log"]
 
 @dataclass(frozen=True, kw_only=True)
 class _Layer:
-    """Values drawn in one colour under one name of the legend; a blank one is not in the legend."""
+    """Values that are drawn in one colour; `label` is the name in the legend, "" for none."""
 
     label: str
     colour: str
 
     def __post_init__(self) -> None:
-        """Raise ValueError where the arrays differ in length."""
+        """Raise ValueError if the arrays differ in length."""
         lengths = [len(value) for value in vars(self).values() if isinstance(value, np.ndarray | tuple)]
         if len(set(lengths)) > 1:
             raise ValueError(f"{self.label}: arrays of lengths {lengths}, expected equal ones")
@@ -54,22 +54,22 @@ class _Layer:
 
 @dataclass(frozen=True, kw_only=True)
 class Points(_Layer):
-    """Points, P of them."""
+    """P separate points."""
 
     kind: ClassVar[str] = "points"
     shape: Shape = "dot"
     size: float = 3.0  #: Width in pixels of a page.
-    #: NaN is not drawn, shape (P,).
+    #: Shape (P,); points with NaN are not drawn.
     x: Floats
     y: Floats
 
-    #: Time since the start of the run; a click on a point shows the sky at that time; shape (P,).
+    #: Time of each point since the start of the group [s], shape (P,); a click on a point shows the sky at this time.
     epoch_s: Floats | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curve(_Layer):
-    """A line through P points, broken where one is NaN."""
+    """Line through P points, interrupted at points with NaN."""
 
     kind: ClassVar[str] = "line"
     width: float = 1.5
@@ -80,7 +80,7 @@ class Curve(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Band(_Layer):
-    """The area between two lines of P points, broken where one is NaN."""
+    """Area between two lines with P points each, interrupted at points with NaN."""
 
     kind: ClassVar[str] = "band"
     x: Floats
@@ -90,7 +90,7 @@ class Band(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Bars(_Layer):
-    """Upright bars from `left` to `right`, each B long."""
+    """B vertical bars, each from `left` to `right` on the x axis."""
 
     kind: ClassVar[str] = "bars"
     left: Floats
@@ -100,10 +100,10 @@ class Bars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Cells(_Layer):
-    """Numbers of points in the cells of a grid; darker cells have more."""
+    """Numbers of points in the A x B cells of a grid; darker cells have more points."""
 
     kind: ClassVar[str] = "cells"
-    #: Shape (A + 1,), (B + 1,).
+    #: Shapes (A + 1,) and (B + 1,).
     x_edges: Floats
     y_edges: Floats
     counts: Integers  #: Shape (A, B).
@@ -115,11 +115,11 @@ class Cells(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class RangeBars(_Layer):
-    """A bar from minimum to maximum with a mark at the mean for each name, from the top down."""
+    """N horizontal bars from `low` to `high` with a mark at `mid`, one per name, from top to bottom."""
 
     kind: ClassVar[str] = "ranges"
     names: tuple[str, ...]
-    #: NaN is not drawn, shape (N,).
+    #: Shape (N,); bars with NaN are not drawn.
     low: Floats
     mid: Floats
     high: Floats
@@ -127,14 +127,15 @@ class RangeBars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Marks(_Layer):
-    """Text at points."""
+    """Texts at P points."""
 
     kind: ClassVar[str] = "marks"
     #: Shape (P,).
     x: Floats
     y: Floats
-    words: tuple[str, ...]  #: Lines separated by line feeds.
-    place: Literal["beside", "on"] = "beside"  #: Text beside a cross at the point, or centred on it without a cross.
+    words: tuple[str, ...]  #: Text at each point; lines are separated by line feeds.
+    #: Position of the text: beside a cross at the point, or centred on the point without a cross.
+    place: Literal["beside", "on"] = "beside"
 
 
 Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
@@ -142,28 +143,28 @@ Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """One chart."""
+    """Chart with two axes."""
 
-    name: str  #: Short, for files and anchors: ``error-time``.
-    #: Heading; explanation with the counts of points left out.
+    name: str  #: Short name for files and page elements, such as ``error-time``.
     title: str
-    caption: str
+    caption: str  #: Explanation, with the number of omitted points.
 
     x_label: str
     y_label: str
-    layers: tuple[Layer, ...]  #: Drawn in this order.
-    start: np.datetime64 | None = None  #: `x` is seconds from this time.
+    layers: tuple[Layer, ...]  #: Layers in the order in which they are drawn.
+    start: np.datetime64 | None = None  #: GPS time from which `x` counts [s]; None if the x axis is not time.
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
-    y_linear: float = 1.0  #: A symlog axis is linear up to here.
+    y_linear: float = 1.0  #: Absolute value up to which a symlog axis is linear.
+    #: Ranges of the axes; None for the range of the data.
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
-    equal: bool = False  #: Equal scales on both axes; a scale bar and north are drawn.
-    width: Literal["wide", "half"] = "wide"
+    equal: bool = False  #: Whether the axes are east and north with equal scales; an arrow to the north is drawn.
+    width: Literal["wide", "half"] = "wide"  #: Width in a page.
 
     @property
     def common_axis(self) -> Literal["time", "chainage", ""]:
-        """Quantity on the x axis that other charts share: they are zoomed together."""
+        """Quantity on the x axis by which charts are zoomed together; "" if there is no such quantity."""
         if self.start is not None:
             return "time"
         return "chainage" if self.x_label.startswith("chainage") else ""
@@ -176,31 +177,31 @@ class Chart:
 
 @dataclass(frozen=True, kw_only=True)
 class SkyEpochs:
-    """Satellites in view of an antenna, R rows over K epochs, for sky plots."""
+    """Satellites in view of an antenna for sky plots: R rows in K epochs."""
 
     name: str
     title: str
     caption: str
-    start: np.datetime64
-    epoch_s: Floats  #: Rising, from `start`; shape (K,).
-    first: Integers  #: Rows of epoch k: first[k] to first[k + 1]; shape (K + 1,).
-    #: Shape (R,).
+    start: np.datetime64  #: GPS time from which `epoch_s` counts.
+    epoch_s: Floats  #: Times of the epochs in ascending order [s], shape (K,).
+    first: Integers  #: Index of the first row of each epoch, followed by R; shape (K + 1,).
+    #: Satellite and signal of each row, shape (R,).
     satellite: Strings
     signal: Strings
-    #: Shape (R,).
+    #: Direction and C/N0 of each row, shape (R,); NaN for an unknown C/N0.
     azimuth_deg: Floats
     elevation_deg: Floats
     cn0_dbhz: Floats
-    reason: Strings = field(repr=False)  #: First reason for its rejection, or ``used``; shape (R,).
+    reason: Strings = field(repr=False)  #: First rejection reason of each row, or ``used``; shape (R,).
 
     @property
     def empty(self) -> bool:
-        """Whether it has no satellites."""
+        """Whether there are no satellites."""
         return not len(self.satellite)
 
 
 def _has_content(layer: Layer) -> bool:
-    """Return whether a layer has anything to draw; text alone does not count."""
+    """Return whether a layer has anything to draw other than text."""
     if isinstance(layer, Marks):
         return False
     if isinstance(layer, Cells):
@@ -218,12 +219,12 @@ __all__ = ["find_start", "floats", "nice_step", "points", "since", "words"]
 
 
 def points(table: pl.DataFrame, *names: str) -> Floats:
-    """Return columns adjacent, shape (rows, columns)."""
+    """Return columns of a table as one array, shape (rows, columns); NaN for absent values."""
     return np.stack([floats(table, name) for name in names], axis=1)
 
 
 def find_start(table: pl.DataFrame) -> np.datetime64:
-    """Return the earliest time of a table; ValueError where it is empty."""
+    """Return the earliest time of a table; ValueError if the table is empty."""
     if not len(table):
         raise ValueError("the table has no rows")
     return np.datetime64(table["time_gpst"].to_numpy().min(), "ns")
@@ -235,18 +236,21 @@ def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
 
 
 def nice_step(rough: float) -> float:
-    """1, 2 or 5 times a power of ten, at least `rough`."""
+    """Return the smallest number of the form 1, 2 or 5 times a power of ten that is not below `rough`."""
     power = 10.0 ** np.floor(np.log10(max(rough, 1e-9)))
     return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
 
 
-#: Largest number of points in a layer of a chart: more than two per pixel of a wide chart in a page [1150 pixels].
+#: Maximum number of points in a layer: more than two per pixel of a wide chart in a page, which has 1150 pixels.
 POINTS: Final = 3000
 _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
 
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Rows of the smallest and largest `y` in each of at most `points` / 2 equal pieces of `x`, rising, not NaN."""
+    """Return the ascending indices of the smallest and largest `y` in each of `points` / 2 equal pieces of the x range.
+
+    Points with NaN are omitted; if there are at most `points` others, all of them are returned.
+    """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
         return rows
@@ -265,11 +269,15 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
-    """At most `points` rows, no two in one square cell, which grows from width `cell`; rows with NaN left out."""
+    """Return the indices of at most `points` points, of which no two are in the same square cell.
+
+    The width of the cells is increased from `cell` until this is reached; if there are at most `points` points, all are
+    returned. Points with NaN are omitted.
+    """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
     while len(rows) > points:
-        # rows and columns of the grid as one number each cell
+        # row and column of a cell are combined to one number
         across, up = ((v[rows] / cell).astype(np.int64) for v in (x - left, y - low))
         _, first = np.unique(across * (int(up.max()) + 1) + up, return_index=True)
         rows = rows[np.sort(first)]
@@ -278,19 +286,22 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 
 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """At most `points` rows, not NaN: a fifth extremes, the others by the golden-ratio sequence, evenly dense."""
+    """Return the indices of at most `points` points that represent a series.
+
+    A fifth of them are `extremes`; a golden-ratio sequence selects the others evenly. Points with NaN are omitted.
+    """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
         return rows
     outline = extremes(x, y, points=points // 5)
-    # the rows of the smallest members of a uniform sequence in [0, 1)
+    # the low-discrepancy sequence is uniform in [0, 1), so that a threshold selects evenly distributed rows
     order = (np.arange(len(rows)) * _GOLDEN) % 1.0
     sample = rows[order < (points - len(outline)) / len(rows)]
     return np.asarray(np.union1d(outline, sample)[:points], dtype=np.intp)
 
 
 def thin_points(series: Iterable[Points]) -> tuple[list[Layer], str]:
-    """Return layers with the points that `spread` keeps of each, and a sentence on the thinning."""
+    """Return layers with the points of each series that `spread` selects, and a sentence on the thinning."""
     layers: list[Layer] = []
     shown = total = 0
     for whole in series:
@@ -302,7 +313,7 @@ def thin_points(series: Iterable[Points]) -> tuple[list[Layer], str]:
 
 
 def counts_sentence(shown: int, total: int) -> str:
-    """Return a sentence on the thinning, empty if there was none."""
+    """Return a sentence on the number of points shown, beginning with a space; "" if all points are shown."""
     if shown == total:
         return ""
-    return f" {shown:,} of {total:,} points are shown, the extremes among them."
+    return f" {shown:,} of {total:,} points are shown, including the extremes."

@@ -1,4 +1,4 @@
-"""Charts drawn with matplotlib."""
+"""Drawing of charts with matplotlib."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
 
 
 def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
-    """Return a function that draws the charts of another function, with its parameters and `ax`."""
+    """Return a function that draws the chart returned by `chart_of`, with its parameters and the parameter `ax`.
+
+    SettingsError: a table is not a polars table, or lacks a column.
+    """
     own = signature(chart_of)
     of_table = next(iter(own.parameters.values())).annotation == "pl.DataFrame"
 
@@ -60,7 +63,7 @@ def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
     draw.__name__ = draw.__qualname__ = f"plot_{chart_of.__name__}"
     draw.__annotations__ = {**chart_of.__annotations__, "ax": "Axes | None", "return": "Axes"}
     draw.__doc__ = (
-        f"{chart_of.__doc__}\n\n    Drawn into the axes `ax`, or into a new figure; the axes are returned.\n    "
+        f"{chart_of.__doc__}\n\n    Draws into the axes `ax`, or into a new figure; the axes are returned.\n    "
     )
     del draw.__wrapped__
     ax = Parameter("ax", Parameter.KEYWORD_ONLY, default=None, annotation="Axes | None")
@@ -69,12 +72,12 @@ def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
 
 
 def _size(chart: Chart) -> tuple[float, float]:
-    """Return the width and height of the figure of a chart [inch]."""
+    """Return the width and height of a figure for a chart [inch]."""
     return (10.0, 7.0) if chart.equal else (10.0 if chart.width == "wide" else 6.0, 4.2)
 
 
 def draw_figure(chart: Chart) -> Figure:
-    """Return a chart as a figure of its own, outside matplotlib.pyplot; ``figure.savefig("error.png")`` writes it."""
+    """Draw a chart into a new figure that is independent of matplotlib.pyplot, and return the figure."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=_size(chart), layout="constrained")
@@ -83,14 +86,17 @@ def draw_figure(chart: Chart) -> Figure:
 
 
 def save_figure(figure: Figure, path: str | PathLike[str]) -> Path:
-    """Write a figure as PNG, or SVG where the name says so; OutputError where it cannot be written."""
+    """Write a figure as SVG if the name ends in ``.svg``, otherwise as PNG, and return the path.
+
+    OutputError: the file cannot be written.
+    """
     with stage_file(path, what="picture") as staged:
         figure.savefig(staged, format="svg" if str(path).endswith(".svg") else "png", dpi=110)
     return Path(path)
 
 
 def draw_chart(chart: Chart, ax: Axes | None = None) -> Axes:
-    """Draw a chart into matplotlib axes, or into a new figure of matplotlib.pyplot; the axes are returned."""
+    """Draw a chart into matplotlib axes, or into a new figure of matplotlib.pyplot, and return the axes."""
     axes = new_axes(_size(chart)) if ax is None else ax
     for layer in chart.layers:
         _draw(layer, axes, chart)
@@ -106,7 +112,7 @@ def draw_chart(chart: Chart, ax: Axes | None = None) -> Axes:
 
 
 def new_axes(size: tuple[float, float], **axes: Any) -> Axes:
-    """Return axes of a new figure of matplotlib.pyplot, which a notebook shows; `size` in inches."""
+    """Return axes in a new figure of matplotlib.pyplot, which a notebook shows; `size` is in inches."""
     from matplotlib import pyplot
 
     _, made = pyplot.subplots(figsize=size, layout="constrained", subplot_kw=axes)
@@ -114,7 +120,10 @@ def new_axes(size: tuple[float, float], **axes: Any) -> Axes:
 
 
 def draw_sky(sky: SkyEpochs, time: np.datetime64, *, ax: Axes | None = None) -> Axes:
-    """Draw the satellites at the epoch nearest to a GPS time into polar axes; ValueError: no epoch exists."""
+    """Draw the satellites at the epoch nearest to a GPS time into polar axes, and return the axes.
+
+    ValueError: there are no satellites, or `ax` is not polar.
+    """
     if sky.empty:
         raise ValueError("there are no satellites to draw")
     polar: Any = new_axes((6.0, 6.0), projection="polar") if ax is None else ax
@@ -162,7 +171,7 @@ def _scales(chart: Chart, axes: Axes) -> None:
 
 
 def _along(chart: Chart, x: Any) -> Any:
-    """Return the times instead of seconds if the x axis is time."""
+    """Return values of the x axis for matplotlib: times if the chart has a start, otherwise the values."""
     return x if chart.start is None else chart.start + timedelta(x)
 
 

@@ -1,8 +1,8 @@
-"""Charts of errors, and of errors against their protection levels.
+"""Charts of errors and of protection levels.
 
-The tables have one row per epoch of one antenna, as in `railfix.evaluate.Evaluation.epochs`:
-``time_gpst``, ``chainage_m`` (of the reference), ``error_m`` and ``conventional_error_m`` (+ toward the end of the
-line), and optionally ``along_sigma_m``, ``reference_good`` and columns of protection levels.
+Tables of errors have one row per epoch of one antenna, as in `railfix.evaluate.Evaluation.epochs`, with the columns
+``time_gpst``, ``chainage_m`` (of the reference), ``error_m`` and ``conventional_error_m`` (positive toward the end of
+the line), and optionally ``status``, ``along_sigma_m``, ``reference_good`` and columns of protection levels.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from railfix.report.plots.chart import (
 )
 
 _ERROR_LABEL: Final = "error along the line [m]"
-_SIGN: Final = "+ is toward the end of the line."
-#: Number of pieces of the axis; the largest sigma and level of each is drawn.
+_SIGN: Final = "Positive errors are toward the end of the line."
+#: Number of pieces of the x axis; the largest sigma and protection level of each piece is drawn.
 _PIECES: Final = 600
 _SERIES: Final = (
     ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
@@ -57,20 +57,20 @@ _SERIES: Final = (
 
 
 def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
-    """Return errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
+    """Return a chart of errors on the map and of conventional positions, with sigma and level (P1 figures 7 and 10).
 
-    Both tables are of one antenna, in order of time; `filtered` is of the filter along the track.
+    Both tables are of the same antenna, in order of time. `filtered` has the errors of the filter along the track.
     """
     return _errors(errors, filtered, find_start(errors))
 
 
 def error_over_chainage(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
-    """Return the errors over the chainage of the reference (P1 figure 8), of the tables of `error_over_time`."""
+    """Return the chart of `error_over_time` with the chainage of the reference as x axis (P1 figure 8)."""
     return _errors(errors, filtered, None)
 
 
 def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datetime64 | None) -> Chart:
-    """Return errors over the time since `start`, or over the chainage without one."""
+    """Return a chart of errors over the time since `start`, or over chainage if `start` is None."""
 
     def axis(table: pl.DataFrame) -> Floats:
         return floats(table, "chainage_m") if start is None else since(table, start)
@@ -81,7 +81,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
     at, sigma = _greatest(x, floats(errors, "along_sigma_m"))
     if len(at):
         layers.append(Band(label="± stated sigma", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
-        caption.append("Band: the standard deviation that railfix states, the largest of each short piece.")
+        caption.append("The band is the stated standard deviation, the largest value in each short piece of the axis.")
     levels = []
     drawn_levels = [name for name in level_columns(errors) if np.isfinite(floats(errors, name)).any()]
     for column, colour in zip(drawn_levels, (PURPLE, GREEN, BLACK, GREY), strict=False):
@@ -113,7 +113,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
     if scale["y_scale"] == "symlog":
         caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
     if levels and np.isfinite(every).any():
-        # scale to the errors and the median level, not to a few large levels
+        # a few large levels would make the errors too small to read: the axis shows the errors and the median level
         top = 1.25 * max(float(np.nanmax(np.abs(every))), *(float(np.nanmedian(most)) for most in levels))
         scale["y_range"] = (-top, top)
         if max(float(np.nanmax(most)) for most in levels) > top:
@@ -132,13 +132,13 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
 
 
 def good_errors(errors: pl.DataFrame, column: str) -> Floats:
-    """Return the errors of a column, NaN where the standard deviation of the reference exceeds the limit."""
+    """Return the errors in a column [m]; NaN where ``reference_good``, if there is such a column, is false."""
     values = floats(errors, column)
     return np.where(errors["reference_good"].to_numpy(), values, np.nan) if "reference_good" in errors else values
 
 
 def error_scale(error_m: Floats) -> dict[str, Any]:
-    """Scale of an axis of errors: logarithmic beyond the usual errors where a few are far larger."""
+    """Return the fields of `Chart` for the scale of an error axis, which is symlog if a few errors are far larger."""
     size = np.abs(error_m[np.isfinite(error_m)])
     if not len(size):
         return {"y_scale": "linear"}
@@ -149,7 +149,7 @@ def error_scale(error_m: Floats) -> dict[str, Any]:
 
 
 def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the largest y of each piece of x, NaN between pieces far apart."""
+    """Return the centre of each piece of the x axis with data and the largest y in it, with NaN at gaps."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(rows):
         return np.empty(0), np.empty(0)
@@ -159,7 +159,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     most = np.full(_PIECES, np.nan)
     np.fmax.at(most, piece, y[rows])
     here = np.isfinite(most)
-    # a few empty pieces are due to the spacing of the epochs
+    # single empty pieces are not gaps: they are due to the spacing of the epochs
     inside = np.flatnonzero(here)
     spacing = np.percentile(np.diff(inside), 98) if len(inside) > 1 else 1.0
     gap = np.flatnonzero(np.diff(inside) > 3 * spacing)
@@ -168,7 +168,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
-    """Return the minimum, mean and maximum error of each run by name, on the map and conventional (P1 figure 11)."""
+    """Return a chart of minimum, mean and maximum error, on the map and conventional, by run name (P1 figure 11)."""
     names: list[str] = []
     values: list[Floats] = []
     for run, errors in runs.items():
@@ -192,7 +192,8 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
     return Chart(
         name="error-ranges",
         title="Range of the errors",
-        caption=f"From the lowest to the highest signed error, with failed checks; the mark is the mean. {_SIGN}",
+        caption=f"Each bar extends from the lowest to the highest error, including positions that failed a check; the "
+        f"mark is the mean. {_SIGN}",
         x_label=_ERROR_LABEL,
         y_label="",
         layers=tuple(layers),
@@ -200,7 +201,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
 
 
 def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
-    """Return the errors of several runs over the chainage of their references, in one chart (P1 figure 8)."""
+    """Return a chart of the errors of several runs, by name, over the chainage of their references (P1 figure 8)."""
     layers, thinned = thin_points(
         Points(
             label=run, colour=CYCLE[number % len(CYCLE)], x=floats(errors, "chainage_m"),
@@ -220,17 +221,17 @@ def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
     )
 
 
-#: Parts of the level, and the level itself.
+#: Label and column of each part of the protection level, and of the level itself.
 _PARTS: Final = (
     ("fault-free part", "protection_fault_free_m"),
     ("one-fault part", "protection_one_fault_m"),
-    ("part of two faults", "protection_two_faults_m"),
-    ("RAIM's level", "raim_level_m"),
+    ("two-fault part", "protection_two_faults_m"),
+    ("RAIM level", "raim_level_m"),
     ("level", "protection_level_m"),
 )
 
 
-#: Regions with their labels and extents: from 0 to the alarm limit, and on to the end (1 to 2).
+#: Regions with the text of their labels, and the x and y of the label: 1 is the alarm limit, 2 the end of the axis.
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),
@@ -241,9 +242,10 @@ _REGIONS: Final = (
 
 
 def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
-    """Protection level over the size of the error, counted in cells, with the epochs of each region written into it.
+    """Return a chart of the protection level over the absolute error, as numbers of epochs in cells.
 
-    Values beyond the axes are counted in the last cells. The darkness of a cell grows with the logarithm of its epochs.
+    The number of epochs of each region is written into the region. Values beyond the axes are counted in the last
+    cells.
     """
     width = diagram.edges_m[1] - diagram.edges_m[0]
     edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
@@ -261,11 +263,12 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
     return Chart(
         name="stanford",
         title=title,
-        caption=f"{judged:,} epochs with an error: {regions}. Available: {100 * diagram.available_rate:.2f} % of all "
-        f"epochs{'; available windows that stay so: ' + kept if kept else ''}. Right of the diagonal the error exceeds "
-        f"the level. Values above {top:g} m, infinite levels among them, are in the last cells. Darker cells have more "
-        "epochs, on a logarithmic scale.",
-        x_label="size of the error along the line [m]",
+        caption=f"{judged:,} epochs have an error: {regions}. Levels are available at "
+        f"{100 * diagram.available_rate:.2f} % of all epochs"
+        f"{'; windows beginning at an available epoch stay available: ' + kept if kept else ''}. Right of the diagonal "
+        f"the error exceeds the level. Values above {top:g} m, including infinite levels, are counted in the last "
+        "cells. Darker cells have more epochs, on a logarithmic scale.",
+        x_label="absolute error along the line [m]",
         y_label="protection level [m]",
         layers=(
             Cells(label="epochs", colour=BLACK, x_edges=edges, y_edges=edges, counts=diagram.histogram),
@@ -281,7 +284,7 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
 
 
 def _regions(diagram: Stanford, top_m: float) -> Marks:
-    """Return the regions that the axes show, by name and epochs."""
+    """Return labels with the name and the number of epochs of each region; `top_m` is the end of the axes [m]."""
     limit = diagram.alarm_limit_m
 
     def place(value: float) -> float:
@@ -298,18 +301,21 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
 
 
 def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
-    """Return the protection level of one antenna and its parts over time; empty where the run has no levels."""
+    """Return a chart of the protection level of one antenna and its parts over time.
+
+    `positions` is the table of positions. The chart is empty if the run has no protection levels.
+    """
     return _levels(positions, alarm_limit_m, find_start(positions))
 
 
 def levels_over_chainage(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
-    """Return the same over the chainage of the positions; those without a position are left out."""
+    """Return the chart of `levels_over_time` over chainage, without epochs that have no position."""
     return _levels(positions, alarm_limit_m, None)
 
 
 def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 | None) -> Chart:
-    """Return levels over the time since `start`, or over the chainage without one."""
-    # levels are of interest near the alarm limit: a few far beyond it do not set the axis
+    """Return a chart of levels over the time since `start`, or over chainage if `start` is None."""
+    # the axis ends at twice the alarm limit, because larger levels are of little interest
     top = 2.0 * alarm_limit_m
     epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch
@@ -329,8 +335,8 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     caption[1] += f"; not drawn: {plural(infinite, 'infinite level')}." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
-            "Each part is computed with its own part of the risk; the level uses the whole risk and can be below a "
-            "part."
+            "Each part is computed with its own share of the risk; the level uses the whole risk and can be smaller "
+            "than a part."
         )
     return Chart(
         name="levels-chainage" if start is None else "levels",
@@ -345,7 +351,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
 
 
 def _count(positions: pl.DataFrame) -> str:
-    """Return the epochs by status and cause of the level, in words."""
+    """Return sentences with the numbers of epochs by status of the level and by its largest contribution."""
     sentences = []
     for column, what in (("protection_status", "Epochs"), ("protection_cause", "Largest contribution to the level")):
         if column in positions.columns:

@@ -1,4 +1,4 @@
-"""Charts of the positions on the line: plan (P1 figure 6), intervals (figure 12), satellites used."""
+"""Charts of positions on the line: plan (P1 figure 6), positioning intervals (P1 figure 12), used satellites."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ from railfix.report.plots.chart import (
 from railfix.track import Track
 
 ECEF: Final = ("x_m", "y_m", "z_m")
-#: Limits between classes of error size and of protection level [m].
+#: Limits between classes of the absolute error, and of the protection level [m].
 ERROR_CLASSES: Final = (1.0, 2.0, 5.0, 10.0)
 LEVEL_CLASSES: Final = (5.0, 10.0, 20.0, 40.0)
-#: The line is drawn this far beyond the first and the last position [m].
+#: Distance by which the line is drawn beyond the first and the last position [m].
 _BEYOND_M: Final = 30.0
 _TRACK_PIECES: Final = 1500
 _MARKS: Final = 12
@@ -60,13 +60,12 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Return the positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
+    """Return a plan of the line and the positions of one antenna, with marks of the kilometrage (P1 figure 6).
 
-    No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
-    the first that is given, and by their status without either. With `filtered`, epochs without a single-epoch position
-    are drawn at the filter's position. Without `track` the line is drawn through the positions. `tunnels_m` are
-    chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of lines to draw below,
-    each of shape (P, 2) [deg].
+    Positions are coloured by `error_m`, else by `level_m`, both of shape (rows,), else by status. With `filtered`, the
+    positions of the filter are drawn at epochs without a single-epoch position. Without `track`, the line is drawn
+    through the positions. `tunnels_m` has the first and last chainage of each tunnel. `background` has lines that are
+    drawn below, each as longitude and latitude of shape (P, 2) [deg]. The chart is empty if there is no position.
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
@@ -101,7 +100,7 @@ def plan(
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Positions too close to distinguish are drawn once ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
-    far = f" Outside: {plural(outside, 'conventional position')}." if outside else ""
+    far = f" Outside the plan: {plural(outside, 'conventional position')}." if outside else ""
     return chart(
         caption=f"Positions on the map, coloured by {coloured}; conventional positions in grey.{far} Origin at "
         f"latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}.{thinned}",
@@ -112,7 +111,7 @@ def plan(
 def _filter_points(
     placed: pl.DataFrame, filtered: pl.DataFrame, frame: LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
-    """Yield the filter's positions of epochs without a single-epoch position."""
+    """Yield the positions of the filter at epochs that are not in `placed`, if there are any."""
     alone = filtered.join(placed, on="time_gpst", how="anti").filter(pl.col("x_m").is_not_null())
     if len(alone):
         place = frame.plane(points(alone, *ECEF))
@@ -124,17 +123,17 @@ def _filter_points(
 
 @dataclass(frozen=True, kw_only=True)
 class LocalFrame:
-    """East and north at a point of the line."""
+    """Local frame with axes east, north and up at a point."""
 
-    origin_ecef_m: Floats
-    axes: Floats
+    origin_ecef_m: Floats  #: Shape (3,).
+    axes: Floats  #: Unit vectors east, north and up in ECEF as rows, shape (3, 3).
     latitude_deg: float
     longitude_deg: float
     height_m: float
 
     @classmethod
     def around(cls, ecef_m: Floats) -> LocalFrame:
-        """Return the frame at the mean of points, shape (P, 3)."""
+        """Return the frame at the mean of points, ECEF, shape (P, 3) [m]."""
         origin = ecef_m.mean(axis=0)
         latitude, longitude, height = (float(value) for value in geodetic_from_ecef(origin))
         axes = enu_axes(latitude, longitude)
@@ -142,29 +141,29 @@ class LocalFrame:
 
     @classmethod
     def at(cls, latitude_deg: float, longitude_deg: float) -> LocalFrame:
-        """Return the frame at a point on the ellipsoid."""
+        """Return the frame at a point on the ellipsoid, in degrees."""
         origin, axes = ecef_from_geodetic(latitude_deg, longitude_deg, 0.0), enu_axes(latitude_deg, longitude_deg)
         return cls(
             origin_ecef_m=origin, axes=axes, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=0.0
         )
 
     def plane(self, ecef_m: Floats) -> Floats:
-        """Return the east and north of points, shape (P, 2) [m]."""
+        """Return east and north of points in ECEF, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
     def to_plane(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
-        """Return the east and north of points of the height of the origin, shape (P, 2) [m]."""
+        """Return east and north of geodetic points [deg] at the height of the origin, shape (P, 2) [m]."""
         return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 
 def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
-    """Yield the lines of the background within a box."""
+    """Yield the part of the background lines within a box, whose corners are `low` and `high`, as one layer."""
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
     for line in lines:
         plane = frame.to_plane(line[:, 1], line[:, 0])
         inside = np.asarray(((plane > low) & (plane < high)).all(axis=1))
-        # neighbours outside stay, so that lines reach the edge
+        # the points next to inside points are kept, so that lines reach the edge of the box
         kept = inside | np.append(inside[1:], False) | np.append(False, inside[:-1])
         if inside.any():
             parts += [np.where(kept[:, None], plane, np.nan), gap]
@@ -176,7 +175,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
 def _line(
     track: Track | None, frame: LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
 ) -> Iterator[Curve]:
-    """Yield the line between the first and the last position, and its tunnels."""
+    """Yield the line from before the first to after the last position, and its tunnels."""
     if track is None:
         yield _line_of_positions(here, chainage_m)
         return
@@ -198,7 +197,7 @@ def _line(
 def _classes(
     positions: pl.DataFrame, error_m: Floats | None, level_m: Floats | None
 ) -> tuple[list[tuple[str, str, Masks]], str]:
-    """Label, colour and rows of each class of positions, and the quantity."""
+    """Return label, colour and mask of each class of positions, and the name of the quantity that defines it."""
     if error_m is not None:
         return size_classes(np.abs(error_m), ERROR_CLASSES, "error", "no reference"), "the size of their error"
     if level_m is not None:
@@ -209,7 +208,7 @@ def _classes(
 
 
 def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
-    """Return the classes of sizes, from small to large."""
+    """Return label, colour and mask of each class of values between `edges` [m], and first of the NaN values."""
     classes = [(unknown, BLACK, np.isnan(size))]
     for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):
         label = f"{quantity} {low:g} to {high:g} m" if np.isfinite(high) else f"{quantity} {low:g} m and more"
@@ -218,7 +217,7 @@ def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: s
 
 
 def _line_of_positions(here: Floats, chainage_m: Floats) -> Curve:
-    """Return the line through the positions: the middle of each short piece, broken at wide gaps."""
+    """Return a line through one position per short piece of chainage, with breaks at wide gaps."""
     order = np.argsort(chainage_m, kind="stable")
     chainage, place = chainage_m[order], here[order]
     width = max(float(np.ptp(chainage)) / _TRACK_PIECES, 0.5)
@@ -229,7 +228,7 @@ def _line_of_positions(here: Floats, chainage_m: Floats) -> Curve:
 
 
 def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
-    """About a dozen marks at round values of the kilometrage, or of the chainage without one."""
+    """Return about a dozen marks at round values of the kilometrage, or of the chainage if there is no kilometrage."""
     along = floats(positions, "kilometrage_m")
     label = "kilometrage"
     if not np.isfinite(along).any():
@@ -247,7 +246,11 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Return chainage and distance [m] from the previous position while moving; `prefix` begins the columns."""
+    """Return the chainage of positions and the distance from the previous position [m], without standstill if known.
+
+    `prefix` is the beginning of the names of the columns. Without a column of intervals, the distances are computed
+    from the chainages, and standstill is included.
+    """
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
         moved = distance > 0.0
@@ -261,7 +264,7 @@ _FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("on
 
 
 def interval_over_chainage(table: pl.DataFrame) -> Chart:
-    """Distance from each position to the previous one, over chainage (P1 figure 12), of the table of `interval`."""
+    """Return a chart of the distance from the previous position over chainage (P1 figure 12); see `interval`."""
     intervals = {label: interval(table, prefix) for label, prefix, _, _ in _FIXES}
     layers, thinned = thin_points(
         Points(label=label, colour=colour, shape=shape, x=intervals[label][0], y=intervals[label][1])  # type: ignore[arg-type]
@@ -271,7 +274,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
     return Chart(
         name="interval-chainage",
         title="Positioning interval",
-        caption=f"Distance along the line from each position to the previous one. {_by(table)} "
+        caption=f"Distance along the line between consecutive positions. {_by(table)} "
         f"Longest: {', '.join(longest)}.{thinned}",
         x_label="chainage [m]",
         y_label="distance from the previous position [m]",
@@ -281,7 +284,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
 
 
 def interval_distribution(table: pl.DataFrame) -> Chart:
-    """Return the distribution of distances from the previous position (P1 figure 12); see `interval`."""
+    """Return a histogram of the distance from the previous position (P1 figure 12); see `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)
@@ -296,7 +299,7 @@ def interval_distribution(table: pl.DataFrame) -> Chart:
     return Chart(
         name="interval-distribution",
         title="Positioning interval, distribution",
-        caption=f"Number of positions by their distance from the previous one, in classes of {step:g} m. {_by(table)}",
+        caption=f"Number of positions by distance from the previous position, in classes of {step:g} m. {_by(table)}",
         x_label="distance from the previous position [m]",
         y_label="positions",
         layers=tuple(layers),
@@ -307,12 +310,12 @@ def interval_distribution(table: pl.DataFrame) -> Chart:
 
 def _by(table: pl.DataFrame) -> str:
     if "interval_m" in table.columns:
-        return "Distances travelled by the reference; intervals at standstill are left out."
-    return "Without a reference the distances are between the positions, including their noise."
+        return "The reference gives the distance travelled; intervals at standstill are omitted."
+    return "Without a reference, the distances are computed from the positions and include their noise."
 
 
 def satellites_over_time(positions: pl.DataFrame) -> Chart:
-    """Return satellites used and rejected at each epoch of one antenna."""
+    """Return a chart of the numbers of used and rejected satellites at each epoch of one antenna."""
     start = find_start(positions)
     x = since(positions, start)
     columns = (("rejected", "n_rejected", CONVENTIONAL), ("used", "n_used", CONSTRAINED))
@@ -323,7 +326,7 @@ def satellites_over_time(positions: pl.DataFrame) -> Chart:
     return Chart(
         name="satellites",
         title="Satellites",
-        caption=f"Satellites with a pseudorange.{thinned}",
+        caption=f"Numbers of satellites with a pseudorange.{thinned}",
         x_label="GPS time",
         y_label="satellites",
         layers=tuple(layers),

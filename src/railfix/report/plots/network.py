@@ -1,4 +1,4 @@
-"""Pictures of maps: networks of tracks, the quality of a map, a surveyed line, probabilities of tracks at rest."""
+"""Charts of networks of tracks, map quality, surveyed lines, and probabilities of the track of a train at rest."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from railfix.track.network_match import Matched, PlanLog
     from railfix.track.network_read import NetworkQuality
 
-#: Points of tracks that are drawn at most; of larger networks every n-th one and the ends.
+#: Maximum number of drawn points of tracks; of larger networks, every n-th point and the ends are drawn.
 _DRAWN: Final = 200_000
-#: Tracks that are named in the plan at most.
+#: Maximum number of tracks that are named in the plan.
 _NAMED: Final = 400
-#: Margin of the view around a run, as a fraction of its larger extent; smallest margin [m]; distance of a
-#: name from its track, as a fraction of the extent of the view.
+#: Margin of the view around a run as a fraction of its larger extent, minimum margin [m], and distance of a name from
+#: its track as a fraction of the extent of the view.
 _MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
-#: Positions by the probability of their track: at least this, and the colour.
+#: Smallest track probability and colour of each class of positions.
 _CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
 
 
@@ -41,12 +41,12 @@ def plot_network(
     quality: NetworkQuality | None = None,
     run: tuple[PlanLog, Matched] | None = None,
 ) -> None:
-    """Write `network_plan` as a PNG or SVG file; OutputError where it cannot be written."""
+    """Write `network_plan` as a PNG or SVG file; OutputError if it cannot be written."""
     save_figure(draw_figure(network_plan(network, quality, run)), path)
 
 
 def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[PlanLog, Matched] | None) -> Chart:
-    """Return tracks with their switches and names, findings of the check, and the positions of a run."""
+    """Return a plan of the tracks with switches and names, findings of the map check, and the positions of a run."""
     latitude, longitude = _degrees(network)
     frame = network_frame(network)
     nth = max(1, len(latitude) // _DRAWN)
@@ -73,9 +73,9 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
         middle = (network.first_point[:-1] + network.first_point[1:]) // 2
         east, north = frame.to_plane(latitude[middle], longitude[middle]).T
         layers.append(Marks(label="names", colour=BLACK, x=east, y=north, words=network.names, place="on"))
-    caption = f"Plan about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}."
+    caption = f"Origin at latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}."
     if nth > 1:
-        caption += f" Every {nth}th point of a track and its ends are drawn."
+        caption += f" One of {nth} points of each track, and its ends, are drawn."
     return Chart(
         name="network", title="Tracks", caption=caption, x_label="east [m]", y_label="north [m]", layers=tuple(layers),
         equal=True, x_range=view and view[0], y_range=view and view[1],
@@ -91,13 +91,13 @@ def _degrees(network: Network) -> tuple[Floats, Floats]:
 
 
 def network_frame(network: Network) -> LocalFrame:
-    """Return the plane of the plan of a network, about the median of its points."""
+    """Return the local frame for the plan of a network, at the median of its points."""
     latitude, longitude = _degrees(network)
     return LocalFrame.at(float(np.median(latitude)), float(np.median(longitude)))
 
 
 def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Return the ranges east and north of the positions with a margin; None without positions."""
+    """Return the ranges of the east and north axes [m] around the positions of a run; None without positions."""
     known = np.isfinite(log.latitude_deg)
     if not known.any():
         return None
@@ -111,7 +111,7 @@ def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[f
 def _names_beside(
     network: Network, frame: LocalFrame, matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
 ) -> Marks:
-    """Names of the tracks that a run has passed, next to the middle of its positions there, on alternating sides."""
+    """Return the names of the tracks on which a run has positions, beside the middle position on alternating sides."""
     passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
     places = [np.flatnonzero(matched.track == track) for track in passed][:_NAMED]
     rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
@@ -119,14 +119,14 @@ def _names_beside(
     points, ahead, _ = network.course_on(track, matched.chainage_m[rows])
     (x, y), (dx, dy) = frame.plane(points).T, (ahead @ frame.axes[:2].T).T
     span = max(high - low for low, high in view)
-    # words are wider than high: farther from a line that runs north
+    # texts are wider than high, and are therefore placed farther from a track that runs north
     away = np.where(np.arange(len(rows)) % 2, -1.0, 1.0) * span * (_BESIDE * np.abs(dx) + 2.0 * _BESIDE * np.abs(dy))
     words = tuple(network.names[t] for t in track)
     return Marks(label="names", colour=BLACK, x=x + away * dy, y=y - away * dx, words=words, place="on")
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
-    """Return every n-th point of each track and its last one, and where in them a new track begins."""
+    """Return indices of every n-th and the last point of each track, and the positions in them where a track begins."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
     place = np.arange(len(track)) - first[track]
@@ -135,29 +135,29 @@ def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
 
 
 def _switches(network: Network) -> Indices:
-    """Track and end of each stem of a switch, shape (n, 2)."""
+    """Return the track and the end of the stem of each switch, shape (n, 2)."""
     stems = sorted(end for end, others in network.passages.items() if len(others) > 1)
     return np.array(stems, dtype=np.intp).reshape(-1, 2)
 
 
 def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]:
-    """Return the positions in classes of the probability of their track, and those on none."""
+    """Return layers of the positions by class of track probability, and of the positions without a track."""
     east, north = frame.to_plane(log.latitude_deg, log.longitude_deg).T
     on, layers, above = matched.track >= 0, [], np.inf
     for low, colour in _CLASSES:
         rows = on & (matched.probability >= low) & (matched.probability < above)
         layers.append(
-            Points(label=f"position, probability of its track from {low:g}", colour=colour, x=east[rows], y=north[rows])
+            Points(label=f"position, track probability from {low:g}", colour=colour, x=east[rows], y=north[rows])
         )
         above = low
     off = ~on & np.isfinite(log.latitude_deg)
-    layers.append(Points(label="position on no track", colour=BLACK, x=east[off], y=north[off], shape="ring"))
+    layers.append(Points(label="position without a track", colour=BLACK, x=east[off], y=north[off], shape="ring"))
     return [layer for layer in layers if len(layer.x)]
 
 
 _COLOURS: Final = {"error": "#c1272d", "warning": "#e08e0b"}
 _LINE: Final = "#1f4e79"
-#: Panel along the line in which each kind of finding is marked; other kinds are marked in the plan only.
+#: Panel in which each kind of finding is marked; other kinds are marked in the plan only.
 _PANELS: Final = {
     "mid-chord": "mid-chord",
     "duplicate": "spacing",
@@ -174,7 +174,10 @@ _PANELS: Final = {
 
 
 def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None:
-    """Draw plan, mid-chord deviation, spacing, turns, gradient and cant, with the findings marked, as a PNG file."""
+    """Write a picture of the plan, and of mid-chord deviation, point spacing, turns, gradient and cant over chainage.
+
+    The findings of the map check are marked. The file is PNG or SVG; OutputError if it cannot be written.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 14), layout="constrained")
@@ -220,7 +223,7 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
         if np.isfinite(y).any():
             axes.plot(x, y, "-", color=_LINE, linewidth=0.9)
         else:
-            axes.text(0.5, 0.5, "the map has none", transform=axes.transAxes, ha="center", va="center", color="0.4")
+            axes.text(0.5, 0.5, "not in the map", transform=axes.transAxes, ha="center", va="center", color="0.4")
         if limit is not None and np.nanmax(y, initial=0.0) > limit / 4.0:
             axes.axhline(limit, color=_COLOURS["error"], linewidth=0.8, linestyle="--")
         axes.set_ylabel(label, fontsize=8)
@@ -239,7 +242,10 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
 
 
 def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
-    """Draw positions, map and passes in plan, and height and standard deviations along the line."""
+    """Write a picture of a survey: positions and map in plan, and height and standard deviations over chainage.
+
+    OutputError: the file cannot be written.
+    """
     from matplotlib.figure import Figure
 
     survey, track = surveyed.survey, surveyed.survey.track
@@ -283,7 +289,7 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
 
 
 def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, risk: float) -> None:
-    """Draw the probability of not being each track over time, with the risk allowed."""
+    """Write a picture of the probabilities of the tracks, and of another track, over time, with the allowed risk."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)
@@ -293,7 +299,7 @@ def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, r
         if shares[:, k].max() > 1e-3:
             above.plot(decision.seconds, shares[:, k], marker=".", label=name)
             below.semilogy(decision.seconds, np.maximum(1.0 - shares[:, k], 1e-12), marker=".", label=name)
-    below.axhline(risk, color="black", linestyle="--", label="risk allowed")
+    below.axhline(risk, color="black", linestyle="--", label="allowed risk")
     above.set(ylabel="probability", title=f"track: {decision.track}")
     below.set(ylabel="probability of another track", xlabel="time at rest [s]")
     below.legend(loc="best", fontsize=7)

@@ -1,4 +1,4 @@
-"""Charts of the screens: each metric against its limit, and the C/N0 curve (P1 figure 3)."""
+"""Charts of the screens: metrics with their limits, and the C/N0 curve (P1 figure 3)."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ from railfix.screens import SCREENS, Cn0Limits, ScreenPicture
 
 _KEPT: Final = "#2f86b8"
 _COLUMNS: Final = 4
-#: Rows of a chart that are evaluated in one step.
+#: Number of rows of a chart that are processed together.
 _BLOCK: Final = 100_000
-#: Points of the line of a limit: two a pixel of a wide chart.
+#: Maximum number of points of the curve of a limit.
 _LINE_POINTS: Final = 1500
 
 
 def draw_screen(
     path: str | PathLike[str], picture: ScreenPicture, time: Datetimes, chainage_m: Floats | None = None
 ) -> Path:
-    """Draw a metric against its limit over T times, and over chainage [m] where it is known, as a PNG file.
+    """Write a picture of a metric with its limit over T times and, if given, over chainage [m]; return its path.
 
-    OutputError: the file cannot be written.
+    The file is PNG or SVG. OutputError: it cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -64,7 +64,11 @@ def draw_screen(
 
 
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
-    """Return the chart of a metric against its limit over T times; `epoch`, shape (T,), gives the time of each row."""
+    """Return a chart of a metric with its limit over time.
+
+    `time` has the time of each of T rows of the picture. With `epoch`, shape (T,), it has the times of E epochs, and
+    `epoch` is the index of the epoch of each row.
+    """
     start = time.min() if len(time) else np.datetime64(0, "ns")
     return _screen(picture, seconds(time - start), epoch, start)
 
@@ -72,12 +76,12 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
 def screen_over_chainage(
     picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
 ) -> Chart:
-    """Return the same over the chainage, shape (T,), or (E,) with `epoch` [m]; see `screen_over_time`."""
+    """Return the chart of `screen_over_time` over chainage [m], which has shape (T,), or (E,) with `epoch`."""
     return _screen(picture, chainage_m, epoch, None)
 
 
 def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None, start: np.datetime64 | None) -> Chart:
-    """Return the metric over the time since `start`, or over the chainage without one."""
+    """Return a chart of the metric over the time since `start`, or over chainage if `start` is None."""
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
@@ -114,7 +118,9 @@ def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
     return Chart(
         name="chainage" if start is None else "time",
         title=f"{picture.title}: {judged:,} tested, {rejected:,} rejected ({share})",
-        caption=(("" if same else "Line: the tightest limit of each epoch.") + counts_sentence(shown, total)).strip(),
+        caption=(
+            ("" if same else "The line is the tightest limit of each epoch.") + counts_sentence(shown, total)
+        ).strip(),
         x_label="chainage [m]" if start is None else "GPS time",
         y_label=picture.label,
         layers=tuple(layers),
@@ -127,7 +133,7 @@ def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
 def _blocks(
     picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
 ) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
-    """Yield x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
+    """Yield flat arrays of x, metric, rejection and limit for blocks of `_BLOCK` rows, to limit the memory."""
     limit = np.broadcast_to(picture.limit, picture.metric.shape)
     for first in range(0, len(picture.metric), _BLOCK):
         rows = slice(first, first + _BLOCK)
@@ -137,14 +143,14 @@ def _blocks(
 
 
 def _join(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Return the pairs of arrays end to end."""
+    """Concatenate pairs of arrays."""
     if not parts:
         return np.empty(0), np.empty(0)
     return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
 
 
 def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
-    """Return the smallest limit at each distinct x, in rising order of x."""
+    """Return the distinct values of x in ascending order, and the smallest limit at each of them."""
     known = np.isfinite(x)
     x, limit = x[known], limit[known]
     order = np.argsort(x, kind="stable")
@@ -155,7 +161,10 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
 
 
 def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples) -> Path:
-    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3), as PNG."""
+    """Write a picture of C/N0 over elevation with mean and threshold (P1 figure 3), and return its path.
+
+    It has one panel per constellation and signal of the curve. OutputError: the file cannot be written.
+    """
     from matplotlib.figure import Figure
 
     charts = [open_sky_chart(mean, *samples.of(mean.kind, mean.signal), Cn0Limits()) for mean in curve.means]
@@ -174,31 +183,32 @@ def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Sampl
 
 @dataclass(frozen=True, kw_only=True)
 class _ScreenRows:
-    """Positions and observations of one antenna; the observations of a column are read when it is drawn."""
+    """Positions and observations of one antenna; a column of the observations is read when it is drawn."""
 
     positions: pl.DataFrame
     observations: pl.LazyFrame
     epoch: NDArray[np.int32]
 
     def channels(self, column: str) -> Floats:
-        """Return one column of the observations in the precision of charts, shape (N, 1)."""
+        """Return one column of the observations in single precision, shape (N, 1); NaN for absent values."""
         values = pl.col(column).cast(pl.Float32).fill_null(float("nan"))
         return self.observations.select(values).collect()[column].to_numpy()[:, None]
 
     def rejected(self, reason: Reason) -> Masks:
-        """Return observations with a reason, shape (N, 1)."""
+        """Return whether each observation has a rejection reason, shape (N, 1)."""
         flags = self.observations.select((pl.col("reason") & int(reason)) != 0).collect()
         return flags["reason"].to_numpy()[:, None]
 
     def epochs(self, column: str) -> Floats:
-        """Return one column of the positions, shape (T, 1)."""
+        """Return one column of the positions, shape (T, 1); NaN for absent values."""
         return floats(self.positions, column)[:, None]
 
 
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
-    """Draw every screen of a run that tested anything, one picture per antenna: ``front_doppler.png`` and the like.
+    """Write one picture per screen and antenna, such as ``front_doppler.png``, into the folder `out`; return the paths.
 
-    InputFileError: the folder is not that of a run, or the run wrote no observations (``railfix run --observations``).
+    Screens that tested nothing have no picture. InputFileError: `run` is not a results folder, or the run wrote no
+    observations (``railfix run --observations``). OutputError: the folder or a file cannot be written.
     """
     (reported,), _ = read_runs([run])
     if reported.observations is None:
@@ -220,7 +230,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
 
 
 def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
-    """Return the columns of the screens that tables of an earlier version lack."""
+    """Return the names of columns of the screens that the tables, written by an earlier version, lack."""
     columns = [column for screen in SCREENS for column in screen.columns]
     missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
     missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())
@@ -229,15 +239,14 @@ def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list
 
 @dataclass(frozen=True, kw_only=True)
 class RunScreen:
-    """One screen of a run over one antenna."""
+    """Result of one screen of a run for one antenna."""
 
-    #: ``front``, ``doppler``.
-    antenna: str
-    name: str
-    picture: ScreenPicture  #: A row an epoch, or an observation.
-    epoch: NDArray[np.int32] | None  #: Epoch of each row; None where the rows are the epochs; shape (T,).
-    epoch_time: Datetimes  #: Shape (E,).
-    epoch_chainage_m: Floats  #: Of the position; NaN without one; shape (E,).
+    antenna: str  #: ``front`` or ``rear``.
+    name: str  #: Name of the picture, such as ``doppler``.
+    picture: ScreenPicture  #: Metric and limit, with one row per epoch or per observation.
+    epoch: NDArray[np.int32] | None  #: Index of the epoch of each row, shape (T,); None if the rows are the epochs.
+    epoch_time: Datetimes  #: Time of each epoch, shape (E,).
+    epoch_chainage_m: Floats  #: Chainage of the position of each epoch, shape (E,); NaN without a position.
 
     @property
     def time(self) -> Datetimes:
@@ -251,7 +260,7 @@ class RunScreen:
 
 
 def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
-    """Yield every screen of a run that tested anything, antenna by antenna, with the settings that were used."""
+    """Yield the screens of a run that tested anything, by antenna; `config` has the settings of the run."""
     antennas = positions["antenna"].unique(maintain_order=True).to_list()
     for antenna in antennas:
         mine = positions.filter(pl.col("antenna") == antenna) if len(antennas) > 1 else positions
@@ -274,7 +283,7 @@ def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyF
 
 
 def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
-    """Yield the pictures of the active screens and of the protection level, with the names of their files."""
+    """Yield the name and the picture of each active screen, and of the protection level if it is on."""
     for screen in SCREENS:
         if screen.name in config.screens:
             for name, picture in screen.pictures(rows, getattr(config, screen.name)):
@@ -285,7 +294,7 @@ def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple
             yield (
                 "protection_level",
                 ScreenPicture(
-                    title=f"{antenna}: protection level along the line against the alarm limit (finite ones)",
+                    title=f"{antenna}: finite protection levels along the line, and the alarm limit",
                     label="protection level [m]",
                     metric=level,
                     reject=level > config.alarm_limit_m,

@@ -1,4 +1,4 @@
-"""Charts of the signals: C/N0 over elevation (P1 figure 3), the sky."""
+"""Charts of the signals: C/N0 over elevation (P1 figure 3), and sky plots."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from railfix.report.plots.chart import (
 )
 from railfix.screens import Cn0Limits
 
-#: Cells of C/N0 over elevation.
+#: Edges of the cells of elevation [deg] and C/N0 [dB-Hz].
 _ELEVATION_EDGES: Final = np.arange(0.0, 91.0, 1.0)
 _CN0_EDGES: Final = np.arange(10.0, 60.5, 0.5)
-#: Fewest samples of a piece of elevation to draw a mean of.
+#: Minimum number of samples in an interval of elevation for which the mean is drawn.
 _LEAST: Final = 10
-#: Largest number of epochs of the sky plot.
+#: Maximum number of epochs of a sky plot.
 SKY_EPOCHS: Final = 2000
 #: Columns of the observations that the charts use.
 CN0_COLUMNS: Final = ("satellite", "signal", "reason", "elevation_deg", "cn0_dbhz")
@@ -49,7 +49,11 @@ def cn0_over_elevation(
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
 ) -> list[Chart]:
-    """Return C/N0 over elevation with mean and thresholds, a chart for each constellation and signal (P1 figure 3)."""
+    """Return a chart of C/N0 over elevation for each constellation and signal (P1 figure 3).
+
+    The chart has the mean, the thresholds of the screen `limits`, and the elevation mask. With a `curve`, the mean is
+    that of the curve, otherwise it is computed from the observations.
+    """
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
         pl.col("cn0_dbhz").is_finite(),
@@ -69,13 +73,13 @@ def cn0_over_elevation(
         counts = np.zeros((len(_ELEVATION_EDGES) - 1, len(_CN0_EDGES) - 1), dtype=np.int64)
         drawn = mine.filter(pl.col("up").is_between(0, counts.shape[1] - 1), pl.col("across") < len(counts))
         np.add.at(counts, (drawn["across"].to_numpy(), drawn["up"].to_numpy()), drawn["count"].to_numpy())
-        caption = f"{size:,} observations, the more the darker."
+        caption = f"{size:,} observations; darker cells have more."
         charts.append(_cn0_chart(kind, signal, counts, lines, title="C/N0 over elevation: ", caption=caption))
     return charts
 
 
 def open_sky_chart(mean: Cn0Mean, elevation_deg: Floats, cn0_dbhz: Floats, limits: Cn0Limits) -> Chart:
-    """Return the samples of one constellation and signal under open sky, with their mean and the thresholds."""
+    """Return a chart of the open-sky samples of one constellation and signal, with their mean and the thresholds."""
     counts = np.histogram2d(elevation_deg, cn0_dbhz, bins=[_ELEVATION_EDGES, _CN0_EDGES])[0].astype(np.int64)
     return _cn0_chart(mean.kind, mean.signal, counts, (*_open_sky(mean, limits), *_floor(limits)))
 
@@ -98,7 +102,7 @@ def _cn0_chart(
 
 
 def _cell(column: str, edges: Floats) -> pl.Expr:
-    """Return the number of the cell of a value between edges of equal distance, the last edge in the last cell."""
+    """Return the index of the cell of a value between equidistant edges; the last edge belongs to the last cell."""
     width, last = float(edges[1] - edges[0]), float(edges[-1])
     number = ((pl.col(column) - float(edges[0])) / width).floor().cast(pl.Int64)
     return pl.when(pl.col(column) == last).then(len(edges) - 2).otherwise(number)
@@ -121,7 +125,7 @@ def _lines(
 
 
 def _open_sky(mean: Cn0Mean, limits: Cn0Limits | None) -> Iterator[Layer]:
-    """Yield the mean of the open sky, and the threshold below it."""
+    """Yield the mean of a C/N0 curve (open sky), and the threshold below it if the screen has one."""
     at = np.linspace(0.0, 90.0, 181)
     level = mean.at(at)
     yield Curve(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
@@ -153,9 +157,10 @@ def sky_epochs(
     epochs: int = SKY_EPOCHS,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Return satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
+    """Return the satellites in view of one antenna at some epochs, for sky plots.
 
-    At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones.
+    At most `epochs` epochs are returned: up to half of them are `wanted` epochs, and the others are evenly spaced. Each
+    satellite has one row per epoch, with its selected signal.
     """
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
     times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]

@@ -1,4 +1,4 @@
-// What goes wrong in this page is written into it, where a test reads it.
+// Errors of the scripts are written into a hidden element of the page, which tests read.
 "use strict";
 (function () {
   const place = document.getElementById("railfix-errors");

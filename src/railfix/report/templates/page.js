@@ -1,5 +1,5 @@
-// Charts of the page as traces of plotly.js; charts of one antenna zoomed together; the satellites of a chosen epoch
-// beside the charts; tables as CSV files.
+// Charts of the page as traces of plotly.js, with a common zoom of the charts of one antenna; a sky plot of the chosen
+// epoch next to the charts; tables as CSV files.
 "use strict";
 (function () {
   const LIGHT = { ink: "#1b1b1b", grid: "#e3e3e3", axis: "#767676", paper: "#ffffff" };
@@ -12,14 +12,14 @@
   let printing = false;
   const theme = () => darkness.matches && !printing ? DARK : LIGHT;
 
-  // Colour of a layer: lighter on a dark page.
+  // Return the colour of a layer, which is lighter on a dark page.
   function tone(colour) {
     if (theme() === LIGHT) return colour;
     if (colour === "#000000") return DARK.ink;
     return "#" + [1, 3, 5].map(i => Math.round(parseInt(colour.slice(i, i + 2), 16) * 0.6 + 255 * 0.4).toString(16).padStart(2, "0")).join("");
   }
 
-  // ---- numbers of the page: float32 or whole numbers, little endian, base 64
+  // ---- arrays of the page: float32 or unsigned integers, little endian, in base 64
   function numbers(packed) {
     const kinds = { f: Float32Array, h: Uint16Array, i: Uint32Array };
     const raw = atob(packed.slice(1)), bytes = new Uint8Array(raw.length);
@@ -35,7 +35,7 @@
   function clock(seconds) { return new Date(Math.round(seconds * 1e3)).toISOString().slice(11, 21); }
   function date(seconds) { return new Date(seconds * 1e3).toISOString().slice(0, 10); }
 
-  // ---- axes: plotly has no axis that is linear around zero and logarithmic beyond
+  // ---- axes: symlog values are scaled here, because plotly has no axis that is linear near zero and logarithmic beyond
   function scaled(chart) {
     if (chart.y_scale !== "symlog") return v => v;
     const linear = chart.y_linear;
@@ -68,7 +68,7 @@
       return { mode: "lines", x: abscissa(chart, layer.x), y: ordinate(chart, layer.y), customdata: layer.y,
         hovertemplate: hover(chart, layer.label), line: { color: tone(layer.colour), width: layer.width, dash: DASHES[layer.dash] } };
     },
-    band(chart, layer) { // one closed outline for each stretch without a gap
+    band(chart, layer) { // each stretch without a gap is one closed outline
       const x = [], y = [], at = abscissa(chart, layer.x), low = ordinate(chart, layer.low), high = ordinate(chart, layer.high);
       for (let i = 0; i < at.length;) {
         let j = i;
@@ -112,7 +112,7 @@
         marker: { symbol: "cross-thin-open", size: 8, color: colour, line: { color: colour, width: 1.5 } } };
     }
   };
-  function meanMarks(chart, layer) { // of ranges: a bar across at the mean
+  function meanMarks(chart, layer) { // marks at the means of range bars
     const rows = layer.names.map((_, i) => i).filter(i => layer.mid[i] === layer.mid[i]);
     return { mode: "markers", x: rows.map(i => layer.mid[i]), y: rows, showlegend: false, hoverinfo: "skip",
       marker: { symbol: "line-ns-open", size: 16, color: tone(layer.colour), line: { width: 3, color: tone(layer.colour) } } };
@@ -129,7 +129,7 @@
   };
   Plot.prototype.traces = function () {
     const chart = this.load(), traces = [], seen = new Set();
-    this.layers = []; // layer of each trace
+    this.layers = []; // the layer of each trace, by index of the trace
     for (const layer of chart.layers) {
       const first = Boolean(layer.label) && !seen.has(layer.label);
       seen.add(layer.label);
@@ -143,7 +143,7 @@
     const chart = this.load(), t = theme(), half = this.figure.classList.contains("half");
     const names = chart.layers.find(layer => layer.kind === "ranges"), labels = new Set(chart.layers.map(layer => layer.label).filter(Boolean));
     const base = names ? 110 + 26 * names.names.length : chart.equal ? (half ? 360 : 500) : half ? 320 : 350;
-    // Rows of the legend below the axis, by the letters of its entries.
+    // The number of rows of the legend below the axis is estimated from the number of letters of its entries.
     const width = printing ? PRINTED[half ? "half" : "wide"] : this.div.clientWidth;
     const row = Math.max(20, (width - MARGIN.l - MARGIN.r) / 6.6), letters = [...labels].map(label => 8 + label.length);
     this.below = MARGIN.b + 21 * letters.reduce(([rows, used], wide) => used + wide > row ? [rows + 1, wide] : [rows, used + wide], [letters.length ? 1 : 0, 0])[0];
@@ -171,7 +171,7 @@
     if (!drawn) this.listen();
     this.thin();
   };
-  // Range of an axis as the reader sees it, in the units of the data: milliseconds since 1970 on an axis of time.
+  // Return the visible range of an axis in the units of the data, which are milliseconds since 1970 on a time axis.
   Plot.prototype.range = function (name) {
     const range = this.div.layout[name].range, isTime = name === "xaxis" && this.chart.start !== undefined;
     return isTime ? range.map(v => typeof v === "number" ? v : Date.parse(String(v).replace(" ", "T") + "Z")) : range.map(Number);
@@ -188,7 +188,7 @@
       const point = event.points[0], layer = this.layers[point.curveNumber];
       if (layer.epoch && skies[this.figure.dataset.sky]) choose(this.figure.dataset.sky, (this.chart.epoch0 || 0) + layer.epoch[point.pointNumber], this.figure);
     });
-    new ResizeObserver(() => { // another width has other rows of the legend
+    new ResizeObserver(() => { // the number of rows of the legend depends on the width
       const wide = this.div.clientWidth, layout = this.layout();
       if (!printing && wide && this.div.layout.width !== wide) Plotly.relayout(this.div, { width: wide, height: layout.height, "margin.b": this.below });
     }).observe(this.div);
@@ -213,7 +213,7 @@
     return seen.length ? seen[Math.floor(seen.length / 2)] : sky.time(0);
   };
   Plot.prototype.epochLayers = function () { return this.load().layers.filter(layer => layer.kind === "points" && layer.epoch); };
-  // Epochs of the points inside the ranges of the axes, in order of time [s since 1970].
+  // Return the epochs of the points inside the visible ranges, in order of time [s since 1970].
   Plot.prototype.seenEpochs = function () {
     const chart = this.load(), [x0, x1] = this.range("xaxis"), [y0, y1] = this.range("yaxis"), out = [];
     for (const layer of this.epochLayers()) {
@@ -223,7 +223,7 @@
     }
     return Float64Array.from(out).sort();
   };
-  // Labels beside one another: those that would overlap at the present scale are left out.
+  // Hide the labels that would overlap others at the present scale.
   Plot.prototype.thin = function () {
     this.layers.forEach((layer, k) => {
       if (layer.kind !== "marks" || layer.words.length < 10) return;
@@ -240,7 +240,7 @@
       Plotly.restyle(this.div, { text: [text] }, [k]);
     });
   };
-  // A mark at the chosen epoch: a line across an axis of time, else a ring around the point.
+  // Return the mark of the chosen epoch: a vertical line on a time axis, otherwise a ring around the point.
   Plot.prototype.chosenShapes = function () {
     const sky = skies[this.figure.dataset.sky], seconds = sky && sky.chosen;
     if (seconds === undefined || seconds === null || !sky) return [];
@@ -255,7 +255,7 @@
     return [{ type: "circle", xsizemode: "pixel", ysizemode: "pixel", xanchor: best[0], yanchor: best[1], x0: -8, x1: 8, y0: -8, y1: 8, line }];
   };
 
-  // ---- charts of one antenna show the same epochs; those with the same axis the same range
+  // ---- after a zoom, charts with the same axis show the same range, and other charts of the antenna the same epochs
   function together(source) {
     const { zoom, linked } = source.figure.dataset, others = plots.filter(plot => plot !== source && plot.chart && plot.figure.dataset.drawn);
     const epochs = linked && source.zoomed ? source.seenEpochs() : null;
@@ -271,11 +271,11 @@
       Promise.resolve(change && Plotly.relayout(plot.div, change)).then(() => { plot.following = false; plot.thin(); });
     }
   }
-  // Ranges of the axes that hold the points of some epochs (null: none of them is in the chart).
+  // Return the axis ranges that contain the points of some epochs; null if the chart has none of these epochs.
   Plot.prototype.around = function (epochs) {
     if (!epochs || !epochs.length) return null;
     const gap = Math.max(2, (epochs[epochs.length - 1] - epochs[0]) / 50), low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-    const seen = seconds => { // the epoch before or after is among those of the other chart, or near: charts are thinned
+    const seen = seconds => { // charts are thinned: an epoch between two near epochs of the other chart counts as one of them
       let a = 0, b = epochs.length;
       while (a < b) { const m = (a + b) >> 1; if (epochs[m] < seconds) a = m + 1; else b = m; }
       return a < epochs.length && epochs[a] === seconds || a > 0 && a < epochs.length && epochs[a] - epochs[a - 1] <= gap;
@@ -294,7 +294,7 @@
     return change;
   };
 
-  // ---- the sky of one epoch: a picture and a table, which stand beside the charts once an epoch was chosen
+  // ---- sky plot and table of satellites of one epoch, which are shown next to the charts after an epoch was chosen
   function Sky(figure) {
     this.figure = figure;
     this.picture = figure.querySelector("svg");
@@ -365,7 +365,7 @@
     if (text !== undefined) element.textContent = text;
     return element;
   }
-  // North up, the horizon at the rim with a radius of 90.
+  // Return the elements of a sky plot with north up and a radius of 90 deg minus elevation.
   function skyMarks(satellites) {
     const out = [90, 60, 30].map(r => svg("circle", { class: "grid", r }));
     out.push(svg("path", { class: "grid", d: "M-90 0H90M0-90V90" }));
@@ -384,8 +384,8 @@
     }
     return out;
   }
-  // The panel and the mark come first, over the page; then the charts make room, and the one that was clicked on, `figure`,
-  // stays in the window.
+  // Show the sky plot `id` at an epoch. The panel first covers the page; the charts then become narrower, and the clicked
+  // chart, `figure`, is scrolled into view.
   function choose(id, seconds, figure) {
     const sky = skies[id];
     sky.chosen = seconds;
@@ -404,7 +404,7 @@
       if (plot.chart && plot.figure.dataset.drawn && plot.figure.dataset.sky === id && inSight(plot.figure)) Plotly.relayout(plot.div, { shapes: plot.chosenShapes() });
   }
 
-  // ---- drawn when they come near the window, all of them for print
+  // ---- charts are drawn when they are near the visible part of the page, and all charts before printing
   function timing(name) { document.getElementById("railfix-timing").dataset[name] = performance.now().toFixed(0); }
   document.querySelectorAll("figure[data-chart]").forEach(function (figure) {
     const plot = figure.classList.contains("skyplot") ? new Sky(figure) : new Plot(figure);
@@ -430,7 +430,7 @@
     waiting = true;
     setTimeout(function () { waiting = false; near(); }, 60);
   }, { passive: true });
-  window.addEventListener("load", function () { // the numbers behind the first click are read while nobody waits
+  window.addEventListener("load", function () { // the data of the sky plots are decoded before the first click
     timing("load");
     setTimeout(() => Object.values(skies).forEach(sky => sky.load()), 500);
   });
@@ -449,7 +449,7 @@
     again();
   });
 
-  // ---- a finding of a network: its place in the plan
+  // ---- links of findings in a network move the plan to the finding
   document.querySelectorAll('a[href^="#plan:"]').forEach(link => link.addEventListener("click", function (event) {
     const [x, y] = link.getAttribute("href").slice(6).split(",").map(Number), plot = plots.find(one => one.load().equal);
     event.preventDefault();
