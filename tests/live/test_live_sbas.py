@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import railfix
 from railfix.cli import app
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.live.state_values import decode, encode
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
@@ -83,17 +85,8 @@ def test_what_sbas_in_live_needs(log: dict[str, Path], tmp_path: Path) -> None:
     assert "--sbas stream" in recorded.output
     rinex = tmp_path / "log.rnx"
     railfix.write_observations(railfix.read_observations(log["log"])[:5], rinex)
-    words = [
-        "run",
-        "--front",
-        str(rinex),
-        "--nav",
-        str(log["nav"]),
-        "--track",
-        str(log["line"]),
-        "--out",
-        str(tmp_path),
-    ]
+    words = ["run", "--front", str(rinex), "--nav", str(log["nav"]), "--track", str(log["line"])]
+    words += ["--out", str(tmp_path)]
     nothing = RUNNER.invoke(app, [*words, "--sbas", "stream", "--set", "sbas_prn=137"])
     assert nothing.exit_code == 4
     assert "RINEX logs contain no SBAS" in nothing.output
@@ -102,13 +95,7 @@ def test_what_sbas_in_live_needs(log: dict[str, Path], tmp_path: Path) -> None:
 def test_messages_of_two_receivers_count_once(log: dict[str, Path]) -> None:
     """Both antennas' receivers pass on the same message, some tenths of a second apart."""
     messages = read_sbas(log["log"])
-    late = SbasMessages(
-        **{
-            name: getattr(messages, name)
-            for name in ("prn", "type", "bits", "parity_bits", "source", "line", "sources")
-        },
-        time=messages.time + np.timedelta64(300, "ms"),
-    )
+    late = replace(messages, time=messages.time + np.timedelta64(300, "ms"))
     state = SbasState(prn=137)
     for k in range(len(messages)):
         state = state.add_messages(messages.take(np.array([k]))).add_messages(late.take(np.array([k])))
@@ -128,6 +115,17 @@ def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> 
     assert np.isnan(result.antennas["front"].chainage_m).all()
     with pytest.raises(SettingsError, match="give its PRN"):
         railfix.EpochProcessor(railfix.Config(sbas="stream"), line)
+
+
+def test_a_stored_state_has_the_sbas_messages(log: dict[str, Path]) -> None:
+    observations, messages = railfix.read_observations(log["log"])[:EPOCHS], read_sbas(log["log"])
+    line = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([log["line"]]))}
+    config = parse_config({"sbas": "stream", "sbas_prn": 137, "elevation": {"mask_deg": 10}, "filter": "off"})
+    processor = railfix.EpochProcessor(config, line, navigation=railfix.read_navigation(log["nav"]))
+    _, state = processor.process({"front": observations[:150]}, messages=messages)
+    (one, _), (other, _) = (processor.process({"front": observations[150:]}, s) for s in (state, decode(encode(state))))
+    assert np.array_equal(one.antennas["front"].chainage_m, other.antennas["front"].chainage_m, equal_nan=True)
+    assert np.isfinite(one.antennas["front"].chainage_m).sum() > 50
 
 
 def test_the_budget_beside_sbas_is_one_object_so_that_a_live_epoch_finds_its_allocation_kept() -> None:

@@ -1,7 +1,8 @@
 """Encoding of a live state as JSON and arrays, and its decoding, which executes no content.
 
-Plain values, arrays, containers, enumerations, named tuples and data classes of this package are supported. A data
-class is decoded by its constructor, so that the constructor's checks apply to the file's values.
+Plain values, arrays, containers, enumerations, named tuples, settings and data classes of this package are written.
+Settings and data classes are created by their own constructors, so that the constructors' checks apply to the values
+from the file.
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+<<<<<<< HEAD
 #: Types of containers by their names in the file.
+=======
+from railfix.core.settings import Settings
+
+#: Containers by their names in the file.
+>>>>>>> 0c2abf94 (A state of railfix live can have SBAS messages: --state with --sbas stream ended in a traceback)
 _MAPPINGS: Final[dict[str, Any]] = {
     "dict": dict, "proxy": MappingProxyType, "counter": Counter, "ordered": OrderedDict,
 }  # fmt: skip
@@ -83,6 +90,8 @@ def _encode(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:
         return {"deque": each(value), "most": value.maxlen}
     if kind is slice:
         return {"slice": each((value.start, value.stop, value.step))}
+    if isinstance(value, Settings):
+        return {"settings": _name(kind), "values": value.model_dump(mode="json", exclude_unset=True)}
     if _is_value(kind):
         return {"of": _name(kind), "fields": {f.name: _encode(getattr(value, f.name), arrays) for f in fields(value)}}
     raise StateFormatError(f"{kind.__module__}.{kind.__qualname__} is no part of a state")
@@ -115,6 +124,8 @@ def _decode(tree: Any, stored: Mapping[str, Any]) -> Any:
         return deque(each(content), more["most"])
     if name == "slice":
         return slice(*each(content))
+    if name == "settings":
+        return _find(content, lambda found: issubclass(found, Settings)).model_validate(more["values"])
     if name == "of":
         values = {field: _decode(one, stored) for field, one in more["fields"].items()}
         return _find(content, _is_value)(**values)

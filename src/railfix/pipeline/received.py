@@ -57,13 +57,17 @@ class Received:
 
     navigation: Navigation = field(default_factory=no_navigation)
     messages: SbasState | None = None  #: SBAS messages of the GEO in use; None without SBAS.
-    sbas: SbasCorrections | DfmcService | None = None  #: Corrections from these messages.
     #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
     klobuchar: Floats | None = None
     #: Standard deviation of the vertical delay if typical coefficients replace broadcast ones, otherwise 0.
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()  #: One sentence on each replacement of requested data.
     base: BaseErrors | None = None  #: Range errors measured by a base station.
+
+    @property
+    def sbas(self) -> SbasCorrections | DfmcService | None:
+        """Corrections from the SBAS messages; None without SBAS."""
+        return None if self.messages is None else self.messages.corrections
 
 
 def broadcast_source(received: Received, config: Config) -> BroadcastSource:
@@ -104,21 +108,14 @@ def known_from_start(
     """
     received = Received(navigation=navigation or no_navigation())
     if messages is None and config.sbas == "stream":
-        state = _empty_state(config)
-        return _with_notes(replace(received, messages=state, sbas=state.corrections), config)
-    received = _with_notes(received, config)
+        return _with_notes(replace(received, messages=_empty_state(config)), config)
     if messages is None:
-        return received
+        return _with_notes(received, config)
     try:
-        sbas: SbasCorrections | DfmcService = (
-            DfmcService.from_log(messages, prn=config.sbas_prn)
-            if config.sbas_band == "L5"
-            else SbasCorrections.from_log(messages, prn=config.sbas_prn, limits=config.sbas_limits)
-        )
+        state = SbasState.from_log(messages, prn=config.sbas_prn, limits=config.sbas_limits, band=config.sbas_band)
     except ValueError as error:
         raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
-    state = SbasState(prn=sbas.prn, limits=config.sbas_limits, band=config.sbas_band).add_messages(messages)
-    return _with_notes(replace(received, messages=state, sbas=sbas), config)
+    return _with_notes(replace(received, messages=state), config)
 
 
 def receive(
@@ -149,7 +146,7 @@ def receive(
             state = _empty_state(config)
         state = state.add_messages(messages)
         state = state if np.isnat(time) else state.drop_before(time)
-        after = replace(after, messages=state, sbas=state.corrections)
+        after = replace(after, messages=state)
     return _with_notes(after, config)
 
 
@@ -164,10 +161,11 @@ def _empty_state(config: Config) -> SbasState:
 
 def _with_notes(received: Received, config: Config) -> Received:
     """Return the data with the ionospheric coefficients in use and notes on replacements of requested data."""
-    if received.sbas is not None and received.navigation.precise is not None:
+    messages = received.messages
+    if messages is not None and received.navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
     received = _with_ionosphere(received, config)
-    return received if received.sbas is None else replace(received, notes=(*received.notes, *received.sbas.notes))
+    return received if messages is None else replace(received, notes=(*received.notes, *messages.notes))
 
 
 def _current(navigation: Navigation, time: np.datetime64) -> Navigation:
@@ -217,12 +215,12 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 def _with_ionosphere(received: Received, config: Config) -> Received:
     """Return the data with the Klobuchar coefficients in use, and notes if these are not the requested ones."""
     if isinstance(received.sbas, DfmcService):  # the model helps the screens, and cancels in the combination
-        modelled = _with_ionosphere(replace(received, sbas=None), config)
+        modelled = _with_ionosphere(replace(received, messages=None), config)
         note = (
             f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} requested, ionosphere-free codes used "
             f"instead; troposphere: {config.troposphere} requested, SBAS model used"
         )
-        return replace(modelled, sbas=received.sbas, notes=(note,))
+        return replace(modelled, messages=received.messages, notes=(note,))
     if received.sbas is not None:
         asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
         note = f"{asked} requested, SBAS models used instead"

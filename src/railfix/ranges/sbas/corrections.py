@@ -258,11 +258,37 @@ class SbasState:
     #: Messages of that PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
     band: Band = "L1"  #: Frequency of the messages.
+    #: For a recorded log, sentences on its messages and on the corrections from them; None for messages as they arrive.
+    log_notes: tuple[str, ...] | None = None
+
+    @classmethod
+    def from_log(
+        cls,
+        messages: SbasMessages,
+        *,
+        prn: int | Literal["best"] = "best",
+        limits: SbasLimits | None = None,
+        band: Band = "L1",
+    ) -> SbasState:
+        """Return the state after the messages of a recorded log; ValueError: it has no message of the requested PRN."""
+        limits = limits or SbasLimits()
+        of_log: SbasCorrections | DfmcService = (
+            DfmcService.from_log(messages, prn=prn)
+            if band == "L5"
+            else SbasCorrections.from_log(messages, prn=prn, limits=limits)
+        )
+        state = cls(prn=of_log.prn, limits=limits, band=band).add_messages(messages)
+        return replace(state, log_notes=of_log.notes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One sentence on each correction that was requested and used, and on the messages of a recorded log."""
+        return self.corrections.notes if self.log_notes is None else self.log_notes
 
     def add_messages(self, messages: SbasMessages) -> SbasState:
         """Return the state after more messages; other PRNs, and repeated ones of a second receiver, are left out."""
         joined = self.messages.merge(messages.of(self.prn))
-        return replace(self, messages=joined.take(~joined.repeated()))
+        return replace(self, messages=joined.take(~joined.repeated()), log_notes=None)
 
     @cached_property
     def corrections(self) -> SbasCorrections | DfmcService:
