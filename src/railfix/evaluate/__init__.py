@@ -1,4 +1,4 @@
-"""Accuracy of positions: errors along the line against a reference, and figures of merit.
+"""Accuracy and integrity of positions: errors along the line against a reference, and their statistics.
 
 The error is the distance along the map from the reference's point on the map to the position; it is positive toward the
 end of the line in either direction of travel (P1 3.3, 5).

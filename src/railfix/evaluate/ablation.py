@@ -1,4 +1,7 @@
-"""Effect of each screen and of each source of the filter: the logs are read once and processed with every choice."""
+"""Effect of each screen and of each source of the filter on accuracy and availability.
+
+The logs are read once, and every chunk is processed with each choice of screens and sources.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ from railfix.tracking import TrackStatus
 
 #: Names of the choices with all screens and with none, and of the filter along the track.
 ALL, NONE, FILTER = "all", "none", "filter"
-#: Sensors with their required inputs.
+#: Sources of the filter that require sensors, with the inputs that they require.
 _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
     "wheel": ("tachometer",),
     "radar": ("radar",),
@@ -53,30 +56,27 @@ _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
 class Effect:
     """Rates and errors of one antenna with one choice of screens, or of filter sources."""
 
-    choice: str  #: "all", "none", "only raim", "without raim"; "filter", "filter without phase".
-    #: Active screens; sources of the filter along the track, empty for single epochs.
-    screens: tuple[str, ...]
-    sources: tuple[str, ...]
+    choice: str  #: Name of the choice, such as "all", "none", "only raim", "without raim", "filter without phase".
+    screens: tuple[str, ...]  #: Active screens.
+    sources: tuple[str, ...]  #: Sources of the filter along the track; empty for single epochs.
 
     antenna: str
-    epochs: int  #: Epochs with observations, and with a reference where one is given.
-    #: Fraction of the epochs with coordinates, and of those with status ok; for the filter: tracking.
-    rate: float
-    ok_rate: float
-    n_used: float  #: Satellites used, mean over the epochs.
-    sigma_p50_m: float  #: Median of the standard deviation along the line, of the epochs with coordinates.
-    #: Errors of all positions, of positions with status ok, and of the conventional position from the same ranges; None
-    #: without a reference.
-    coordinates: Score | None = None
-    ok: Score | None = None
+    epochs: int  #: Number of epochs with observations, and with a reference position if a reference is given.
+    rate: float  #: Fraction of the epochs that have coordinates.
+    ok_rate: float  #: Fraction of the epochs with status ok; for the filter, with status tracking.
+    n_used: float  #: Mean number of satellites used.
+    sigma_p50_m: float  #: Median standard deviation along the line of the epochs with coordinates; NaN without any.
+    coordinates: Score | None = None  #: Errors of all positions; None without a reference.
+    ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
+    #: Errors of the conventional positions from the same ranges; None without a reference.
     conventional: Score | None = None
-    #: Errors at epochs without observations, such as in tunnels; None where there are no such epochs.
+    #: Errors at epochs without observations, as in tunnels; None without such epochs or without a reference.
     outage: Score | None = None
-    #: 95th percentile of the error size over the standard deviation; NaN without a reference.
+    #: 95th percentile of |error| / standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
 
     def as_row(self) -> dict[str, Any]:
-        """Return the plain values for one row of a table, NaN as None."""
+        """Return the values by column name for one row of a table, with None in place of NaN."""
         row: dict[str, Any] = {name: getattr(self, name) for name in _OF_EFFECT}
         row["screens"], row["sources"] = " ".join(self.screens), " ".join(self.sources)
         for name in ("coordinates", "ok", "conventional", "outage"):
@@ -94,16 +94,16 @@ _OF_SCORE: Final = ("positions", "mean_m", "std_m", "p50_m", "p95_m", "max_m", "
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """Effects of all choices, by antenna, then by choice."""
+    """Effects of all choices of screens and sources on one log."""
 
-    effects: tuple[Effect, ...]
+    effects: tuple[Effect, ...]  #: In the order of the antennas, then of the choices.
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
 
 
 def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the choices of screens by name: all, none, each alone, all but each; equal choices once."""
+    """Return the choices of screens by name: all, none, each screen alone, and all but one; equal choices only once."""
     named = {ALL: tuple(screens), NONE: ()}
     named |= {f"only {name}": (name,) for name in screens}
     named |= {f"without {name}": tuple(other for other in screens if other != name) for name in screens}
@@ -112,7 +112,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of the filter's sources by name: all available, all but each; codes are always used."""
+    """Return the choices of filter sources by name: all available sources, and all but one; codes are always used."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {
@@ -121,7 +121,7 @@ def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[s
 
 
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the active screens that can work in this run, and one sentence on each that cannot."""
+    """Return the active screens whose inputs are available in this run, and a note on each other active screen."""
     setup = ScreenSetup(
         antennas=len(trajectories),
         spacing_known=all(t.body_chainage_m is not None for t in trajectories.values()),
@@ -143,7 +143,10 @@ def ablate_files(
     reading: ColumnNames | None = None,
     progress: Progress | None = None,
 ) -> Ablation:
-    """Process the logs with every choice of screens and sources, and write ``ablation.csv`` and ``ablation.json``."""
+    """Process the logs with every choice of screens and sources, and write ``ablation.csv`` and ``ablation.json``.
+
+    The errors are those of a run; MismatchError also where ground truth and log do not overlap in time.
+    """
     began = clock.perf_counter()
     options = options or RunOptions()
     inputs, config = inputs.prepare(config or Config())
@@ -205,12 +208,12 @@ def ablate_files(
 
 
 def _read_truth(inputs: RunInputs, reading: ColumnNames) -> Mapping[str, AntennaReference]:
-    """Return the reference positions by antenna; empty without any."""
+    """Return the reference positions by antenna; empty without `inputs.truth`."""
     return {} if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs), **reading.arguments)
 
 
 def _settings_of_choices(inputs: RunInputs, config: Config, screens: tuple[str, ...]) -> dict[str, Config]:
-    """Return the settings of every choice; protection levels are not part of the result."""
+    """Return the settings of every choice by name; protection levels are off because they are not compared."""
     plain = config.model_copy(update={"protection": "off", "filter": "off"})
     settings = {name: plain.model_copy(update={"screens": chosen}) for name, chosen in choices(screens).items()}
     if config.filter == "track":
@@ -223,7 +226,10 @@ def _settings_of_choices(inputs: RunInputs, config: Config, screens: tuple[str, 
 def _columns(
     result: AntennaResult, track: AlongTrack | None, reference: AntennaReference | None, trajectory: Trajectory
 ) -> dict[str, Floats]:
-    """Return the columns of one chunk of one antenna from which the effect is computed: of the filter if it is on."""
+    """Return the columns of one antenna and chunk from which the effect is computed, each of shape (T,).
+
+    Positions and standard deviations are those of the filter if `track` is given. Masks are 1.0 or 0.0.
+    """
     counted = result.status != Status.NO_OBSERVATION
     without = ~counted
     if track is None:

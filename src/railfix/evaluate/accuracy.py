@@ -1,7 +1,7 @@
-"""Figures of merit by groups of epochs, for constrained and conventional positions, with confidence limits.
+"""Error statistics by groups of epochs, for constrained and conventional positions, with confidence limits.
 
-Errors of a train are correlated over tens of seconds, so that epochs are not independent samples; blocks
-of a minute nearly are.
+Errors of a train are correlated over tens of seconds, so that epochs are not independent samples. Confidence limits are
+therefore computed by resampling blocks of one minute, which are nearly independent.
 """
 
 from __future__ import annotations
@@ -19,31 +19,32 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.reasons import Status
 from railfix.evaluate.evaluation_inputs import EvaluationOptions, floats
 
-#: Distance on the map beyond which a position counts as wrong [m].
+#: Error, or distance from the reference, above which a position counts as wrong [m].
 WRONG_PLACE_M = 50.0
-#: Error sizes; the fraction of errors above each is counted [m].
+#: Error magnitudes; the fraction of errors above each magnitude is reported [m].
 OVER_M: Final = (5, 10, 20, 50)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Figures of merit of a run."""
+    """Availability and error statistics of a run; statistics are NaN without a position."""
 
-    epochs: int  #: Epochs with observations inside the time of the reference.
-    positions: int  #: Epochs with coordinates.
+    epochs: int  #: Number of epochs with observations inside the time of the reference.
+    positions: int  #: Number of these epochs with an error, so with a position.
     rate: float  #: positions / epochs.
-    #: Statistics of the signed error.
-    mean_m: float
-    std_m: float
-    #: Statistics of the absolute error.
-    p50_m: float
-    p95_m: float
-    max_m: float
-    wrong_place: float  #: Fraction of the positions more than `WRONG_PLACE_M` from the reference.
+    mean_m: float  #: Mean of the signed error.
+    std_m: float  #: Population standard deviation of the signed error.
+    p50_m: float  #: Median of the error magnitude.
+    p95_m: float  #: 95th percentile of the error magnitude.
+    max_m: float  #: Largest error magnitude.
+    wrong_place: float  #: Fraction of the positions with an error above `WRONG_PLACE_M`.
 
 
 def score(error_m: Floats, observed: Masks) -> Score:
-    """Figures of merit from signed errors, NaN without a position, at the observed epochs; ValueError without any."""
+    """Compute the statistics of signed errors, shape (T,) and NaN without a position, at the `observed` epochs.
+
+    Raise ValueError where no epoch is observed.
+    """
     if not observed.any():
         raise ValueError("no epoch with observations lies inside the time of the reference")
     values = error_m[observed & np.isfinite(error_m)]
@@ -61,15 +62,15 @@ def score(error_m: Floats, observed: Masks) -> Score:
     )
 
 
-#: Limits between the classes of satellites used.
+#: Limits between the classes by number of satellites used.
 _SATELLITE_EDGES: Final = (4, 5, 6, 7, 8, 10, 12, 15, 20)
-#: Fewest blocks for confidence limits.
+#: Minimum number of blocks for confidence limits.
 FEWEST_BLOCKS: Final = 5
-#: Number of values at which the cumulative counts are evaluated at a time.
+#: Number of values at which the cumulative counts are evaluated in one step of the search for a percentile.
 _NODES: Final = 400
 
 
-#: Figures with limits, as columns: lower and upper limit; the last two are of the error size over its sigma.
+#: Statistics with confidence limits, as column names; the last two are percentiles of |error| / sigma.
 LIMITS: Final = ("mean{}_m", "rate{}", "p95{}_m", "normalised_p68{}", "normalised_p95{}")
 LIMIT_COLUMNS: Final = tuple(name.format(end) for name in LIMITS for end in ("_low", "_high"))
 
@@ -85,7 +86,11 @@ def block_limits(
     seed: int,
     confidence: float,
 ) -> dict[str, float]:
-    """Return `LIMIT_COLUMNS` and the number of blocks, drawn with replacement; NaN below `FEWEST_BLOCKS`."""
+    """Compute the confidence limits `LIMIT_COLUMNS` and the number of blocks, by a block bootstrap.
+
+    Errors, sigmas, the masks and the block numbers have shape (T,). Blocks are drawn with replacement `replicates`
+    times. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks.
+    """
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)
     if blocks < FEWEST_BLOCKS:
@@ -128,7 +133,11 @@ def block_limits(
 
 
 def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, *, share: float) -> Floats:
-    """Compute the percentile of each resample (replicates,), counted at ever finer nodes; NaN where it has no value."""
+    """Compute the percentile of each resample, shape (replicates,), by counting values at increasingly fine nodes.
+
+    `size` and the block numbers `member` have shape (T,); `times` is the number of times that a resample has a block,
+    shape (replicates, blocks); `errors` is the number of values of a resample. NaN where a resample has no value.
+    """
     found = np.full(len(times), np.nan)
     drawn = errors > 0
     if not drawn.any():
@@ -152,61 +161,61 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
             most = high - low + 1
 
 
-#: Kinds of position: on the map, of status ok alone, 3-D at their nearest point.
+#: Kinds of position: on the map; on the map with status ok; 3-D single point at the nearest point of the line.
 POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 #: Columns that identify a row of every table.
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Type of the name columns while grouping: many rows, few distinct names.
+#: Data type of the name columns while grouping, as they have many rows and few distinct names.
 WORDS: Final = pl.Categorical()
-#: Value in place of a name for all groups together.
+#: Name of a row in which all groups are combined.
 ALL: Final = "all"
-#: Groups of `signals`: epochs at which the single-epoch solution used a satellite, and tunnels and other outages.
+#: Groups of `signals`: epochs at which the single-epoch solution used a satellite, and epochs at which it used none.
 WITH_SATELLITES: Final = "with satellites"
 WITHOUT_SATELLITES: Final = "without satellites"
 AIDED: Final = pl.col("observed") & (pl.col("n_used").fill_null(0) > 0)
 
 #: Columns of the table of figures, with their unit and meaning.
 FIGURE_COLUMNS: Final[dict[str, str]] = {
-    "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `signals` (with or without a satellite "
-    "used), `status`; of several runs also `configuration` and `line`",
+    "grouping": "grouping of the epochs: `all`, `section`, `environment`, `speed`, `satellites`, `signals` (with or "
+    "without a satellite used), `status`; with several runs also `configuration` and `line`",
     "group": "name of the group",
-    "run": "name of the run; `all` for several together",
+    "run": "name of the run; `all` where several runs are combined",
     "configuration": "settings of the run",
     "line": "name of the track",
-    "antenna": "`front` or `rear`; `all` for both together",
-    "position": "`constrained`: positions on the map; `constrained_ok`: those of them that passed every check; "
-    "`conventional`",
+    "antenna": "`front` or `rear`; `all` where both are combined",
+    "position": "`constrained`: positions on the map; `constrained_ok`: positions on the map that passed every check; "
+    "`conventional`: 3-D single points at the nearest point of the line",
     "epochs_of": "`own`: every epoch of this kind; `common`: epochs with a constrained and a conventional position",
-    "epochs": "of the run, with a reference; epochs missing in the log included",
-    "observed": "those with observations",
-    "positions": "those with a position",
-    "left_out": "positions whose reference is not accurate enough",
-    "errors": "positions with an error",
-    "rate": "epochs with observations and position / observed",
-    "rate_of_run": "positions / epochs",
-    "mean_m": "error",
-    "std_m": "error, population standard deviation",
-    "rms_m": "error",
-    **dict.fromkeys(("p50_m", "p95_m", "p99_m", "max_m"), "size of error"),
+    "epochs": "number of epochs with a reference, including epochs missing in the log",
+    "observed": "number of epochs with a reference and observations",
+    "positions": "number of epochs with a reference and a position",
+    "left_out": "number of positions without an error because the reference is not accurate enough",
+    "errors": "number of positions with an error",
+    "rate": "fraction of the `observed` epochs with a position",
+    "rate_of_run": "fraction of the `epochs` with a position",
+    "mean_m": "mean error, + toward the end of the line",
+    "std_m": "population standard deviation of the error",
+    "rms_m": "root mean square error",
+    **dict.fromkeys(("p50_m", "p95_m", "p99_m", "max_m"), "percentile or maximum of the error magnitude"),
     "lowest_m": "error furthest toward the start of the line",
     "highest_m": "error furthest toward the end of the line",
-    "max_at_time": "GPS time of the largest error",
+    "max_at_time": "GPS time of the largest error magnitude",
     "max_at_chainage_m": "chainage of the reference at that time",
-    **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this size"),
-    "wrong_places": "errors above 50 m",
+    **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this magnitude"),
+    "wrong_places": "number of errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",
-    "along_sigma_p50_m": "median standard deviation that the run states",
+    "along_sigma_p50_m": "median standard deviation along the line that the run states",
     **dict.fromkeys(
         ("distance_p50_m", "distance_p95_m", "distance_max_m"),
-        "straight distance from the position on the map to the reference",
+        "percentile or maximum of the straight distance (3-D) from the position on the map to the reference",
     ),
-    **dict.fromkeys(("normalised_mean", "normalised_rms"), "error / along_sigma"),
-    **dict.fromkeys(("normalised_p68", "normalised_p95"), "size of error / along_sigma"),
+    **dict.fromkeys(("normalised_mean", "normalised_rms"), "mean or root mean square of error / along_sigma"),
+    **dict.fromkeys(("normalised_p68", "normalised_p95"), "percentile of the magnitude of error / along_sigma"),
     **dict.fromkeys((f"over_{n}_sigma" for n in (1, 2, 3)), "fraction of errors above this multiple of along_sigma"),
-    "blocks": "blocks of time for the confidence limits below",
-    **dict.fromkeys(LIMIT_COLUMNS, "limit of confidence"),
+    "blocks": "number of time blocks for the confidence limits that follow",
+    **dict.fromkeys(LIMIT_COLUMNS, "lower (`_low`) or upper (`_high`) confidence limit"),
 }
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
@@ -219,7 +228,10 @@ USED: Final = (
 
 
 def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Epochs inside the reference, with a class and its rank (``section``, ``section_rank``) for every grouping."""
+    """Return the epochs inside the reference, with a class and its rank for every grouping.
+
+    The columns of a grouping are, for example, ``section_group`` and ``section_rank``; the ranks order the groups.
+    """
     section = (pl.col("chainage_m") / options.section_m).floor().cast(pl.Int64)
     speed, used = pl.col("speed_mps") * 3.6, pl.col("n_used")
     edges = options.speed_edges_kmh
@@ -253,7 +265,7 @@ def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
 
 
 def _plain(value: pl.Expr) -> pl.Expr:
-    """Return a whole number without its decimals."""
+    """Return numbers as text, whole numbers without decimals."""
     return pl.when(value == value.round()).then(value.cast(pl.Int64).cast(pl.String)).otherwise(value.cast(pl.String))
 
 
@@ -270,7 +282,7 @@ def _satellite_names() -> list[str]:
 
 
 def has_position(position: str) -> pl.Expr:
-    """Return whether an epoch has a position of one kind of `POSITIONS`."""
+    """Return the expression for epochs with a position of the given kind, one of `POSITIONS`."""
     if position == "conventional":
         return pl.col("conventional_positioned")
     if position == "constrained_ok":
@@ -279,7 +291,11 @@ def has_position(position: str) -> pl.Expr:
 
 
 def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
-    """Return epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
+    """Return epochs with the columns of one kind of position from which the statistics are computed.
+
+    ``has`` is true for epochs with a position; ``error``, ``size`` (error magnitude) and ``normalised`` (error / sigma)
+    are null where the reference is not accurate enough; ``sigma`` and ``distance`` are null for conventional positions.
+    """
     conventional = position == "conventional"
     column = "conventional_error_m" if conventional else "error_m"
     has = has_position(position)
@@ -300,7 +316,7 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
 
 
 def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
-    """Return `FIGURE_COLUMNS` for every grouping, group, antenna, kind of position and choice of epochs."""
+    """Return the table `FIGURE_COLUMNS` for every grouping, group, antenna, kind of position and choice of epochs."""
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}
     for epochs in parts:
@@ -317,7 +333,7 @@ def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options:
 
 
 def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
-    """Return the table of one grouping in the order of its groups, with the columns of `FIGURE_COLUMNS`."""
+    """Return the table of one grouping sorted by its groups, with the columns `FIGURE_COLUMNS`."""
     rank, group = f"{grouping}_rank", f"{grouping}_group"
     words = [pl.col(name).cast(pl.String) for name in KEYS]
     named = table.with_columns(*words, grouping=pl.lit(grouping), group=pl.col(group).cast(pl.String))
@@ -325,12 +341,12 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
-    """Return the value of a column where another is largest, the first of equals; null where the other is all null."""
+    """Return the value of `column` in the first row where the column `by` is largest; null where `by` is all null."""
     return pl.col(column).get(pl.col(by).arg_max())
 
 
 def _figures() -> list[pl.Expr]:
-    """Return every figure of a group of rows of `series`."""
+    """Return the expressions of all statistics of a group of rows of `series`."""
     error, size, has = pl.col("error"), pl.col("size"), pl.col("has")
     good = error.is_not_null()
     observed, positions = pl.col("observed").sum(), has.sum()
@@ -370,7 +386,7 @@ def _figures() -> list[pl.Expr]:
 def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
-    """Return the table with confidence limits, null where they are undefined."""
+    """Return the table with confidence limits, computed from the epochs `part`; null without `part` or if undefined."""
     schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
     if part is None:
         return table.with_columns(pl.lit(None, kind).alias(name) for name, kind in schema.items())

@@ -1,4 +1,4 @@
-"""Table of a benchmark: railfix with one configuration and other programs (RTKLIB's single point) on all cases."""
+"""Benchmark: railfix with one configuration, and other programs such as RTKLIB, evaluated on all cases of a folder."""
 
 from __future__ import annotations
 
@@ -40,18 +40,22 @@ from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.output import OutputFolder
 from railfix.track.trajectory import Trajectory
 
-#: Row of RTKLIB's single point, and the program that computes it (Debian package rtklib).
+#: Name of the row with RTKLIB's single-point positions, and the program that computes them (Debian package rtklib).
 RTKLIB_SINGLE: Final = "RTKLIB single point"
 RTKLIB_PROGRAM: Final = "rnx2rtkp"
-#: Fraction of the log's interval within which a position is assigned to an epoch.
+#: Largest time difference between a position and its epoch, as a fraction of the interval of the log.
 _NEAR: Final = 0.4
-_LONGEST_S: Final = 600.0
-#: RTKLIB's bits of the constellations.
+_LONGEST_S: Final = 600.0  #: Time after which RTKLIB is ended [s].
+#: Bits of the constellations in RTKLIB's option pos1-navsys.
 _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
 
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
-    """Find the row of a log nearest to each epoch, closer than 0.4 of the median interval; -1 for none, shape (T,)."""
+    """Return the row of a log for each epoch, shape (T,); -1 for epochs without a row.
+
+    `time` are the epochs, `found` the times of the log. A row belongs to its nearest epoch if the time difference is
+    less than 0.4 of the median interval of the epochs; of several rows for an epoch the nearest is returned.
+    """
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
     if len(time) < 2:
@@ -66,7 +70,11 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:
-    """Return another program's positions as a table of a run, moved to the nearest point of the line."""
+    """Return another program's positions, moved to the nearest point of the line, as a positions table of a run.
+
+    The table has one row per epoch in `epochs`; epochs without a position have the status no_convergence, or
+    no_observation where railfix has no observation either.
+    """
     time = epochs["time_gpst"].to_numpy()
     row = rows_at_epochs(time, log.time)
     has = row >= 0
@@ -93,7 +101,10 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 
 
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
-    """Write another program's positions as the folder of a run; `run` is railfix's run on the same log."""
+    """Write another program's positions as the folder of a run; `run` is the folder of railfix's run on the same log.
+
+    Raise MismatchError where the run has no epochs of the antenna, or the log has no position at these epochs.
+    """
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
@@ -119,7 +130,9 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
-    """Compute RTKLIB's single point of the front antenna with the settings' mask; return the reason if it fails."""
+    """Write RTKLIB's single-point positions of the front antenna to `out`, with elevation mask and constellations of
+    `config`; return None, or the reason why there are none.
+    """
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
         return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
@@ -144,14 +157,14 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
 
 
 def _unpack(paths: Sequence[Path], folder: Path, kind: str) -> list[Path]:
-    """Write files uncompressed, as RTKLIB reads them; return their paths."""
+    """Write copies of files without compression, which RTKLIB requires, into a folder; return their paths."""
     unpacked = {folder / f"{number}.{kind}": path for number, path in enumerate(paths)}
     for target, path in unpacked.items():
         target.write_bytes(read_bytes(path))
     return list(unpacked)
 
 
-#: Rows of railfix: name, table and kind of position.
+#: Rows of railfix in the table: name, table of positions and kind of position.
 _OWN: Final = (
     ("railfix filter", "train", "constrained"),
     ("railfix single epochs", POSITIONS_TABLE, "constrained"),
@@ -165,20 +178,20 @@ _OF_STANFORD: Final = (
     "alarm_limit_m", "judged", "nominal", "misleading", "hazardously_misleading", "unavailable",
     "unavailable_misleading", "availability", "continuity_15_s",
 )  # fmt: skip
-#: Columns of the table with their meaning; columns of `railfix evaluate` are its figures.
+#: Columns of the table with their meaning; error statistics are described as in `railfix evaluate`.
 BENCHMARK_COLUMNS: Final[dict[str, str]] = {
-    "case": "name of the folder",
-    "held_out": "no test reads the case, no setting was chosen with it",
+    "case": "name of the folder of the case",
+    "held_out": "whether the case is reserved: no test reads it and no setting was chosen with it",
     "position": "positions that are evaluated; those of other programs are moved to the nearest point of the line",
-    "antenna": "`front` or `rear`; `all` for both together",
+    "antenna": "`front` or `rear`; `all` where both are combined",
     **{name: FIGURE_COLUMNS[name] for name in _OF_FIGURES},
-    "time_to_first_s": "from the first epoch with observations to the first position",
-    "over_level": "errors above their level without an alarm (levels `usable`)",
-    "over_level_alarm": "errors above their level where the run had raised an alarm or a doubt",
+    "time_to_first_s": "time from the first epoch with observations to the first position",
+    "over_level": "number of errors above a usable level (no alarm, and a status with a bounded error)",
+    "over_level_alarm": "number of errors above a level that was not usable, because of an alarm or the status",
     **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, own limit)" for name in _OF_STANFORD},
     "error": "reason for a missing result",
 }
-#: Names in the table for readers: column, head, feature of EN 16803-1, decimals, factor.
+#: Columns of the printed table: column, header, performance feature of EN 16803-1, decimals, factor.
 _SHOWN: Final = (
     ("observed", "epochs", "", 0, 1),
     ("rate", "rate %", "Availability", 1, 100),
@@ -208,8 +221,10 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and evaluate them with other programs; return
-    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings derived from held-out cases.
+    """Run the cases of a folder with one configuration, evaluate them and the other programs, and write the tables.
+
+    Return the table `BENCHMARK_COLUMNS`, in which a failed case has its reason in ``error``, and notes. Raise
+    InputFileError where a file has a wrong hash, MismatchError where settings were derived from a held-out case.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)
@@ -245,7 +260,7 @@ def run_benchmark(
 
 
 def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Evaluate railfix and the other programs on one case; return rows and notes."""
+    """Evaluate railfix and the other programs on one case; return the rows of the table, and notes."""
     tables = list_position_tables(run.out)
     items = [RunAndReference(run=run.out, reference=case.truth, configuration=name, table=name) for name in tables]
     others, notes = _programs(case, run, out)
@@ -257,7 +272,7 @@ def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]
 
 
 def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path], list[str]]:
-    """Write the positions of other programs as folders of runs; return them by name, and notes."""
+    """Write the positions of each other program as the folder of a run; return the folders by program, and notes."""
     out.mkdir(parents=True, exist_ok=True)
     notes: list[str] = []
     single = out / "rtklib-single.pos"
@@ -275,7 +290,7 @@ def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path],
 
 
 def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dict[str, Any]:
-    """Return the row of one kind of position of one run, for both antennas if there are two."""
+    """Return the table row of one kind of position of one run; two antennas are combined."""
     figures = evaluation.figures.filter(run=run.name, grouping=ALL, epochs_of="own", position=kind)
     antenna = ALL if ALL in figures["antenna"] else figures["antenna"][0]
     row = figures.filter(antenna=antenna).row(0, named=True)
@@ -293,7 +308,7 @@ def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dic
 
 
 def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
-    """Return the time from the first epoch with observations to the first with a position [s]; None without one."""
+    """Return the time from the first epoch with observations to the first position [s]; None without a position."""
     observed, placed = (
         epochs.filter(mask)["time_gpst"].to_numpy() for mask in (pl.col("observed"), has_position(kind))
     )
@@ -301,12 +316,12 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
 
 
 def heads() -> tuple[list[str], list[str]]:
-    """Return the headers of the table for readers, and each column's performance feature of EN 16803-1."""
+    """Return the headers of the printed table, and the performance feature of EN 16803-1 of each column."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
 
 
 def shown_rows(table: pl.DataFrame) -> list[list[str]]:
-    """Return the rows of the table for readers; "-" where a column has no value."""
+    """Return the rows of the printed table as text; "-" where a column has no value."""
     return [
         [
             f"{row['case']}{' (held out)' if row['held_out'] else ''}",
@@ -321,14 +336,14 @@ def shown_rows(table: pl.DataFrame) -> list[list[str]]:
 
 
 def markdown_table(table: pl.DataFrame) -> str:
-    """Return the table in Markdown; the second header line has the features of EN 16803-1."""
+    """Return the printed table in Markdown; its first row has the performance features of EN 16803-1."""
     names, features = heads()
     lines = [names, ["---", "---", *["---:"] * len(_SHOWN)], ["EN 16803-1", "", *features[2:]], *shown_rows(table)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _write(table: pl.DataFrame, notes: Sequence[str], cases: Sequence[Case], config: Config, out: Path) -> None:
-    """Write the table as CSV, JSON and Markdown."""
+    """Write the table as CSV, JSON and Markdown into the folder `out`."""
     write_whole(out / "benchmark.csv", table.write_csv(), what="table of the benchmark")
     write_whole(out / "benchmark.md", markdown_table(table), what="table of the benchmark")
     about = {case.name: case.content.model_dump(mode="json", include=_ABOUT) for case in cases}
@@ -345,5 +360,5 @@ def _write(table: pl.DataFrame, notes: Sequence[str], cases: Sequence[Case], con
     write_whole(out / "benchmark.json", json.dumps(record, indent=2, allow_nan=False) + "\n", what="benchmark")
 
 
-#: Record of a case in ``benchmark.json``.
+#: Fields of a case that are written into ``benchmark.json``.
 _ABOUT: Final = {"held_out", "licence", "fetch", "sha256", "scenario"}

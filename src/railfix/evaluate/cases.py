@@ -17,18 +17,18 @@ from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
-#: File that marks a folder as a case.
+#: Name of the file that makes a folder a case.
 CASE_FILE: Final = "case.toml"
-#: Files of a run that are settings: all cases share one configuration.
+#: Inputs of a run that a case must not have, because all cases share one configuration.
 _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
 
 class OtherPositions(Settings):
-    """Another program's positions: RTKLIB, NMEA, CSV or another kind of `railfix.io.positions.read_positions`."""
+    """File of another program's positions, in a format of `railfix.io.positions.read_positions` (RTKLIB, NMEA, CSV)."""
 
     file: Path
     antenna: Antenna = "front"
-    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of a CSV file whose names differ.
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of a CSV file, where not the usual names.
 
 
 class RecordedScenario(Settings):
@@ -44,42 +44,41 @@ class RecordedScenario(Settings):
     signals: str = ""
     rate_hz: float | None = Field(default=None, gt=0.0)
     duration_s: float | None = Field(default=None, gt=0.0)
-    reference: str = ""  #: System of the ground truth; its standard deviation follows.
-    reference_accuracy_m: float | None = Field(default=None, gt=0.0)
+    reference: str = ""  #: System that measured the ground truth.
+    reference_accuracy_m: float | None = Field(default=None, gt=0.0)  #: Standard deviation of the ground truth.
 
 
 class CaseFile(Settings):
-    """Content of ``case.toml``; files are relative to its folder."""
+    """Content of ``case.toml``; paths are relative to the folder of the case."""
 
-    #: Licence of the data; how to obtain them.
-    licence: str = Field(min_length=1)
-    fetch: str = Field(min_length=1)
-    held_out: bool  #: The case is for the benchmark alone: no test uses it and no setting was chosen with it.
-    files: RunInputs  #: Options of `railfix run`, with the ground truth as `truth`.
-    sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its name there.
+    licence: str = Field(min_length=1)  #: Licence of the data.
+    fetch: str = Field(min_length=1)  #: Source of the data, such as a URL.
+    held_out: bool  #: Whether the case is reserved for the benchmark: no test and no choice of settings uses it.
+    files: RunInputs  #: Inputs of `railfix run`, with the ground truth as `truth`.
+    sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its path as written there.
     positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
     scenario: RecordedScenario = RecordedScenario()
     options: RunOptions = RunOptions()
     evaluation: EvaluationOptions = EvaluationOptions()
 
     def every_file(self) -> Iterator[Path]:
-        """Yield every file, as written."""
+        """Yield the path of every file, as written in ``case.toml``."""
         yield from self.files.paths
         yield from (other.file for other in self.positions.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A case with the paths of its files."""
+    """Case of a benchmark, with the absolute paths of its files."""
 
-    name: str  #: Name of its folder.
+    name: str  #: Name of the folder.
     folder: Path
     content: CaseFile
-    inputs: RunInputs  #: Without the ground truth.
-    truth: Path
+    inputs: RunInputs  #: Inputs of the run, without the ground truth.
+    truth: Path  #: Ground truth.
 
     def check_hashes(self) -> None:
-        """Raise InputFileError where a file differs from the case's file, SettingsError where it has no hash."""
+        """Raise InputFileError where a file is missing or its SHA-256 differs, SettingsError where none is stated."""
         for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
@@ -94,7 +93,10 @@ class Case:
 
 
 def read_case(folder: Path) -> Case:
-    """Read the case in a folder; InputFileError, SettingsError where ``case.toml`` is not a valid case."""
+    """Read the case in a folder.
+
+    Raise InputFileError where ``case.toml`` cannot be read, SettingsError where it is not a valid case.
+    """
     path = folder / CASE_FILE
     content = load_settings(CaseFile, path, what="a case of a benchmark")
     if content.files.truth is None:
@@ -112,16 +114,22 @@ def read_case(folder: Path) -> Case:
 
 
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
+    """Write the ``case.toml`` of a folder from `content`, which has no hashes: the SHA-256 of each file is added.
+
+    Raise SettingsError where the content is not a valid case.
+    """
     case = validate(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
     hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
     write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what="a case of a benchmark")
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases in the subfolders of a folder, or the case in the folder itself, by name (`read_case`)."""
+    """Read the cases in the subfolders of a folder, sorted by name, or the case in the folder itself.
+
+    Raise InputFileError where there is no case, and the errors of `read_case`.
+    """
     if not folder.is_dir():
-        raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
+        raise InputFileError(folder, "there is no such folder; expected a folder whose subfolders have a case.toml")
     folders = (
         [folder] if (folder / CASE_FILE).is_file() else sorted(path.parent for path in folder.glob(f"*/{CASE_FILE}"))
     )
@@ -131,7 +139,10 @@ def read_cases(folder: Path) -> list[Case]:
 
 
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
-    """Raise MismatchError where a settings file was fitted on a held-out case, by the SHA-256 that it records."""
+    """Raise MismatchError where a C/N0 curve or an error model was fitted on a held-out case.
+
+    These files record the SHA-256 of their inputs, which are compared with the SHA-256 of the cases.
+    """
     files = [path for path in (config.cn0_curve, config.error_model) if path is not None]
     for path in files:
         text = read_text(path)

@@ -1,4 +1,4 @@
-"""Table of epochs and antennas: position, reference, error."""
+"""Table of the evaluated epochs: position, reference and error, one row per epoch and antenna."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from railfix.io.reference_log import AntennaReference
 
 #: Status of an epoch missing in the log.
 NOT_LOGGED: Final = "not_logged"
-#: Environment where neither reference nor sections name it.
+#: Environment of epochs for which neither the reference nor the sections state an environment.
 UNKNOWN: Final = "unknown"
 
 #: Columns of the table of epochs, with their unit and meaning.
@@ -30,63 +30,67 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
     "status": "status of the epoch; `not_logged` for epochs missing in the log",
-    "observed": "the antenna has observations",
-    "in_reference": "the reference trajectory covers the epoch",
-    "reference_good": "the reference is accurate enough, or states no accuracy",
-    "chainage_m": "of the reference",
-    "speed_mps": "of the reference, unsigned; from its positions where it states no speed",
+    "observed": "whether the antenna has observations",
+    "in_reference": "whether the reference trajectory covers the epoch",
+    "reference_good": "whether the reference is accurate enough, or states no accuracy",
+    "chainage_m": "chainage of the reference",
+    "speed_mps": "speed of the reference, unsigned; computed from its positions where it states no speed",
     "moved_m": "distance travelled since the first epoch with a reference",
-    "environment": "of the reference or of the sections, else `unknown`",
+    "environment": "environment stated by the reference, else by the sections, else `unknown`",
     "reference_sigma_m": "standard deviation of the reference along the track",
     "reference_source": "source of the reference position",
-    "n_used": "satellites used",
-    "positioned": "there is a position on the map",
-    "conventional_positioned": "there is a 3-D single point",
-    "error_m": "position on the map, + toward the end of the line",
-    "conventional_error_m": "3-D single point at its nearest point of the trajectory, + toward the end",
-    "distance_m": "straight distance from the position on the map to the reference",
-    "along_sigma_m": "standard deviation that the run states",
-    "branch_probability": "of the filter along the track: probability of the branch",
+    "n_used": "number of satellites used",
+    "positioned": "whether there is a position on the map",
+    "conventional_positioned": "whether there is a 3-D single point",
+    "error_m": "error of the position on the map, + toward the end of the line",
+    "conventional_error_m": "error of the nearest point of the trajectory to the 3-D single point, + toward the end of "
+    "the line",
+    "distance_m": "straight distance (3-D) from the position on the map to the reference",
+    "along_sigma_m": "standard deviation along the line that the run states",
+    "branch_probability": "probability of the branch, for the filter along the track",
     "sources": "measurements that the filter used",
     "interval_m": "distance travelled since the previous position",
     "gap_s": "time since the previous position",
-    "conventional_interval_m": "the same for the conventional positions",
-    "conventional_gap_s": "the same for the conventional positions",
-    "block": "block of time within the run, for confidence limits",
+    "conventional_interval_m": "distance travelled since the previous conventional position",
+    "conventional_gap_s": "time since the previous conventional position",
+    "block": "number of the time block within the run, for confidence limits",
 }
 
-#: Condition for rows of filter tables, which state a probability for every position.
+#: Expression for rows of the filter, recognised by the probability of the branch, which only the filter states.
 OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaEpochs:
-    """Epochs of one antenna, with information on their evaluation."""
+    """Evaluated epochs of one antenna."""
 
-    #: `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
+    #: `EPOCH_COLUMNS` without run, configuration and line; then the protection levels with their parts.
     table: pl.DataFrame
 
     errors: PlaceErrors
-    speed_from: str
-    outside: int  #: Epochs of the log outside the reference.
-    step_s: float  #: Interval of the log.
-    from_sections: int  #: Epochs with a reference whose environment comes from the sections.
+    speed_from: str  #: Source of the speed: "reference", or "places" if computed from positions of the reference.
+    outside: int  #: Number of epochs of the log outside the reference.
+    step_s: float  #: Median interval of the log; NaN with fewer than two epochs.
+    from_sections: int  #: Number of epochs with a reference whose environment is from the sections.
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
-    """Return the names of the columns of protection levels."""
+    """Return the names of the columns of a table that are protection levels."""
     return [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
 
 
 def protection_columns(table: pl.DataFrame) -> list[str]:
-    """Return the names of the columns of protection levels, then of their parts, causes and statuses."""
+    """Return the names of the columns of a table that are protection levels, then their parts, causes and statuses."""
     levels = level_columns(table)
     endings = [f"_protection_{name}" for name in (*PARTS, *STATED)]
     return levels + [name for name in table.columns if name.endswith(tuple(endings))]
 
 
 def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Concatenate tables; levels are null where a table has none. The tables are consumed column by column."""
+    """Concatenate tables of epochs; columns that a table does not have are null in its rows.
+
+    The columns are removed from the given tables one by one, to save memory.
+    """
     schema = {name: kind for table in tables for name, kind in table.schema.items()}
     lengths = [len(table) for table in tables]
     columns = []
@@ -100,9 +104,10 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Return the epochs of a log with those missing in its gaps, a mask of the logged epochs, and the interval [s].
+    """Return the epochs of a log and the epochs missing in its gaps, a mask of the logged epochs, and the interval [s].
 
-    Gaps are longer than 1.5 intervals.
+    A gap is longer than 1.5 times the median interval; missing epochs are spread evenly over it. With fewer than two
+    epochs the interval is NaN.
     """
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
@@ -120,7 +125,11 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
 def distance_travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
-    """Return the distance travelled since the first known reference position (T,) [m]; NaN before and after."""
+    """Return the distance travelled since the first known reference position, shape (T,) [m].
+
+    `step_m` are the distances between successive known positions. Steps at a speed below `options.standing_mps` are not
+    counted. The distance is interpolated by time over gaps; NaN before the first and after the last known position.
+    """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)
     if not len(at):
@@ -135,7 +144,10 @@ def distance_travelled(
 
 
 def since_last(values: Floats, has: Masks) -> Floats:
-    """Increase of a quantity since the previous row that `has`, shape (T,); NaN at rows that do not."""
+    """Return the increase of a quantity since the previous row of the mask `has`, shape (T,).
+
+    NaN at rows outside the mask, at the first row of the mask, and where the quantity is NaN.
+    """
     grown = np.full(len(values), np.nan)
     at = np.flatnonzero(has & np.isfinite(values))
     grown[at[1:]] = np.diff(values[at])
@@ -151,7 +163,10 @@ def antenna_epochs(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> AntennaEpochs:
-    """Return the epochs of one antenna of a run with their errors; MismatchError: no overlap in time, no errors."""
+    """Return the epochs of one antenna of a run with their errors.
+
+    Raise MismatchError where run and reference do not overlap in time, and the errors of `compute_errors`.
+    """
     mine = run.positions.filter(pl.col("antenna") == antenna)
     time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())
     own = _OwnColumns(mine, np.where(logged, np.cumsum(logged) - 1, len(mine)))
@@ -212,7 +227,7 @@ def antenna_epochs(
 
 
 class _OwnColumns(NamedTuple):
-    """Columns of one antenna's positions, on the epochs of its log and the missing epochs between them."""
+    """Columns of an antenna's positions, extended to the epochs that are missing in the log."""
 
     table: pl.DataFrame
     rows: Indices  #: Row of the table for each epoch; the length of the table for a missing epoch.
@@ -227,7 +242,7 @@ class _OwnColumns(NamedTuple):
         return pl.concat([texts, pl.Series([None], dtype=pl.String)])[self.rows]
 
     def answers(self, reference_chainage_m: Floats, reference_ecef_m: Floats) -> Answers:
-        """Return the positions of the run with the reference positions, NaN for missing epochs."""
+        """Return the positions of the run, NaN for missing epochs, together with the reference positions."""
         return Answers(
             chainage_m=self.floats("chainage_m"),
             conventional_chainage_m=self.floats("conventional_chainage_m"),
@@ -238,9 +253,9 @@ class _OwnColumns(NamedTuple):
 
 
 def _since_last_position(time: Datetimes, moved_m: Floats, answers: Answers) -> dict[str, Floats]:
-    """Return distance and time since the last position, on the map and conventional.
+    """Return distance travelled and time since the previous position, on the map and for conventional positions.
 
-    The distance travelled is interpolated by time over gaps of the reference, so that positions there count.
+    Positions in gaps of the reference are included, because `moved_m` is interpolated over the gaps.
     """
     columns, clock = {}, np.where(np.isfinite(moved_m), seconds(time - time[0]), np.nan)
     for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
@@ -250,7 +265,7 @@ def _since_last_position(time: Datetimes, moved_m: Floats, answers: Answers) -> 
 
 
 def _levels(run: RunFolder, own: _OwnColumns) -> dict[str, Any]:
-    """Return the protection levels of a run, their parts, causes and statuses."""
+    """Return the protection levels of a run with their parts, causes and statuses, by prefixed column name."""
     columns: dict[str, Any] = {run.prefix_column(name): own.floats(name) for name in level_columns(own.table)}
     for name in (f"protection_{name}" for name in (*PARTS, *STATED)):
         if name in own.table.columns and run.level_kind is not None:
@@ -259,7 +274,7 @@ def _levels(run: RunFolder, own: _OwnColumns) -> dict[str, Any]:
 
 
 def _steps(values: Floats, known: Masks) -> Floats:
-    """Return the distances between successive known positions: differences of chainage, or straight distances."""
+    """Return the distances between successive known positions [m] from chainages (T,) or ECEF positions (T, 3)."""
     step = np.diff(values[known], axis=0)
     return np.abs(step) if step.ndim == 1 else np.asarray(np.linalg.norm(step, axis=1))
 
@@ -279,6 +294,6 @@ def _own_speed(time: Datetimes, step_m: Floats, known: Masks) -> Floats:
 
 
 def _environment(stated: Strings, sections: Sections | None, chainage_m: Floats) -> Strings:
-    """Return the environment stated by the reference, or by the sections where the reference has none."""
+    """Return the environment stated by the reference, else by the sections at the chainage, else `UNKNOWN`."""
     names = stated if sections is None else np.where(stated == "", sections.at(chainage_m), stated)
     return np.where(names == "", UNKNOWN, names)

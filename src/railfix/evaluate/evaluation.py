@@ -1,4 +1,4 @@
-"""Evaluate one run, or a campaign of several, against reference trajectories."""
+"""Evaluation of one run or of several runs against reference trajectories."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from railfix.evaluate.intervals import branch_table, interval_table, level_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
 
-#: File names of a reference that are looked for in the folder of a run's log.
+#: File names under which a reference is searched for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
-#: Columns of the positions that are evaluated in addition to the error columns of every table.
+#: Columns that are read from a table of positions in addition to the columns that every table must have.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
 _FACTS: Final = ("speed_from", "outside", "step_s")
-#: Blocks of one run are numbered separately from the next.
+#: Offset between the block numbers of successive runs, which makes them unique.
 _BLOCKS_APART: Final = 10**9
 
 Reference = Path | Mapping[str, AntennaReference] | None
@@ -44,33 +44,33 @@ Reference = Path | Mapping[str, AntennaReference] | None
 
 @dataclass(frozen=True, kw_only=True)
 class RunAndReference:
-    """A table of positions of a run, with its reference trajectory."""
+    """Table of positions of a run, and the reference trajectory of the run."""
 
-    run: Path
-    reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` in the folder of the run's log.
-    configuration: str | None = None  #: Name of its settings; None: the settings that differ between the runs.
-    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.evaluation_inputs.list_position_tables`.
-    #: Another run on the same log, whose conventional positions replace the run's own: a run with the elevation and
-    #: C/N0 screens alone has the conventional positions that P1 compares with.
+    run: Path  #: Folder that `railfix run` wrote.
+    #: File, or trajectories by antenna; with None, the file of `BESIDE_THE_LOG` in the folder of the run's log.
+    reference: Reference = None
+    configuration: str | None = None  #: Name of the settings; with None, the settings that differ between the runs.
+    table: str = POSITIONS_TABLE  #: Name of the table, see `railfix.evaluate.evaluation_inputs.list_position_tables`.
+    #: Another run on the same log, whose conventional positions replace the run's own. P1 compares with the
+    #: conventional positions of a run with only the elevation and C/N0 screens.
     conventional: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """Information on the evaluation of one run: name, configuration and line as in the tables."""
+    """Evaluated run: its names in the tables, the reference, the methods and the inputs."""
 
     name: str
     configuration: str
     line: str
     path: Path
-    table: str  #: Table of positions.
-    reference: str  #: The file, or "given" for arrays.
-    #: By antenna: "chainage" or "trajectory"; "reference" or "places".
-    method: Mapping[str, str]
-    speed_from: Mapping[str, str]
-    outside: Mapping[str, int]  #: Epochs of the log outside the reference, by antenna.
-    step_s: Mapping[str, float]  #: Interval of the log, by antenna.
-    protection: Mapping[str, Any]  #: Basis of its protection levels, from ``run.json``.
+    table: str  #: Name of the table of positions.
+    reference: str  #: File of the reference, or "given" for arrays.
+    method: Mapping[str, str]  #: Method of the errors by antenna: "chainage" or "trajectory".
+    speed_from: Mapping[str, str]  #: Source of the speed by antenna: "reference" or "places".
+    outside: Mapping[str, int]  #: Number of epochs of the log outside the reference, by antenna.
+    step_s: Mapping[str, float]  #: Median interval of the log, by antenna.
+    protection: Mapping[str, Any]  #: Basis of the protection levels, from ``run.json``.
     settings: Mapping[str, Any]
     inputs: tuple[Mapping[str, Any], ...]  #: Files that were read, with size and hash.
     notes: tuple[str, ...]
@@ -82,18 +82,21 @@ class Evaluation(NotebookTable):
 
     runs: tuple[EvaluatedRun, ...]
     epochs: pl.DataFrame  #: One row per epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
-    figures: pl.DataFrame  #: Figures of every grouping: `FIGURE_COLUMNS`.
+    figures: pl.DataFrame  #: Error statistics of every grouping: `FIGURE_COLUMNS`.
     intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
     levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None where no run has a protection level.
-    integrity: Mapping[str, Integrity]  #: Levels against errors, by the basis of the levels.
-    #: `OUTAGE_COLUMNS`, `BRANCH_COLUMNS`; None where no table of the filter along the track is among the runs.
-    outages: pl.DataFrame | None
-    branches: pl.DataFrame | None
+    integrity: Mapping[str, Integrity]  #: Levels against errors, by the kind of level.
+    outages: pl.DataFrame | None  #: `OUTAGE_COLUMNS`; None without a table of the filter along the track.
+    branches: pl.DataFrame | None  #: `BRANCH_COLUMNS`; None without a table of the filter along the track.
     options: EvaluationOptions
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return one figure of the row with these values, by default "all", own, constrained; otherwise LookupError."""
+        """Return column `name` of the row of `figures` with the values `where`.
+
+        By default the row is of the grouping "all", of the epochs "own" and of the position "constrained". Raise
+        LookupError unless exactly one row has these values.
+        """
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:
@@ -113,7 +116,7 @@ def evaluate_run(
     files: TrackFiles | None = None,
     options: EvaluationOptions | None = None,
 ) -> Evaluation:
-    """Evaluate one run against its reference trajectory; see `evaluate_runs`."""
+    """Evaluate one run against its reference trajectory; parameters and errors are as for `evaluate_runs`."""
     place = Path(reference) if isinstance(reference, str) else reference
     item = RunAndReference(run=Path(run), reference=place)
     return evaluate_runs([item], sections=sections, files=files, options=options)
@@ -128,11 +131,12 @@ def evaluate_runs(
 ) -> Evaluation:
     """Evaluate runs against their reference trajectories.
 
-    `sections`: the environment by chainage (``from_m,to_m,environment``) where a reference does not state it. `files`:
-    replacements of the track and the vehicle that ``run.json`` names.
+    `sections` is a CSV file of the environment by chainage (``from_m,to_m,environment``), used where a reference does
+    not state it. `files` replaces the track and the vehicle that ``run.json`` names.
 
-    InputFileError: a file is missing, or its content is not as expected. MismatchError: a run and its reference do not
-    overlap in time, or the errors cannot be computed as requested. SettingsError: the same run twice, or none.
+    Raise InputFileError where a file is missing or its content is not as expected; MismatchError where a run and its
+    reference do not overlap in time, or the errors cannot be computed as requested; SettingsError where no run is
+    given, or a run twice.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
@@ -183,7 +187,10 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Return one run, not yet named, its antennas' epochs, and its level; a reference is kept in `read`."""
+    """Return one run without a name, the epochs of each antenna, and the kind of its levels with the alarm limit.
+
+    References that are read from files are kept in `read`, so that several runs share them.
+    """
     folder = read_run(item.run, table=item.table, conventional=item.conventional, columns=_COLUMNS)
     kind = folder.level_kind if "protection_level_m" in folder.positions.columns else None
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
@@ -248,7 +255,11 @@ def _references(
     read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]],
     options: EvaluationOptions,
 ) -> tuple[Mapping[str, AntennaReference], Path | None]:
-    """Return the references of a run by antenna, and their file, None for arrays; a file read is kept in `read`."""
+    """Return the references of a run by antenna, and their file, or None for arrays.
+
+    The content of a file is kept in `read`. Raise MismatchError where an antenna has no reference, or the file is a
+    table of the run itself.
+    """
     if isinstance(item.reference, Mapping):
         if missing := [name for name in folder.antennas if name not in item.reference]:
             raise MismatchError(f"{folder.path}: the references given have none of the {missing[0]} antenna; add it")
@@ -264,7 +275,10 @@ def _references(
 
 
 def reference_beside(run: RunFolder) -> Path:
-    """Return the reference in the folder of the front antenna's log; InputFileError unless there is exactly one."""
+    """Return the path of the reference (`BESIDE_THE_LOG`) in the folder of the front antenna's log.
+
+    Raise InputFileError unless there is exactly one.
+    """
     logs = run.input_paths("front")
     if not logs:
         raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
@@ -281,7 +295,10 @@ def reference_beside(run: RunFolder) -> Path:
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
-    """Return a name for the settings of each run: its preset and the settings that differ between the runs."""
+    """Return a name for the settings of each run: the given label, or the preset and the settings that differ.
+
+    For a single run the name has the preset and the screens.
+    """
     keys = dict.fromkeys(key for run_settings in settings for key in run_settings)
     differ = [
         key for key in keys if key != "preset" and len({str(run_settings.get(key)) for run_settings in settings}) > 1
@@ -296,7 +313,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return runs with short distinct names, which include the table where it is not the single-epoch table."""
+    """Return the runs with short distinct names and configurations; a name ends with a table other than `positions`."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
@@ -317,7 +334,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return every grouping of every run; for several runs also the groupings of each configuration."""
+    """Return the error statistics of all groupings of each run; with several runs also of each configuration."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]
@@ -329,14 +346,17 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Yield the rows of each value of a column, then with both antennas combined; columns `as_one` have `ALL`."""
+    """Yield the rows of each value of the column `by`, first by antenna, then with both antennas combined.
+
+    The columns `as_one`, and in the second case ``antenna``, are set to `ALL`.
+    """
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):
             yield epochs.filter(pl.col(by) == value).with_columns(pl.lit(ALL).alias(key) for key in keys)
 
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:
-    """For every run and antenna, and for every configuration with several runs."""
+    """Return the intervals of each run and antenna; with several runs also of each configuration and antenna."""
     table = interval_table(epochs, list(KEYS))
     if epochs["run"].n_unique() < 2:
         return table

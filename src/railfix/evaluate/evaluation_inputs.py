@@ -24,17 +24,17 @@ from railfix.pipeline.level_stage import KINDS
 from railfix.run.inputs import ColumnNames
 from railfix.run.record import RunRecord, read_parquet, read_record
 
-#: Common columns of all tables of positions.
+#: Columns that every table of positions must have.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
-#: No columns beyond the common columns of all tables.
+#: Selector of no columns, to read only the columns that a table must have.
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
-#: Table of single-epoch positions. Another table of the same run, such as ``train``, takes `SINGLE_EPOCH` from it.
+#: Name of the table of single-epoch positions, from which ``train`` gets the columns `SINGLE_EPOCH`.
 POSITIONS_TABLE: Final = "positions"
 TABLES: Final = (POSITIONS_TABLE, "train")
 SINGLE_EPOCH: Final = ("n_used", *CONVENTIONAL)
-#: Kind of protection levels where neither positions nor ``run.json`` name it.
+#: Kind of protection levels where neither the positions nor ``run.json`` state the kind.
 UNKNOWN_KIND: Final = "unknown"
 _KEYS: Final = ("time_gpst", "antenna")
 _ENDINGS: Final = (".parquet", ".csv")
@@ -42,48 +42,48 @@ _ENDINGS: Final = (".parquet", ".csv")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder(RunRecord):
-    """Results of a run, with one of its tables of positions."""
+    """Record of a run, with one of its tables of positions."""
 
-    positions_path: Path  #: The Parquet file of the table, or its CSV file where that is absent.
-    #: One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` is whether
+    positions_path: Path  #: Parquet file of the table, or its CSV file if there is no Parquet file.
+    #: One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` is true where
     #: the antenna has observations.
     positions: pl.DataFrame
-    table: str = POSITIONS_TABLE  #: Name of the table: "positions" for the single-epoch positions.
+    table: str = POSITIONS_TABLE  #: Name of the table: "positions" (single epochs) or "train" (filter).
 
     @property
     def antennas(self) -> list[str]:
-        """Names in the order of the rows."""
+        """Names of the antennas in the order of their first rows."""
         return [str(name) for name in self.positions["antenna"].unique(maintain_order=True)]
 
     @property
     def chainage_of(self) -> Mapping[str, str]:
-        """Reference point of the chainage, by antenna."""
+        """Point of the train whose chainage is given, by antenna, such as "antenna"; empty where not recorded."""
         return dict(self._line.get("chainage_of") or {})
 
     def turn_m(self, antenna: str) -> float:
-        """Length of a closed line by an antenna's chainage [m]; infinite for others, and where no run states it."""
+        """Return the length of a closed line in chainage of an antenna [m]; infinity for an open or unrecorded line."""
         turn = (self._line.get("turn_m") or {}).get(antenna)
         return float("inf") if turn is None else float(turn)
 
     @property
     def line_name(self) -> str:
-        """Name of the track."""
+        """Name of the track, or "unnamed line"."""
         return str(self.track_facts.get("name") or "unnamed line")
 
     @property
     def track_facts(self) -> Mapping[str, Any]:
-        """Information on the track used by the run."""
+        """Entry of ``run.json`` on the track that the run used; empty where not recorded."""
         return dict(self._line.get("track") or {})
 
     @property
     def tracks(self) -> list[Path]:
-        """Files of the track: in the folder if the run moved, joined or raised the track, otherwise its input files."""
+        """Files of the track: ``track.csv`` of the folder if the run changed the track, otherwise the input files."""
         name = self.track_facts.get("file")
         return [self.path / str(name)] if name else self.input_paths("track")
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings in force and kinds of input, by dotted name."""
+        """Settings that were used, by dotted name, and the optional kinds of input that were given."""
         flat = flat_settings(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.entries}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
@@ -96,7 +96,10 @@ class RunFolder(RunRecord):
 
     @property
     def level_kind(self) -> str | None:
-        """Kind of the levels, `UNKNOWN_KIND` where not recorded, None without; InputFileError for several."""
+        """Kind of the protection levels; `UNKNOWN_KIND` where not recorded, None without levels.
+
+        Raise InputFileError where positions and ``run.json`` state several kinds.
+        """
         level = "protection_level_m"
         if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
             return self._kind if self.protection and self.table == POSITIONS_TABLE else None
@@ -119,7 +122,7 @@ class RunFolder(RunRecord):
 
     @property
     def alarm_limit_m(self) -> float | None:
-        """Alarm limit of the run [m]; InputFileError where it is not a positive number."""
+        """Alarm limit of the run [m], None where not recorded; InputFileError where it is not a positive number."""
         limit = self.protection.get("alarm_limit_m")
         if limit is None:
             return None
@@ -130,7 +133,7 @@ class RunFolder(RunRecord):
         return float(limit)
 
     def prefix_column(self, name: str) -> str:
-        """Return the name of a column of the positions in tables of several runs: levels have their kind as prefix."""
+        """Return the name that a column has in tables of several runs: columns of levels are prefixed by their kind."""
         return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
     @property
@@ -139,7 +142,7 @@ class RunFolder(RunRecord):
 
 
 def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the nested settings by dotted name; lists as text."""
+    """Return nested settings by dotted name; a list becomes text with spaces between its elements."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
@@ -158,7 +161,14 @@ def list_position_tables(path: Path) -> list[str]:
 def read_run(
     path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None, columns: cs.Selector | None = None
 ) -> RunFolder:
-    """Read a folder that `railfix run` wrote; InputFileError, MismatchError: the table is not as expected."""
+    """Read the record and one table of positions from a folder that `railfix run` wrote.
+
+    `columns` selects columns in addition to the required columns; by default all are read. With `conventional`, the
+    folder of another run on the same log, its conventional positions replace those of the run.
+
+    Raise InputFileError where a file is missing or the table is not as expected, MismatchError where `conventional` is
+    a run on another log.
+    """
     record = read_record(path).record
     needed = (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED
     file, rows = read_table(path, table, needed, columns)
@@ -189,7 +199,11 @@ def _log_hashes(record: Mapping[str, Any]) -> list[str]:
 def read_table(
     path: Path, name: str, needed: Sequence[str] = NEEDED, columns: cs.Selector | None = None
 ) -> tuple[Path, pl.DataFrame]:
-    """Return the file and the rows of one table of a run, in order of time; InputFileError without `needed` columns."""
+    """Read one table of a run; return its file and its rows in order of time.
+
+    Raise InputFileError where the file or a `needed` column is missing, where there are no rows, or where an antenna
+    has several rows at the same time.
+    """
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:
         raise InputFileError(path, f"holds neither {name}.parquet nor {name}.csv; name a folder of railfix run")
@@ -228,14 +242,14 @@ def _table(file: Path, columns: cs.Selector | None) -> pl.DataFrame:
 
 
 def floats(table: pl.DataFrame, name: str) -> Floats:
-    """Return a column as numbers, NaN where it is null or the table has no such column."""
+    """Return a column as numbers; NaN where it is null, and everywhere if the table has no such column."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
 def words(table: pl.DataFrame, name: str) -> Strings:
-    """Return a column as text, blank where it is null or the table has no such column."""
+    """Return a column as text; blank where it is null, and everywhere if the table has no such column."""
     if name not in table.columns:
         return np.full(len(table), "")
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
@@ -243,14 +257,14 @@ def words(table: pl.DataFrame, name: str) -> Strings:
 
 Method = Literal["chainage", "trajectory"]
 
-#: Longest gap of a reference that is interpolated over [s].
+#: Longest interval between two reference positions over which the reference is interpolated [s].
 LARGEST_GAP_S: Final = 2.5
-#: Windows of continuity [s]: 15 s as for an approach in aviation, a minute as for the run between two stations.
+#: Windows of continuity [s]: 15 s as for an approach in aviation, 60 s as for a journey between two stations.
 WINDOWS_S: Final = (15.0, 60.0)
 
 
 def _rising(edges: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the edges themselves; ValueError where they do not rise."""
+    """Return the edges unchanged; ValueError where they do not increase strictly."""
     if any(high <= low for low, high in pairwise(edges)):
         raise ValueError("rising numbers expected")
     return edges
@@ -261,11 +275,11 @@ RisingEdges = Annotated[tuple[Positive, ...], Field(min_length=1), AfterValidato
 
 
 class EvaluationInputs(Settings):
-    """Files of an evaluation besides the runs, and names of the runs."""
+    """Files of an evaluation in addition to the runs, and names of the configurations."""
 
     reference: tuple[str, ...] = option(
-        "Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs or one for each in order; "
-        "`auto`: truth.csv or reference.csv beside the log of each run.",
+        "Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one file for all runs, or one for each run in "
+        "order; `auto`: truth.csv or reference.csv in the folder of each run's log.",
         metavar="FILE",
         panel=INPUTS,
     )
@@ -277,59 +291,61 @@ class EvaluationInputs(Settings):
         panel=INPUTS,
     )
     conventional: Path | None = option(
-        "Another run on the same log, whose conventional positions are compared with: a run with "
+        "Another run on the same log, whose conventional positions replace those of the run. A run with "
         "`--screens elevation` gives unscreened positions, as in P1.",
         None,
         metavar="RUN",
         panel=INPUTS,
     )
     sections: Path | None = option(
-        "Environment by chainage (from_m,to_m,environment), where the reference has none.",
+        "Environment by chainage (from_m,to_m,environment), used where the reference states none.",
         None,
         metavar="CSV",
         panel=INPUTS,
     )
     label: tuple[str, ...] = option(
-        "Name of the configuration of each run, once for each in order; from the settings by default.",
+        "Name of the configuration of a run, repeated for each run in order; by default from the settings.",
         (),
         metavar="TEXT",
     )
 
 
 class EvaluationOptions(Settings):
-    """Settings of an evaluation; most are described by the options of `railfix evaluate`."""
+    """Settings of an evaluation."""
 
     method: Literal["auto", "chainage", "trajectory"] = option(
-        "Errors as differences of chainage, or along the trajectory from the reference position.", "auto"
+        "Computation of the errors: chainage (differences of chainage), trajectory (along the trajectory from the "
+        "reference position), or auto (chainage where run and reference share a map).",
+        "auto",
     )
     reference_sigma_m: Positive = option(
         "Largest standard deviation of a reference position that is used.", 0.5, name="--reference-sigma", metavar="M"
     )
     reference_quality: tuple[int, ...] = option(
-        "Quality numbers of the reference positions that are used, where the log has them (RTKLIB: 1 fix, 2 float, 5 "
-        "single).",
+        "Quality numbers of the reference positions that are used, if the log has quality numbers (RTKLIB: 1 fix, "
+        "2 float, 5 single).",
         (1,),
         name="--reference-quality",
         metavar="Q,...",
     )
     columns: ColumnNames = Field(default_factory=ColumnNames)
     reference_gap_s: Positive = option(
-        "Longest gap of the reference that is interpolated over.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
+        "Longest gap over which the reference is interpolated.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
     )
     standing_mps: Positive = option(
-        "The train is at standstill below this speed.", 0.3, name="--standing", metavar="M/S"
+        "Speed below which the train counts as at standstill.", 0.3, name="--standing", metavar="M/S"
     )
     section_m: Positive = option("Length of the sections of the line.", 1000.0, name="--section-length", metavar="M")
     speed_edges_kmh: RisingEdges = option(
         "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
     )
     alarm_limits_m: tuple[Positive, ...] = option(
-        "Alarm limits that protection levels are compared with, in addition to the run's own.",
+        "Alarm limits with which protection levels are compared, in addition to the alarm limit of the run.",
         (10.0, 20.0, 40.0),
         name="--alarm-limit",
         metavar="M,...",
     )
-    block_s: Positive = 60.0  #: Length of the blocks of time that are resampled for confidence limits.
+    block_s: Positive = 60.0  #: Length of the time blocks that are resampled for confidence limits.
     replicates: int = Field(default=1000, ge=1)  #: Number of resamples.
     seed: int = option("Seed of the random numbers of the confidence limits.", 0, metavar="N", ge=0)
     confidence: float = Field(default=0.95, gt=0.0, lt=1.0)  #: Probability of the confidence limits, between 0 and 1.
@@ -337,13 +353,11 @@ class EvaluationOptions(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Sections:
-    """S stretches of the line, in rising order, without overlap."""
+    """S stretches of the line with their environment, in rising order, without overlap."""
 
     path: Path
-    #: Chainages; the end belongs to the next stretch; shape (S,).
-    from_m: Floats
-    to_m: Floats
-
+    from_m: Floats  #: Chainage of the start, shape (S,) [m].
+    to_m: Floats  #: Chainage of the end, shape (S,) [m]; the end is not part of the stretch, except for the last one.
     environment: tuple[str, ...]
 
     def at(self, chainage_m: Floats) -> Strings:
@@ -357,7 +371,10 @@ class Sections:
 
 
 def read_sections(path: Path) -> Sections:
-    """Read ``from_m,to_m,environment``; InputFileError for a section without length or name, or inside another."""
+    """Read the sections of a line from a CSV file with the columns ``from_m,to_m,environment``.
+
+    Raise InputFileError where a column is missing, or a section has no length, no environment, or overlaps another.
+    """
     table = read_named_columns(path)
     for name in ("from_m", "to_m", "environment"):
         if name not in table:

@@ -1,7 +1,8 @@
 """Protection levels against errors: Stanford counts, availability, continuity, and errors above their level.
 
-Counted twice. `usable`: a level counts where the status of the position is ok and the level raises no alarm; any
-other position counts as having an infinite level. `all`: every level counts, whatever its status.
+Epochs are counted with two choices of levels. `usable`: a level is used where the status of the position is ok (of the
+filter: tracking or coasting) and the level raises no alarm; any other position is given an infinite level. `all`: every
+level is used, whatever its status.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]
 
-#: Choices of levels, see above.
+#: Choices of levels, see the description of the module.
 LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
-#: Parts of a level, its cause and its status, by their names without "protection_".
+#: Columns of the parts of a level, and of its cause and status, without the prefix "protection_".
 PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
 STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
-#: Columns of the epochs for a Stanford diagram, besides the level and its status.
+#: Columns of the epochs for a Stanford diagram, in addition to the level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
-#: Statuses whose level is a bound: a coasting filter has a level and raises no alarm.
+#: Statuses of positions whose level bounds the error; a coasting filter has a level, too.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -44,69 +45,73 @@ _REGIONS: Final = {
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
-    "levels_of": "`usable`: levels of positions with status ok (of the filter: tracking, coasting) and no alarm, all "
-    "others infinite; `all`: every level",
+    "levels_of": "`usable`: levels of positions with status ok (of the filter: tracking, coasting) and no alarm, other "
+    "levels infinite; `all`: every level",
     "alarm_limit_m": "alarm limit AL",
-    "own_limit": "it is the alarm limit of the run",
-    "epochs": "of the run, with a reference; epochs missing in the log included",
-    "observed": "those with observations",
-    "judged": "those with an error",
-    "nominal": "error <= level <= AL",
-    "misleading": "level < error <= AL",
-    "hazardously_misleading": "level <= AL < error",
-    "unavailable": "AL < level, error <= level",
-    "unavailable_misleading": "AL < level < error",
-    "unjudged": "a position, but no reference accurate enough",
-    "no_position": "neither position nor level",
+    "own_limit": "whether this is the alarm limit of the run",
+    "epochs": "number of epochs with a reference, including epochs missing in the log",
+    "observed": "number of these epochs with observations",
+    "judged": "number of these epochs with an error",
+    "nominal": "epochs with error <= level <= AL",
+    "misleading": "epochs with level < error <= AL",
+    "hazardously_misleading": "epochs with level <= AL < error",
+    "unavailable": "epochs with AL < level and error <= level",
+    "unavailable_misleading": "epochs with AL < level < error",
+    "unjudged": "epochs with a position, but without a sufficiently accurate reference",
+    "no_position": "epochs with neither position nor level",
     "available": "epochs with a level within AL, whether or not the error is known",
     "availability": "available / epochs",
-    "availability_of_observed": "fraction of `observed` with a level within the limit",
-    "beyond": "errors above their level; the same at every AL",
+    "availability_of_observed": "fraction of the `observed` epochs with a level within AL",
+    "beyond": "errors above their level; equal at every AL",
     "beyond_share": "beyond / judged",
-    "beyond_blocks": "blocks of time (60 s) with an error above its level",
-    "windows_15_s": "windows of 15 s from an available epoch on",
-    "kept_15_s": "windows with every epoch available",
-    "continuity_15_s": "kept / windows; not by environment",
-    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "the same for 60 s"),
+    "beyond_blocks": "time blocks (60 s) with an error above its level",
+    "windows_15_s": "windows of 15 s that begin at an available epoch",
+    "kept_15_s": "windows of 15 s in which every epoch is available",
+    "continuity_15_s": "kept_15_s / windows_15_s; not by environment",
+    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as above, for windows of 60 s"),
 }
 
-#: Columns of the list of epochs beyond, with their unit and meaning; KIND is the kind of the level.
+#: Columns of the list of epochs beyond their level, with their unit and meaning; KIND is the kind of the level.
 BEYOND_COLUMNS: Final[dict[str, str]] = {
     "run": "name of the run",
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
-    "chainage_m": "of the reference",
-    "environment": "of the reference or of the sections, else `unknown`",
-    "error_m": "position on the map, + toward the end of the line",
+    "chainage_m": "chainage of the reference",
+    "environment": "environment stated by the reference, else by the sections, else `unknown`",
+    "error_m": "error of the position on the map, + toward the end of the line",
     "KIND_level_m": "protection level",
     **dict.fromkeys(("KIND_fault_free_m", "KIND_one_fault_m", "KIND_two_faults_m"), "part of the level"),
     "KIND_cause": "cause of the level",
     "KIND_status": "status of the level",
     "status": "status of the epoch",
-    "n_used": "satellites used",
-    "usable": "usable status and no alarm: misleading information",
+    "n_used": "number of satellites used",
+    "usable": "whether the level was usable, so that the epoch is misleading information",
 }
 
 
-#: Kind of the protection levels of a run, the prefix of their columns, and its alarm limit [m].
+#: Kind of the protection levels of a run, which is the prefix of their columns, and alarm limit of the run [m] or None.
 Level = tuple[str, float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Integrity:
-    """Levels of one kind against the errors."""
+    """Comparison of the protection levels of one kind with the errors."""
 
     stanford: pl.DataFrame  #: `railfix.evaluate.accuracy.KEYS`, then `STANFORD_COLUMNS`.
     beyond: pl.DataFrame  #: `BEYOND_COLUMNS`, the largest excess first.
 
 
 def level_name(kind: str) -> str:
-    """Return the column of the levels of a kind in the table of epochs."""
+    """Return the name of the column with the levels of a kind in the table of epochs."""
     return f"{kind}_protection_level_m"
 
 
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
-    """Return levels as counted, shape (T,) [m]: infinite without a usable level, NaN without a position."""
+    """Return the levels that are compared with errors, shape (T,) [m].
+
+    A level is infinite where it is missing or, with `levels_of` "usable", not usable; it is NaN without a position
+    (mask `has`). `status` is that of the position, `verdict` that of the level.
+    """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
         bound = np.where(_usable(status, verdict), bound, np.inf)
@@ -120,14 +125,17 @@ def _usable(status: Strings, verdict: Strings) -> Masks:
 def epochs_diagram(
     epochs: pl.DataFrame, kind: str, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """Count the epochs of one antenna (`EPOCH_COLUMNS`) within the reference, and their levels, in a diagram."""
+    """Return the Stanford diagram of the epochs of one antenna (`EPOCH_COLUMNS`) that the reference covers."""
     columns = (level_name(kind), f"{kind}_protection_status")
     spanned = epochs.select(*_JUDGED, *(name for name in columns if name in epochs.columns)).filter("in_reference")
     return _sort(spanned, *_judge(spanned, kind, levels_of), alarm_limit_m, options)
 
 
 def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
-    """Return the counted errors and levels of epochs within the reference, NaN where missing."""
+    """Return the errors and the effective levels of epochs within the reference, shape (T,) each [m].
+
+    The error is NaN without a position or a sufficiently accurate reference; for levels see `effective_levels`.
+    """
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
     level = effective_levels(
@@ -143,7 +151,10 @@ def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Float
 def positions_diagram(
     positions: pl.DataFrame, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """Count the epochs of one antenna (`POSITION_COLUMNS`) without a reference by availability and continuity."""
+    """Return the Stanford diagram of one antenna's epochs (`POSITION_COLUMNS`) without a reference.
+
+    Without errors it has only availability and continuity.
+    """
     level = effective_levels(
         floats(positions, "protection_level_m"),
         np.isfinite(floats(positions, "chainage_m")),
@@ -168,7 +179,10 @@ def _sort(
 
 
 def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
-    """Compare levels with errors by kind, for all runs at all alarm limits; empty where no run has levels."""
+    """Compare the levels of all runs with the errors at all alarm limits.
+
+    Return the comparison by kind of level; empty where no run has levels.
+    """
     own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})
     by_kind = {}
@@ -187,7 +201,7 @@ def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: Evalu
 def _count(
     part: pl.DataFrame, of_run: Level, limits: Sequence[float], options: EvaluationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Yield the counts of one antenna of a run: all epochs, then by environment."""
+    """Yield the counts of one antenna of a run at each alarm limit: all epochs first, then each environment."""
     kind, own_limit = of_run
     keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
     part = part.filter("in_reference")
@@ -226,7 +240,7 @@ def _count(
 
 
 def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
-    """Return rows with sums over both antennas and over all runs of a configuration, and with fractions."""
+    """Return a table of the counts, their sums over antennas and over the runs of a configuration, and fractions."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))
@@ -251,7 +265,7 @@ def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
 
 
 def _beyond(epochs: pl.DataFrame, runs: Sequence[str], kind: str) -> pl.DataFrame:
-    """Return the epochs of some runs whose error exceeds a finite level, the largest excess first."""
+    """Return the epochs of the given runs whose error exceeds a finite level, the largest excess first."""
     level = pl.col(level_name(kind))
     columns = {name: f"{kind}_protection_{name}" for name in (*PARTS, *STATED)}
     absent = [name for name in columns.values() if name not in epochs.columns]

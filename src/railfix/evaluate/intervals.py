@@ -1,4 +1,4 @@
-"""Figures of a run besides its errors: steps between positions, outages, branches, levels, service by chainage."""
+"""Statistics of a run apart from its errors: intervals, outages, branches, protection levels, service by chainage."""
 
 from __future__ import annotations
 
@@ -27,24 +27,29 @@ from railfix.evaluate.evaluation_inputs import RunFolder, list_position_tables, 
 #: Columns of the table of intervals in addition to its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "position": "`constrained`, `constrained_ok` or `conventional`",
-    "intervals": "pairs of consecutive positions between which the train moved",
-    "standing": "pairs of consecutive positions between which the train did not move",
+    "intervals": "number of pairs of consecutive positions between which the train moved",
+    "standing": "number of pairs of consecutive positions between which the train did not move",
     **dict.fromkeys(
         (f"interval_{figure}_m" for figure in ("mean", "p50", "p95", "p99", "max")),
-        "distance travelled between consecutive positions",
+        "mean, percentile or maximum of the distance travelled between consecutive positions",
     ),
     "interval_max_from": "time of the position before the largest interval, GPS time",
-    "interval_max_chainage_m": "chainage of that position; empty in a gap of the reference",
-    **dict.fromkeys(("gap_p50_s", "gap_p95_s", "gap_max_s"), "time between consecutive positions"),
+    "interval_max_chainage_m": "chainage of the reference at that time; empty in a gap of the reference",
+    **dict.fromkeys(
+        ("gap_p50_s", "gap_p95_s", "gap_max_s"), "percentile or maximum of the time between consecutive positions"
+    ),
     "gap_max_from": "time of the position before the longest gap, GPS time",
-    "before_first_s": "from the first epoch with a reference to the first position",
-    "after_last_s": "from the last position to the last epoch with a reference",
+    "before_first_s": "time from the first epoch with a reference to the first position",
+    "after_last_s": "time from the last position to the last epoch with a reference",
 }
 _OF: Final = ("run", "antenna")
 
 
 def interval_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame:
-    """Distribution of the intervals of each kind of position, within one run and antenna (`INTERVAL_COLUMNS`)."""
+    """Return the distribution of the intervals between positions of each kind (`INTERVAL_COLUMNS`), grouped by `by`.
+
+    Intervals are between positions of the same run and antenna.
+    """
     return pl.concat(
         _of_position(epochs.lazy().filter(configuration=name), position, by)
         for position in POSITIONS
@@ -99,22 +104,22 @@ def _seconds(duration: pl.Expr) -> pl.Expr:
     return duration.dt.total_nanoseconds() / 1e9
 
 
-#: Shorter losses of all satellites are not listed [s].
+#: Minimum duration of a stretch without satellites in the table [s].
 LEAST_S: Final = 2.0
 
 #: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
-    "begin_gpst": "first epoch without a satellite used, GPS time",
-    "duration_s": "from the last epoch with a satellite to the last epoch without",
-    "travelled_m": "distance travelled meanwhile, by the reference",
-    "environment": "of the reference or of the sections, at its middle",
-    "carried_by": "measurements that the filter used within the outage",
-    "epochs": "epochs without satellites",
-    "positions": "those with a position",
-    **dict.fromkeys(("outage_p50_m", "outage_p95_m", "outage_max_m"), "size of error"),
-    "end_error_m": "error at the last position",
-    "end_sigma_m": "stated standard deviation there",
-    "largest_normalised": "largest size of error / along_sigma_m",
+    "begin_gpst": "first epoch without a used satellite, GPS time",
+    "duration_s": "time from the last epoch with a used satellite to the last epoch without one",
+    "travelled_m": "distance travelled in this time, by the reference",
+    "environment": "environment in the middle of the stretch, from the reference or from the sections",
+    "carried_by": "measurements that the filter used within the stretch",
+    "epochs": "number of epochs of the stretch",
+    "positions": "number of these epochs with a position",
+    **dict.fromkeys(("outage_p50_m", "outage_p95_m", "outage_max_m"), "percentile or maximum of the error magnitude"),
+    "end_error_m": "error of the last position with an accurate reference",
+    "end_sigma_m": "stated standard deviation of this position",
+    "largest_normalised": "largest magnitude of error / along_sigma_m",
 }
 _OUTAGE_COLUMNS: Final = (
     "time_gpst", "observed", "n_used", "in_reference", "reference_good", "positioned", "moved_m", "environment",
@@ -123,7 +128,10 @@ _OUTAGE_COLUMNS: Final = (
 
 
 def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Stretches without satellites with the filter's errors, in order of time; None without a table of the filter."""
+    """Return the stretches without satellites (`OUTAGE_COLUMNS`), with the errors of the filter, in order of time.
+
+    Stretches shorter than `LEAST_S` are left out. Return None without a table of the filter.
+    """
     filtered = epochs.select(*KEYS, *_OUTAGE_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -158,7 +166,7 @@ def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     return table.filter(pl.col("duration_s") >= LEAST_S).select(*keys, *OUTAGE_COLUMNS)
 
 
-#: Limits of the classes of probability.
+#: Limits between the classes of the branch probability.
 _EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 
 _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
@@ -166,17 +174,20 @@ _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branc
 #: Columns of the table of probabilities in addition to its keys, with their unit and meaning.
 BRANCH_COLUMNS: Final[dict[str, str]] = {
     "probability": "class of the stated probability of the branch; `all` for every epoch",
-    "judged": "positions of the class with an error",
+    "judged": "number of positions of the class with an error",
     "probability_mean": "mean of the stated probabilities",
     "right_share": "fraction of the positions within 50 m of the reference",
-    "wrong_places": "places further away",
-    "blocks": "blocks of time with such an epoch",
-    "wrong_blocks": "blocks with a wrong position",
+    "wrong_places": "number of positions farther than 50 m from the reference",
+    "blocks": "number of time blocks with an epoch of the class",
+    "wrong_blocks": "number of these blocks with a position farther than 50 m from the reference",
 }
 
 
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Return the stated probability and the fraction of correct positions, by class; None without the filter."""
+    """Return the stated probability of the branch and the fraction of correct positions, by class of probability.
+
+    The table has `BRANCH_COLUMNS`. Return None without a table of the filter.
+    """
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -202,21 +213,24 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
 LEVEL_COLUMNS: Final[dict[str, str]] = {
     "level": "column of the level",
     "position": "`constrained` or `constrained_ok`",
-    "observed": "epochs with observations and reference",
-    "positions": "epochs with a position",
-    "infinite": "positions with an infinite level",
-    "with_level": "positions with a finite level",
-    "level_share": "fraction of `observed` with a finite level",
-    "level_p50_m": "finite levels",
-    "level_p95_m": "finite levels",
-    "errors": "finite levels with an error",
-    "over_level": "errors above their level",
+    "observed": "number of epochs with observations and reference",
+    "positions": "number of epochs with a position",
+    "infinite": "number of positions with an infinite level",
+    "with_level": "number of positions with a finite level",
+    "level_share": "fraction of the `observed` epochs with a finite level",
+    "level_p50_m": "median of the finite levels",
+    "level_p95_m": "95th percentile of the finite levels",
+    "errors": "number of positions with a finite level and an error",
+    "over_level": "number of errors above their level",
     "over_level_share": "over_level / errors",
 }
 
 
 def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
-    """Counts of every protection level of the epochs, by the values of some columns; None where a run has none."""
+    """Return the counts and percentiles of every protection level (`LEVEL_COLUMNS`), grouped by the columns `by`.
+
+    Return None where no run has a protection level.
+    """
     tables = []
     for level in level_columns(epochs):
         if epochs[level].null_count() == len(epochs):
@@ -262,10 +276,10 @@ def _counts(level: str) -> list[pl.Expr]:
     ]
 
 
-#: Statuses of the filter with a position that has a level.
+#: Statuses of the filter whose protection level is used.
 _SOUND: Final = ("tracking", "coasting")
 _POSITION_COLUMNS: Final = ("n_used", "n_rejected", "conventional_offset_m")
-#: Columns of the table by stretch; percentiles are over epochs.
+#: Columns of the table of the satellite service by stretch; percentiles are over epochs.
 COLUMNS: Final = (
     "from_m", "to_m", "runs", "epochs", "satellites_median", "satellites_p5", "rejected_share", "reflection_p95_m",
     "ok_share", "tracking_share", "level_median_m", "level_p95_m", "within_limit_share",
@@ -273,8 +287,11 @@ COLUMNS: Final = (
 
 
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
-    """Compute `COLUMNS`, the satellite service by stretches of the line, over all antennas of runs on one map (else
-    MismatchError); epochs without a position are located by the filter.
+    """Compute the satellite service (`COLUMNS`) by stretches of the line, over all antennas and runs.
+
+    The chainage of an epoch is that of the filter, else of the single-epoch position, else interpolated by rows.
+    The level is infinite where the filter is neither tracking nor coasting, null for runs without the filter. Raise
+    MismatchError where the runs are on different maps, or no epoch has a position.
     """
     runs = [read_run(folder) for folder in folders]
     first = runs[0].track_facts
@@ -315,7 +332,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
 
 
 def _epochs(folder: Path, run: RunFolder, number: int) -> pl.DataFrame:
-    """Return the epochs of one run with their chainage, from single epochs and, where the run has it, the filter."""
+    """Return the epochs of one run with chainages, status and level of the filter, null without the filter."""
     single = run.positions.select(
         "time_gpst", "antenna", "chainage_m", pl.col("status").cast(pl.String),
         *(pl.col(name).cast(pl.Float64) for name in _POSITION_COLUMNS),

@@ -1,7 +1,7 @@
-"""Errors along the line of one antenna, by chainage or along the trajectory.
+"""Errors of one antenna along the line, as differences of chainage or along the trajectory.
 
-The error is the distance along the map between the position and the reference's own point on it,
-positive toward the end of the line (P1 3.3).
+The error is the distance along the map from the reference's point on the map to the position, positive toward the end
+of the line (P1 3.3).
 """
 
 from __future__ import annotations
@@ -29,28 +29,35 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Bracket:
-    """Neighbouring instants of the reference for each of T times."""
+    """Neighbouring instants of a reference of R instants for each of T times."""
 
-    #: Equal to the reference where a time is one of its times, shape (T,).
-    left: Indices
-    right: Indices
-    share: Floats  #: 0 at left, 1 at right; shape (T,).
+    left: (
+        Indices  #: Index of the instant before each time; of the instant itself where the times are equal; shape (T,).
+    )
+    right: (
+        Indices  #: Index of the instant after each time; of the instant itself where the times are equal; shape (T,).
+    )
+    share: Floats  #: Fraction of the interval from left to right that has passed, 0 to 1, shape (T,).
     inside: Masks  #: False before the first, after the last, and in gaps of the reference; shape (T,).
 
     def of(self, values: Floats) -> Floats:
-        """Return the values of the reference, shape (R,) or (R, n), interpolated linearly; NaN where not inside."""
+        """Return values of the reference, shape (R,) or (R, n), interpolated linearly to the T times; NaN outside."""
         across = (-1, *(1,) * (values.ndim - 1))
         between = values[self.left] + self.share.reshape(across) * (values[self.right] - values[self.left])
         return np.where(self.inside.reshape(across), between, np.nan)
 
     @property
     def nearest(self) -> Indices:
-        """Index of the nearer instant, shape (T,)."""
+        """Index of the nearest instant of the reference, shape (T,)."""
         return np.where(self.share <= 0.5, self.left, self.right)
 
 
 def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
-    """Return the neighbouring instants of a reference, rising and at least two (ValueError), for each time."""
+    """Return the neighbouring instants of a reference for each time; the reference times must increase.
+
+    Times between two instants that are more than `largest_gap_s` apart are not inside. Raise ValueError where the
+    reference has fewer than two instants.
+    """
     if len(reference_time) < 2:
         raise ValueError(f"reference_time has {len(reference_time)} instants, at least two were expected")
     last = len(reference_time) - 1
@@ -72,9 +79,10 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Return the reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
+    """Interpolate reference positions, shape (R, 3), linearly to other times, shape (T, 3) [m].
 
-    Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
+    The reference times must increase. NaN outside the reference and in its gaps, which are intervals longer than
+    `largest_gap_s`.
     """
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
@@ -82,15 +90,22 @@ def interpolate_reference(
 def along_track_error(
     arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory, *, same_place_m: float = 30.0
 ) -> Floats:
-    """Signed distance on the map from the reference's point to the position, + toward the end of the line (P1 3.3).
+    """Return the signed error along the line, + toward the end of the line, shape (T,) [m] (P1 3.3).
 
-    The distance along the line. Where the map passes the reference point more than once (laps, a road's two
-    carriageways) the pass nearest to the position counts, as the ranges of one epoch cannot distinguish them. Where the
-    line returns near itself (a crossing), the straight distance between the two points counts if it is shorter. On a
-    line that passes every point once neither rule has an effect, except for the chord of a curve.
+    The error is the distance along the line from the reference's nearest point on the map to the position. Where the
+    map passes the reference more than once (laps, two carriageways of a road), the pass nearest to the position is
+    used, because the ranges of one epoch cannot distinguish the passes. Where the line returns near itself (a
+    crossing), the straight distance between the two points is used if it is shorter. On a line that passes every point
+    once these rules have no effect, except that the error in a curve is that of the chord.
 
-    `arc_m` are the positions along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
-    missing. Passes of the map up to `same_place_m` from the reference count as its position.
+    Parameters
+    ----------
+    arc_m : ndarray, shape (T,) [m]
+        Arc lengths of the positions on the trajectory; the error is NaN where a position or a reference is NaN.
+    reference_ecef_m : ndarray, shape (T, 3) [m]
+        Reference positions.
+    same_place_m : float [m]
+        Largest distance of a pass of the map from the reference position.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -116,10 +131,10 @@ def along_track_error(
 
 
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
-    """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
+    """Return the straight distance (3-D) from positions on the map to the reference's nearest point on the map.
 
-    It requires no choice between several passes of the line at one point, and never exceeds the distance along the
-    line. NaN where the position or the reference, shape (T, 3), is missing.
+    The distance has shape (T,) [m] and is NaN where the position or the reference, shape (T, 3), is NaN. It does not
+    depend on the choice between several passes of the line, and never exceeds the distance along the line.
     """
     distance = np.full(len(arc_m), np.nan)
     rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -129,51 +144,53 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Largest median difference between chainages and coordinates of run and reference on the same map [m].
+#: Largest median difference, for a shared map, between the distance of run and reference in chainage and in ECEF [m].
 SAME_MAP_M: Final = 1.0
 #: Largest distance of a position from the trajectory of its run [m].
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: Excess of the distance along the line over twice the error, above which the error is to another pass of the line [m].
+#: An error is to another pass of the line if the distance along the line exceeds twice the error by more than this [m].
 _ANOTHER_PASS_M: Final = 50.0
-#: Rounding of chainages at the ends of the line [m].
+#: Tolerance for rounded chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
     """Files that replace the files of ``run.json``, and options for reading the track (except `reading.reference`)."""
 
-    track: tuple[Path, ...] = option("Track that replaces the track in run.json.", (), metavar="TRACK", panel=INPUTS)
-    vehicle: Path | None = option("Vehicle that replaces the vehicle in run.json.", None, metavar="TOML", panel=INPUTS)
+    track: tuple[Path, ...] = option(
+        "Track map to use instead of the track in run.json.", (), metavar="TRACK", panel=INPUTS
+    )
+    vehicle: Path | None = option(
+        "Vehicle file to use instead of the vehicle in run.json.", None, metavar="TOML", panel=INPUTS
+    )
     reading: TrackReading = Field(default_factory=TrackReading)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Positions of one antenna, and the reference at their times, T epochs."""
+    """Positions of one antenna at T epochs, and the reference at the same epochs."""
 
-    #: NaN without a position, shape (T,).
-    chainage_m: Floats
-    conventional_chainage_m: Floats
-    ecef_m: Floats  #: Shape (T, 3).
-    reference_chainage_m: Floats  #: Shape (T,).
-    reference_ecef_m: Floats  #: NaN outside the reference, shape (T, 3).
+    chainage_m: Floats  #: Chainage of the position on the map, shape (T,); NaN without a position.
+    conventional_chainage_m: Floats  #: Chainage of the conventional position, shape (T,); NaN without a position.
+    ecef_m: Floats  #: Position on the map, shape (T, 3); NaN without a position.
+    reference_chainage_m: Floats  #: Shape (T,); NaN outside the reference, or where it has no chainage.
+    reference_ecef_m: Floats  #: Shape (T, 3); NaN outside the reference.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceErrors:
-    """Signed errors of one antenna, T epochs, + toward the end of the line."""
+    """Errors of one antenna at T epochs; signed errors are + toward the end of the line."""
 
     method: Method
-    #: Shape (T,).
-    error_m: Floats
-    conventional_error_m: Floats
-    #: Straight distance between the position on the map and the reference: its point on the map where the trajectory is
-    #: read, otherwise its own position; shape (T,).
+    error_m: Floats  #: Signed error of the position on the map, shape (T,).
+    conventional_error_m: Floats  #: Signed error of the conventional position, shape (T,).
+    #: Straight distance (3-D) from the position on the map to the reference, shape (T,): to its nearest point on the
+    #: map with the method "trajectory", to the reference position with the method "chainage".
     distance_m: Floats
     reference_chainage_m: Floats  #: Chainage of the reference; from the map where the reference has none; shape (T,).
-    files: tuple[tuple[str, Path], ...] = ()  #: Track and vehicle, if they were read.
+    files: tuple[tuple[str, Path], ...] = ()  #: Kinds and paths of track and vehicle, if they were read.
     notes: tuple[str, ...] = ()
 
 
@@ -185,7 +202,12 @@ def compute_errors(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return one antenna's errors, by chainage on a shared map (`SAME_MAP_M`), else along the trajectory."""
+    """Compute the errors of one antenna.
+
+    With the method "auto" the errors are differences of chainage if run and reference share a map (`SAME_MAP_M`),
+    otherwise distances along the trajectory. Raise MismatchError where the reference is of another region, the method
+    "chainage" is impossible, or the track is not that of the run; InputFileError where a file is missing.
+    """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)
@@ -243,7 +265,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
 def _note_of_passes(
     antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
 ) -> tuple[str, ...]:
-    """Note the number of errors to another pass of the line than the pass of the reference's nearest point."""
+    """Return a note on the number of errors to a pass of the line that is not nearest to the reference, if any."""
     known = np.isfinite(error_m)
     nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
     others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())
@@ -257,7 +279,10 @@ def _note_of_passes(
 
 
 def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[str | None, bool]:
-    """Return the reason against differences of chainage, or None, and whether the reference chainage is usable."""
+    """Return the reason why differences of chainage are not errors, or None.
+
+    Also return whether the chainage of the reference is on the map of the run.
+    """
     known = np.isfinite(answers.reference_ecef_m[:, 0])
     with_chainage = np.isfinite(answers.reference_chainage_m)
     if not with_chainage.any():
@@ -278,7 +303,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
 
 
 def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
-    """Return the arc lengths at chainages, tolerating rounding at the ends of the line."""
+    """Return the arc lengths at chainages; chainages beyond an end by less than `_ROUNDING_M` are moved to the end."""
     first, last = trajectory.chainage_m[0], trajectory.chainage_m[-1]
     near = (chainage_m > first - _ROUNDING_M) & (chainage_m < last + _ROUNDING_M)
     return trajectory.arc_at_chainage(np.where(near, np.clip(chainage_m, first, last), chainage_m))
@@ -287,7 +312,11 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory of a run's positions, files and notes; MismatchError: the positions are off it."""
+    """Return the trajectory on which an antenna's positions lie, the files that were read, and notes.
+
+    Raise InputFileError where a file is missing, MismatchError where a position lies off the trajectory by more than
+    `SAME_TRAJECTORY_M`.
+    """
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:
@@ -321,7 +350,11 @@ def find_trajectory(
 
 
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
-    """Return options for reading the track: the given options, then the file's, then the options in ``run.json``."""
+    """Return the sets of options (CRS, height datum, geoid) with which the track is to be read, in order of preference.
+
+    Given options are the only set. Without them the track is read first without options, then with those in
+    ``run.json``.
+    """
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):
         return [given]
@@ -331,7 +364,7 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
 
 
 def read_run_track(run: RunFolder) -> Track:
-    """Return the track that the run used."""
+    """Read the track that the run used; InputFileError where ``run.json`` has no track or it cannot be read."""
     if not run.tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
     *first, last = _readings(run, TrackFiles())

