@@ -1,10 +1,11 @@
 """Simulated runs with ground truth: RINEX logs of two antennas of a train on a given or generated line.
 
-`Scenario` has all settings, `load_scenario` reads one from TOML, `write_run` writes the files, `Simulation` returns the
-arrays in chunks. The same scenario gives the same numbers. ``railfix simulate`` is the same from the command line.
+`Scenario` has all settings. `load_scenario` reads a scenario from TOML, `write_run` writes the files of a run, and
+`Simulation` returns the arrays in chunks. Equal scenarios give equal numbers. The command ``railfix simulate`` writes
+the same files.
 
-Atmospheric delays and the rigid body are computed here independently of the packages that the estimators
-use, by the same published formulas, so that an error in either causes a position error.
+The rigid body of the vehicle is computed by a different method than in `railfix.track`, so that an error in either
+computation causes a position error.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-# The names of `railfix.simulate`, imported at their first use (lazy-loader).
+# Names of `railfix.simulate`, which lazy-loader imports at their first use.
 
 from .alignment import Alignment, build_alignment
 from .constellation import simulate_navigation

@@ -1,8 +1,8 @@
-"""The continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
+"""Continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
 
-The ground truth is this curve; the track map samples it, with the error `MapError` where set. Chainage is the arc
-length in three dimensions. Curvature changes linearly in transitions (clothoids), and with it the cant (ramps), the
-gradient linearly in vertical curves. The curve is laid on the ellipsoid.
+The curve is the ground truth. The track map consists of points of the curve, with the offset `MapError` where set.
+Chainage is the arc length in three dimensions. Curvature and cant change linearly in transitions (clothoids and cant
+ramps), the gradient changes linearly in vertical curves. The curve is integrated on the WGS 84 ellipsoid.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from railfix.track import Track, interpolate_kilometrage
 
 _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
-#: Spacing of the points that the curve is integrated to [m]; the spline between them is exact to 1e-6 m.
+#: Spacing of the points at which the curve is integrated [m]; the spline between the points is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-_ROUNDS: Final = 8  #: Rounds of the integration on the ellipsoid: each reduces the error by (length / Earth radius).
+_ROUNDS: Final = 8  #: Rounds of the integration; each reduces the error by the factor (length / Earth radius).
 
 #: Pattern of the simulated test line: length [m], radius (right positive) [m] and cant [m] at its end.
 PATTERN: Final = (
@@ -47,7 +47,7 @@ PATTERN: Final = (
     (35.0, np.inf, 0.0),
     (226.0, np.inf, 0.0),
 )
-#: Gradient at points of the pattern: chainage [m], gradient [permille]; linear between.
+#: Gradient at points of the pattern: chainage [m] and gradient [permille]; linear between the points.
 GRADIENT: Final = (
     (0.0, 0.0), (60.0, 0.0), (100.0, -4.0), (180.0, -4.0), (240.0, 10.0), (380.0, 10.0), (450.0, 2.5),
     (560.0, 2.5), (620.0, -6.0), (700.0, -6.0), (756.0, 0.0),
@@ -56,14 +56,14 @@ GRADIENT: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment(Knots):
-    """A line of given elements."""
+    """Continuous line of a scenario."""
 
     settings: LineSettings
-    file: FileLine | None = None  #: The curve through the points of a track file, which replaces the integrated one.
+    file: FileLine | None = None  #: Curve through the points of a track file, used instead of an integrated curve.
 
     @property
     def length_m(self) -> float:
-        """Chainage of the end of the line."""
+        """Chainage of the end of the line, which begins at 0."""
         return float(self.knot_m[-1])
 
     def curvature_at(self, chainage_m: ArrayLike) -> Floats:
@@ -79,7 +79,7 @@ class Alignment(Knots):
         return np.interp(np.asarray(chainage_m, dtype=np.float64), self.grade_knot_m, self.grade)
 
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
-        """Return the line's kilometrage [m]."""
+        """Return the kilometrage at chainages [m]."""
         if self.file is not None:
             return interpolate_kilometrage(chainage_m, self.file.point_m, self.file.track.kilometrage_m)
         return np.asarray(np.asarray(chainage_m, dtype=np.float64) + self.settings.kilometrage_start_m)
@@ -93,15 +93,18 @@ class Alignment(Knots):
         return CubicHermiteSpline(chainage, place, tangent, axis=0)
 
     def at(self, chainage_m: ArrayLike) -> Floats:
-        """Return points of the curve, shape (..., 3) ECEF [m]; its first and last pieces continue beyond the ends."""
+        """Return points of the curve, shape (..., 3) ECEF [m]; beyond the ends the curve is extrapolated."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
 
     def tangent_at(self, chainage_m: ArrayLike) -> Floats:
-        """Return the unit vectors along the curve, shape (..., 3), of length 1 within 1e-6."""
+        """Return the tangents toward rising chainage, shape (..., 3), of length 1 within 1e-6."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
 
     def point_beside(self, chainage_m: Floats, lateral_m: float, height_m: float) -> Floats:
-        """Return the points to the right of the curve and above it, square to it and level, shape (n, 3) ECEF [m]."""
+        """Return points at lateral (right positive) and vertical offsets from the curve, shape (n, 3) ECEF [m].
+
+        The lateral offset is horizontal and perpendicular to the curve.
+        """
         place, tangent = self.at(chainage_m), self.tangent_at(chainage_m)
         up = axes_at(place)[:, 2]
         right = np.cross(tangent, up)
@@ -109,7 +112,10 @@ class Alignment(Knots):
         return np.asarray(place + lateral_m * right + height_m * up)
 
     def point_chainage_m(self) -> Floats:
-        """Chainage of the map's points: the elements' ends, and even steps between within the spacing; a file's own."""
+        """Return the chainages of the points of the track map.
+
+        These are the ends of the elements, and evenly spaced points between them; with a track file, its points.
+        """
         if self.file is not None:
             return self.file.point_m
         points = [np.zeros(1)]
@@ -122,7 +128,7 @@ class Alignment(Knots):
         return np.concatenate(points)
 
     def map_error_m(self, chainage_m: ArrayLike) -> Floats:
-        """Return the offset of the map from the line, to the east, to the north and up, shape (..., 3) [m]."""
+        """Return the offset of the map from the line, east, north and up, shape (..., 3) [m]."""
         error = self.settings.map_error
         rng = np.random.default_rng([error.seed, 12])
         sigmas = (error.plan_sigma_m, error.plan_sigma_m, error.height_sigma_m)
@@ -130,7 +136,7 @@ class Alignment(Knots):
         return np.stack([offset.at(chainage_m) for offset in offsets], axis=-1)
 
     def track(self) -> Track:
-        """Return the track map: the curve at `point_chainage_m`, with its attributes and the map's error."""
+        """Return the track map: points of the curve at `point_chainage_m` with the map error, and their attributes."""
         chainage = self.point_chainage_m()
         ecef = self.at(chainage)
         exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
@@ -156,10 +162,10 @@ class Alignment(Knots):
 
 
 def build_alignment(settings: LineSettings) -> Alignment:
-    """Return the line of a scenario, of any of the four kinds.
+    """Return the line of a scenario.
 
-    SettingsError: when the elements do not make a line. InputFileError: when the track file cannot be read, or is too
-    rough for a line.
+    Raise SettingsError where the elements do not fit together, InputFileError where the track file cannot be read, has
+    too few points, or has a curve that is too sharp.
     """
     if settings.kind == "file":
         assert settings.file is not None
@@ -175,7 +181,7 @@ def build_alignment(settings: LineSettings) -> Alignment:
 
 
 def _pattern_knots(length_m: float) -> Knots:
-    """The pattern of the simulated test line, repeated with every second copy mirrored, to the requested length."""
+    """Return the knots of the simulated test line: `PATTERN` repeated, every second copy mirrored, up to a length."""
     repeats = int(np.ceil(length_m / PATTERN_LENGTH_M - 1e-12))
     lengths, radii, cants = (np.array(column) for column in zip(*PATTERN, strict=True))
     side = np.repeat(np.where(np.arange(repeats) % 2 == 0, 1.0, -1.0), len(lengths))
@@ -198,11 +204,11 @@ def _pattern_knots(length_m: float) -> Knots:
 
 
 def _integrate(line: Alignment) -> tuple[Floats, Floats]:
-    """Return the points and unit tangents of the curve at even chainages, shapes (n, 3).
+    """Return ECEF points [m] and unit tangents of the curve at evenly spaced chainages, shapes (n, 3).
 
-    ``d azimuth = curvature * plan step + sin(latitude) d longitude`` (convergence of the meridians),
-    ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``,
-    ``d height = climb``; integrated in rounds, each by Gauss's rule of two points per step.
+    Per plan length: ``d azimuth = curvature + sin(latitude) d longitude`` (meridian convergence),
+    ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``; per arc length
+    ``d height = sin(slope)``. The equations are integrated in several rounds by two-point Gauss quadrature.
     """
     cells = int(np.ceil(line.length_m / _STEP_M))
     step = line.length_m / cells
@@ -213,7 +219,7 @@ def _integrate(line: Alignment) -> tuple[Floats, Floats]:
     lat0, lon0 = np.radians([settings.latitude_deg, settings.longitude_deg])
 
     def total(rate: Floats) -> tuple[Floats, Floats]:
-        """Return the integral of a rate given at the Gauss points: at the edges, and back at the Gauss points."""
+        """Return the integral of a rate that is given at the Gauss points, at the edges and at the Gauss points."""
         at_edges = np.concatenate([[0.0], np.cumsum(rate.mean(axis=1) * step)])
         slope = (rate[:, 1] - rate[:, 0]) / (offset[1] - offset[0])
         start = rate[:, 0] - slope * offset[0]

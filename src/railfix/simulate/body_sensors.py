@@ -1,7 +1,7 @@
 """Pulse times of a tachometer; specific force and angular rate of an inertial sensor fixed to the body.
 
-Differences in time of position and attitude of the body, in the frame of the Earth, with its gravity and its rotation
-(Groves 2013, 2.3 to 2.5 and 5.2).
+The inertial quantities are differences in time of the body's position and attitude in the Earth-fixed frame, with
+gravity and Earth rotation (Groves 2013, 2.3 to 2.5 and 5.2).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 _STEP_S: Final = 0.01  #: Spacing of the instants between which the wheel's acceleration is constant [s].
-#: Spacing of the search for accelerations and brakings [s], and their least size [m/s^2].
+#: Time step of the search for phases of acceleration and braking [s], and their minimum acceleration [m/s^2].
 _LOOK_S: Final = 0.1
 _HARD_MPS2: Final = 0.05
 #: Streams of random numbers: phase and jitter, slips, teeth, lost and doubled pulses.
@@ -35,7 +35,10 @@ _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Return slips and slides of the run, given and drawn, in order; a drawn one that overlaps another is left out."""
+    """Return the given and the drawn slips and slides of the run in order of time.
+
+    A drawn slip or slide that overlaps another is left out.
+    """
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _SLIPS])
     slips = list(settings.slips)
@@ -54,7 +57,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # Always drawn, so that the slips of one phase are independent of other phases.
+        # Drawn for every phase, so that the slips of a phase do not depend on those of other phases.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
             continue
@@ -67,7 +70,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
 
 
 def slip_ratio(slips: list[SlipInterval], time_s: Floats) -> Floats:
-    """Return the wheel speed over train speed, less 1, at times [s]."""
+    """Return (wheel speed - train speed) / train speed at times [s]; 0 without a slip."""
     ratio = np.zeros(np.shape(time_s))
     for slip in slips:
         part = (time_s - slip.start_s) / (slip.end_s - slip.start_s)
@@ -84,8 +87,12 @@ def pulse_times_s(
     *,
     tooth_errors: Floats | None = None,
 ) -> Floats:
-    """Compute pulse times [s after the start]; `phase` in [0, 1), `tooth_errors` are fractions of the spacing."""
-    # The breakpoints of the motion are nodes, too, so that without slips the result is exact.
+    """Compute the pulse times of a tachometer [s after the start].
+
+    `phase` is the position of the first pulse as a fraction of the pulse spacing, in [0, 1). `tooth_errors` are the
+    position errors of the teeth as fractions of the spacing, shape (pulses per turn,).
+    """
+    # The breakpoints of the motion are also nodes, so that the result without slips is exact.
     corner = motion.time_s[(motion.time_s > 0.0) & (motion.time_s < duration_s)]
     node = np.unique(np.concatenate([np.arange(0.0, duration_s, _STEP_S), corner, [duration_s]]))
     chainage, speed = motion.at(node)
@@ -98,17 +105,17 @@ def pulse_times_s(
     times = _times_at(target, node, turned, np.abs(speed) + surplus)
     if tooth_errors is None:
         return times
-    # The same tooth passes again after a turn, in either direction.
+    # After a turn in either direction the same tooth is at the sensor again.
     tooth = np.cumsum(np.where(motion.at(times)[1] < 0.0, -1, 1)) % len(tooth_errors)
     moved = np.clip(target + apart * tooth_errors[tooth], 0.0, turned[-1])
     return _times_at(np.sort(moved), node, turned, np.abs(speed) + surplus)
 
 
 def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Floats) -> Floats:
-    """Return times at which the wheel has turned by given lengths of its rim; constant acceleration between nodes."""
+    """Return the times at which the wheel has rolled the given distances, with constant acceleration between nodes."""
     step = np.diff(node_s)
     cell = np.clip(np.searchsorted(turned_m, target_m, side="left") - 1, 0, len(step) - 1)
-    # s = v t + a t^2 / 2 with the distance of the cell kept.
+    # s = v t + a t^2 / 2, with an acceleration that gives the distance of the cell.
     start = speed_mps[cell]
     bend = 2.0 * (turned_m[cell + 1] - turned_m[cell] - start * step[cell]) / step[cell] ** 2
     ahead = target_m - turned_m[cell]
@@ -119,7 +126,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
 
 
 def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
-    """Return the pulse times with pulses lost and doubled at random; a doubled one comes before the next tooth."""
+    """Return the pulse times with random lost pulses, and random second pulses between a tooth and the next."""
     if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
         return time_s
     lost, doubled, part = np.random.default_rng([seed, _MISCOUNT]).uniform(size=(3, len(time_s)))
@@ -130,7 +137,7 @@ def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats
 
 
 def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Return pulses as the tachometer gives them, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the pulses of the tachometer with its errors, see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _WHEEL])
     slips = wheel_slips(simulation, settings)
@@ -168,8 +175,8 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
 
 
 _HALF_S: Final = 0.02  #: Longest half interval of the differences in time [s].
-_BLOCK: Final = 50_000  #: Samples computed at once.
-_LEVER_M: Final = 10.0  #: Lever arm of the attitude, long so that rounding of positions is negligible [m].
+_BLOCK: Final = 50_000  #: Number of samples computed in one step.
+_LEVER_M: Final = 10.0  #: Lever arm from which the attitude is computed, long against the rounding of positions [m].
 #: Normal gravity of WGS 84 at the equator [m/s^2], Somigliana's constant, flattening, m, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
 _ECCENTRICITY_2: Final = 6.694_379_990_14e-3
@@ -178,7 +185,7 @@ _NOISE, _ACCEL_DRIFT, _GYRO_DRIFT, _WALK, _VIBRATION = 22, 23, 24, 25, 29
 
 
 def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
-    """Return the normal gravity, centrifugal part included (NIMA TR8350.2, equations 4-1 and 4-3)."""
+    """Return the normal gravity [m/s^2], including centrifugal acceleration (NIMA TR8350.2, equations 4-1 and 4-3)."""
     equator, k, flattening, m, axis = _GRAVITY
     sine = np.sin(np.radians(latitude_deg)) ** 2
     ground = equator * (1.0 + k * sine) / np.sqrt(1.0 - _ECCENTRICITY_2 * sine)
@@ -187,7 +194,10 @@ def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
 
 
 def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats) -> tuple[Floats, Floats]:
-    """Return points of the body, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
+    """Return ECEF positions of a point of the body, shape (n, 3) [m], and the axes of the body, shape (n, 3, 3).
+
+    The rows of the axes are the unit vectors forward, right and down.
+    """
     along, across, up = offset_m
     truth, _ = simulation.body_truth(offset_m, time_s)
     aside, _ = simulation.body_truth((along, across + _LEVER_M, up), time_s)
@@ -196,10 +206,13 @@ def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: 
 
 
 def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats, half_s: float) -> Floats:
-    """Compute force [m/s^2] and inertial rate [rad/s] in the body's axes (n, 6) by differences over `half_s`."""
+    """Compute specific force [m/s^2] and angular rate [rad/s] relative to inertial space in body axes, shape (n, 6).
+
+    They are central differences of position and attitude over ``2 half_s``.
+    """
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now
-    # Differences of positions first, which keeps the digits.
+    # Positions are subtracted before they are summed, which avoids loss of digits.
     acceleration = ((after[0] - place) - (place - before[0])) / half_s**2
     velocity = (after[0] - before[0]) / (2.0 * half_s)
     latitude, longitude, height = geodetic_from_ecef(place)
@@ -233,7 +246,7 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
 
 
 def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Floats) -> Floats | float:
-    """Return the vibration of the six axes at times, shape (n, 6); 0 without any."""
+    """Return the vibration of the six axes at times, shape (n, 6), or 0 where both sigmas are 0."""
     sigmas = np.repeat([settings.vibration_sigma_mps2, settings.vibration_sigma_radps], 3)
     if not sigmas.any():
         return 0.0
@@ -250,7 +263,7 @@ def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Float
 
 
 def _with_errors(true: Floats, time_s: Floats, settings: InertialSettings, seed: int) -> Floats:
-    """Return samples with misalignment, scale errors, biases and drifts, noise, quantisation, applied in this order."""
+    """Return the samples after misalignment, scale errors, biases, drifts, noise and quantisation, in this order."""
     turned = Rotation.from_rotvec(settings.misalignment_rad).inv()
     measured = np.concatenate([turned.apply(true[:, :3]), turned.apply(true[:, 3:])], axis=1)
     measured *= 1.0 + np.array([*settings.accel_scale, *settings.gyro_scale])

@@ -1,10 +1,10 @@
-"""Broadcast records of simulated satellites, and the signals that arrive at a receiver.
+"""Broadcast records of simulated satellites, and the geometry of signals at a receiver.
 
 Orbits have the semi-major axis, eccentricity and inclination of the real constellations; one QZSS satellite is near the
-zenith at the start of the run. All records of a satellite describe the same orbit and clock to within a millimetre. The
-signals follow the newest record transmitted, as receivers use it.
+zenith at the start of the run. All records of a satellite describe the same orbit and clock to within a millimetre.
+Signals are computed from the newest transmitted record, which receivers use, too.
 
-`links` computes every instant; `SatelliteTable` computes nodes once, and interpolates all satellites together.
+`links` computes the states at every instant; `SatelliteTable` computes them at nodes and interpolates all satellites.
 """
 
 from __future__ import annotations
@@ -25,21 +25,24 @@ from railfix.io.rinex import read_navigation
 from railfix.io.rinex.navigation_records import glonass_records
 from railfix.simulate.scenario import Scenario
 
-#: Health as broadcast: all data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou).
+#: Health of an unhealthy satellite: all data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou).
 _ILL_HEALTH: Final = {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}
-#: Validity of a record about its reference time [s], as `railfix.gnss.orbits`.
+#: Largest time from the reference time at which a record is valid [s], as in `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
-#: Time from transmission to reference time, where the transmission time is absent or implausible [s].
+#: Assumed time from transmission to reference time where the transmission time is absent or implausible [s].
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
 _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": ("D1", "D2")}
 
 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
-    """Read the records of the satellites that have a valid record throughout the scenario."""
+    """Read the navigation records of the satellites that have a valid record throughout the scenario.
+
+    Raise MismatchError where no satellite has, or the file lacks the Klobuchar coefficients that the scenario requires.
+    """
     navigation = read_navigation(path)
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
         raise MismatchError(
-            f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; take another file, "
+            f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; use another file, "
             "or set sky.ionosphere_scale to 0 and position with `--set ionosphere=off`"
         )
     records = _select_simulated(navigation.kepler, scenario.sky.systems, _messages(scenario))
@@ -66,7 +69,7 @@ def _messages(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, tuple[str, ...]]) -> KeplerRecords:
-    """Return the records of the simulated signals, with plausible transmission times."""
+    """Return the records of the simulated signals; implausible transmission times are replaced by assumed times."""
     letter = records.satellite.astype("<U1")
     usable = np.zeros(len(records), dtype=np.bool_)
     delay = np.where(letter == "E", records.group_delay_2_s, records.group_delay_1_s)
@@ -80,10 +83,13 @@ def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, 
 
 
 def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:
-    """Indices of a satellite's records in force from `first` to `last`, by transmission; none where one is missing."""
+    """Return the indices of a satellite's records in force from `first` to `last`, in order of transmission.
+
+    The result is empty where the record in force is not valid at some time, or there is none.
+    """
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
-    # Of records sent at the same time, the one with the later reference time.
+    # Of records transmitted at the same time only that with the latest reference time is kept.
     rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0, "ns"), True)]
     sent = records.transmitted[rows]
     begin, end = (int(np.searchsorted(sent, time, side="right")) for time in (first, last))
@@ -97,11 +103,11 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     return np.asarray(rows[: len(rows) if served.all() else 0])
 
 
-#: Klobuchar coefficients of GPS, alpha then beta (fictitious, of ordinary size); they are used for all constellations.
+#: Klobuchar coefficients of GPS, alpha then beta, fictitious values of usual size; used for all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
-#: Seconds between the transmission of the record before and the next (IS-GPS-200: two hours).
+#: Time between the transmissions of two successive records [s] (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
-_SENT_AFTER_S: Final = 18  #: Transmission begins a little after the hour.
+_SENT_AFTER_S: Final = 18  #: Delay of the first transmission of a record after the full hour [s].
 _SYNCHRONOUS_M: Final = (GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0)  #: Radius of a synchronous orbit [m].
 #: Galileo data source: I/NAV of E1-B, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
 _INAV_SOURCE: Final = 517
@@ -109,7 +115,7 @@ _INAV_SOURCE: Final = 517
 
 @dataclass(frozen=True, kw_only=True)
 class _Orbit:
-    """One satellite at the start of the run: angles in radians, node in the Earth-fixed frame of that instant."""
+    """Orbit of a satellite at the start of the run; angles [rad], node in the Earth-fixed frame of that instant."""
 
     name: str
     semi_major_m: float
@@ -121,10 +127,11 @@ class _Orbit:
 
 
 def simulate_navigation(scenario: Scenario) -> Navigation:
-    """Return the broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
+    """Return the broadcast records for the duration of a run.
 
-    All values are rounded to the digits of the file, so that file and arrays describe the same satellites. Where the
-    scenario names a navigation file, its records; errors as `navigation_of_file`.
+    All values are rounded to the digits that `railfix.io.write_navigation` writes, so that file and arrays describe the
+    same satellites. If the scenario names a navigation file, the records are those of `navigation_of_file`, which also
+    raises its errors.
     """
     if scenario.sky.nav is not None:
         return navigation_of_file(scenario, scenario.sky.nav)
@@ -183,7 +190,10 @@ def _orbits(system: str, scenario: Scenario, rng: np.random.Generator) -> list[_
 
 
 def _slot_name(system: str, k: int) -> str:
-    """BeiDou satellites have the numbers of real satellites of their kind: C01 to C05 are read as GEO."""
+    """Return the name of satellite `k` of a constellation.
+
+    BeiDou satellites have numbers of real MEO satellites, because programs read C01 to C05 as GEO satellites.
+    """
     if system == "C":
         return f"C{k + 19 if k < 19 else k + 22:02d}"
     return f"{system}{k + 1:02d}"
@@ -192,7 +202,10 @@ def _slot_name(system: str, k: int) -> str:
 def _figure_of_eight(
     name: str, longitude_deg: float, phase: float, *, eccentricity: float = 0.075, tilt_deg: float = 41.0
 ) -> _Orbit:
-    """Return the inclined synchronous orbit, northmost and farthest at a longitude, `phase` radians ago."""
+    """Return an inclined geosynchronous orbit whose satellite passed its northernmost point `phase` radians ago.
+
+    The northernmost point is the apogee, at the given longitude.
+    """
     return _Orbit(
         name=name,
         semi_major_m=_SYNCHRONOUS_M,
@@ -205,7 +218,7 @@ def _figure_of_eight(
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Return the records of one satellite: the record before the run, the current record, and the following records."""
+    """Return the records of one satellite as rows: the record before the run, the current and the following records."""
     every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
     mu, rotation = GM[system], ROTATION[system]
     start_sow = float(to_week(scenario.start)[1])
@@ -227,7 +240,7 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
         dt = first + (k + 1) * every - start_sow - shift
         toe = scenario.start + timedelta(dt)
         _, toe_sow = to_week(toe + timedelta(shift))
-        # Longitude of the node at toe, and back to the start of the week as the records count it.
+        # Longitude of the node at toe, referred to the start of the week as in the records.
         node = orbit.node + (drift - rotation) * dt + rotation * float(toe_sow)
         ill = orbit.name in scenario.sky.unhealthy and sent_sow + every > start_sow
         row: dict[str, Any] = {
@@ -258,11 +271,11 @@ def _wrap(angle: float) -> float:
 
 
 def _digits(value: float) -> str:
-    """Return a value in the digits of RINEX's D19.12."""
+    """Return a value as text with the digits of the RINEX format D19.12."""
     return f"{value:.12E}"
 
 
-#: Longest piece of `SatelliteTable` [s], nodes of a piece, and the flight time for which it is computed [s].
+#: Longest piece of `SatelliteTable` [s], its number of nodes, and the flight time for which it is computed [s].
 _PIECE_S: Final = 60.0
 _NODES: Final = 7
 _FLIGHT_S: Final = 0.08
@@ -270,18 +283,22 @@ _FLIGHT_S: Final = 0.08
 
 @dataclass(frozen=True, kw_only=True)
 class Links:
-    """Signals received at T instants: from one satellite, shapes (T,), or from S satellites, shapes (T, S)."""
+    """Geometry and satellite clocks of signals received at T instants from one satellite or from S satellites."""
 
-    #: Geometric distance in the frame of reception, the Earth's rotation included; shape (T,) or (T, S).
+    #: Geometric range in the Earth-fixed frame at reception, with Earth rotation; shape (T,) or (T, S).
     range_m: Floats
-    satellite_ecef_m: Floats  #: At transmission, turned into the frame of reception; shape (T, 3) or (T, S, 3).
-    clock_s: Floats  #: Satellite clock with relativity, without group delay; shape (T,) or (T, S).
+    #: Satellite position at transmission, in the Earth-fixed frame at reception; shape (T, 3) or (T, S, 3).
+    satellite_ecef_m: Floats
+    clock_s: Floats  #: Satellite clock with relativistic correction, without group delay; shape (T,) or (T, S).
 
 
 def record_state(
     records: KeplerRecords, row: Indices, since_toe_s: Floats, since_toc_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Position (T, 3) [m] and clock with relativity (T,) [s] by one row of the records for each instant."""
+    """Return positions, shape (T, 3) [m], and clocks with relativistic correction, shape (T,) [s].
+
+    `row` is the row of the records for each instant, `since_toe_s` and `since_toc_s` the times since its toe and toc.
+    """
     position, _, relativity = kepler_state(Orbits.from_records(records).take(row), since_toe_s)
     dt = since_toc_s
     clock = records.af0_s[row] + records.af1[row] * dt + records.af2[row] * dt**2 + relativity
@@ -289,14 +306,17 @@ def record_state(
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
-    """Return the row of the satellite's newest record transmitted by each time (its first where none has been)."""
+    """Return the row of the newest record of a satellite that was transmitted before each time, else its first row."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Return the signals of a satellite at a receiver, `late_s` before T tags: the light-time equation by iteration."""
+    """Return the signals of a satellite that a receiver receives `late_s` before T time tags.
+
+    The light-time equation is solved by iteration.
+    """
     row = newest_record(records, satellite, tag)
     since_toe = seconds(tag - records.toe[row]) - late_s
     since_toc = seconds(tag - records.toc[row]) - late_s
@@ -308,7 +328,10 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
 
 
 def _solve_light_time(state: Callable[[Floats], Floats], flight_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Iterate from a first flight time; `state` returns position and clock, shape (..., 4), by flight times (...)."""
+    """Solve the light-time equation by iteration from an approximate flight time, shape (...).
+
+    `state` returns the satellite's position and clock, shape (..., 4), for flight times, shape (...).
+    """
     x, y, z = (receiver_ecef_m[..., axis] for axis in range(3))
     for _ in range(3):
         place = state(flight_s)
@@ -321,7 +344,7 @@ def _solve_light_time(state: Callable[[Floats], Floats], flight_s: Floats, recei
 
 
 class SatelliteTable:
-    """Satellites over a span of time: computed at nodes once, interpolated within 1e-6 m by degree 6."""
+    """States of satellites over a time span, from polynomials of degree 6 that are exact within 1e-6 m."""
 
     def __init__(
         self, records: KeplerRecords, satellites: Sequence[str], first: np.datetime64, last: np.datetime64
@@ -332,7 +355,7 @@ class SatelliteTable:
         sent = records.transmitted[np.isin(records.satellite, self.satellites)]
         changes = seconds(sent[~np.isnat(sent)] - self._start)
         grid = np.arange(0.0, span, _PIECE_S)
-        # A piece ends where any satellite changes its record.
+        # A piece ends where a satellite begins to transmit another record.
         self._knots = np.unique(np.concatenate([[0.0], grid, changes[(changes > 0.0) & (changes <= span)]]))
         self._end = span
         ends = np.append(self._knots[1:], max(span, self._knots[-1]) + 1e-9)
@@ -350,14 +373,17 @@ class SatelliteTable:
             values[:, :, k, :3] = place.reshape(len(tag), _NODES, 3)
             values[:, :, k, 3] = clock.reshape(len(tag), _NODES)
         to_powers = np.linalg.inv(np.vander(nodes, increasing=True))
-        # Power k of each piece, shape (_NODES, pieces, S, 4).
+        # Coefficients of power k for each piece, shape (_NODES, pieces, S, 4).
         self._powers = np.einsum("kn,pnsc->kpsc", to_powers, values)
 
     def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-        """Return the signals of all satellites, as `links`, shapes (T, S); ValueError outside the table's span."""
+        """Return the signals of all satellites at a receiver, as `links` does, shapes (T, S).
+
+        Raise ValueError where a tag is outside the span of the table.
+        """
         when = seconds(tag - self._start)
         if when.size and (when.min() < 0.0 or when.max() > self._end):
-            raise ValueError("tag is outside of the span that the satellite table was made for")
+            raise ValueError("tag is outside the time span of the satellite table")
         piece = np.searchsorted(self._knots, when, side="right") - 1
         u = ((when - self._middle[piece] - late_s - _FLIGHT_S) / self._half)[:, None, None]
         # Horner's rule for value, slope and half the second derivative.

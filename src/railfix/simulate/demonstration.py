@@ -24,9 +24,9 @@ DEMO_FILES: Final = {
 
 
 def demo_folder() -> Path:
-    """Return the folder of the demonstration run: in an installed package, or in the clone it runs from.
+    """Return the folder of the demonstration run, in the installed package or in a clone of the repository.
 
-    InputFileError: when neither has it, or a file is missing.
+    Raise InputFileError where neither has the folder, or a file is missing.
     """
     package = Path(__file__).resolve().parents[1]
     places = (package / "_demo", package.parents[1] / "data" / "demo")
@@ -40,13 +40,13 @@ def demo_folder() -> Path:
 
 
 def demo_files() -> dict[str, Path]:
-    """Files of the demonstration run: ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``readme``."""
+    """Return the files of the demonstration run by kind (`DEMO_FILES`); InputFileError where they are missing."""
     folder = demo_folder()
     return {name: folder / file for name, file in DEMO_FILES.items()}
 
 
 def demo_inputs() -> RunInputs:
-    """Return the files of the demonstration run; InputFileError where neither the package nor the clone has them."""
+    """Return the files of the demonstration run as inputs of a run; InputFileError where they are missing."""
     files = demo_files()
     return RunInputs(
         front=(files["front"],),
@@ -58,12 +58,12 @@ def demo_inputs() -> RunInputs:
 
 
 def demo_truth() -> Path:
-    """File of the reference trajectory of the demonstration run, for `railfix.evaluate`; InputFileError without."""
+    """Return the file with the ground truth of the demonstration run; InputFileError where it is missing."""
     return demo_files()["truth"]
 
 
 def demo() -> Result:
-    """Positions of the demonstration run, both antennas: the filter along the track and each epoch by itself.
+    """Compute the positions of the demonstration run for both antennas, by the filter and for single epochs.
 
     A notebook shows the result as a table; `railfix.train_table` and `railfix.positions_table` return its rows.
     """

@@ -1,7 +1,8 @@
-"""Errors common to all nearby receivers, and Gauss-Markov processes independent of the chunks.
+"""Satellite and atmospheric errors, which are common to all nearby receivers, and the random processes of errors.
 
-The exact process is drawn at nodes and interpolated by cubics through four of them (Catmull and Rom 1974); the loss of
-variance (less than 1 %) is compensated on average.
+A Gauss-Markov process is drawn exactly at nodes and interpolated by cubics through four nodes (Catmull and Rom 1974).
+The loss of variance by interpolation (less than 1 %) is compensated on average. The values do not depend on the chunks
+in which a run is simulated.
 """
 
 from __future__ import annotations
@@ -26,18 +27,22 @@ from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 
 _NODES_A_TIME: Final = 32  #: Nodes per correlation time.
-#: Least nodes before the start of the run, and least margin around it [s]: clock biases shift instants outside.
+#: Minimum number of nodes before the start of the run.
 _BEFORE: Final = 3
+#: Margins before and after the run [s], because clock biases shift instants beyond its start and end.
 _ROOM_S: Final = (0.1, 1.0)
 
 
 def satellite_key(satellite: str) -> tuple[int, int]:
-    """Return two numbers that identify a satellite in seeds, so that its errors do not depend on other satellites."""
+    """Return two numbers that identify a satellite in a seed, so that its errors do not depend on other satellites."""
     return ord(satellite[0]), int(satellite[1:])
 
 
 class Interpolated:
-    """Columns at even nodes, shape (K, C), the first `nodes_before` the start, with a continuous rate."""
+    """C functions of time given at K evenly spaced nodes, shape (K, C), interpolated with a continuous rate.
+
+    `nodes_before` nodes precede the start of the run.
+    """
 
     def __init__(self, nodes: Floats, spacing_s: float) -> None:
         self._nodes = nodes
@@ -45,28 +50,31 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return the four nodes about each time, shape (T, C), and the fraction of the cell, shape (T, 1)."""
+        """Return the values of the four nodes around each time, shape (T, C), and the fraction of the cell, (T, 1)."""
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
-            raise ValueError("a time is outside of the run that the errors were made for")
+            raise ValueError("a time is outside the run for which the errors were drawn")
         a, b, c, d = (self._nodes[cell + k] for k in (-1, 0, 1, 2))
         return a, b, c, d, (place - cell)[:, None]
 
     def at(self, time_s: Floats) -> Floats:
-        """Return values, shape (T, C), at seconds after the start, shape (T,); ValueError far outside of the run."""
+        """Return the values, shape (T, C), at times after the start, shape (T,) [s].
+
+        Raise ValueError where a time is outside the run and its margins.
+        """
         a, b, c, d, u = self._place(time_s)
         return np.asarray(b + u / 2.0 * ((c - a) + u * (2.0 * a - 5.0 * b + 4.0 * c - d + u * (3.0 * (b - c) + d - a))))
 
     def rate(self, time_s: Floats) -> Floats:
-        """Return the rates of change per second, shape (T, C)."""
+        """Return the rates of change per second, shape (T, C), at times after the start, shape (T,) [s]."""
         a, b, c, d, u = self._place(time_s)
         slope = (c - a) + u * (2.0 * (2.0 * a - 5.0 * b + 4.0 * c - d) + 3.0 * u * (3.0 * (b - c) + d - a))
         return np.asarray(slope / 2.0 / self._spacing_s)
 
 
 def nodes_before(spacing_s: float) -> int:
-    """Return the number of nodes before second 0."""
+    """Return the number of nodes before the start of the run."""
     return max(_BEFORE, int(np.ceil(_ROOM_S[0] / spacing_s)) + 1)
 
 
@@ -76,10 +84,14 @@ def node_count(duration_s: float, spacing_s: float) -> int:
 
 
 class GaussMarkov(Interpolated):
-    """Independent Gauss-Markov processes with keys as seeds; a longer run begins with the same values."""
+    """Independent Gauss-Markov processes of first order, one per key, which is its seed.
+
+    `sigma` is the standard deviation and `time_s` the correlation time. A longer duration does not change the values of
+    a shorter one.
+    """
 
     def __init__(self, keys: Sequence[Sequence[int]], *, sigma: float, time_s: float, duration_s: float) -> None:
-        from scipy.signal import lfilter  # 0.4 s to load, at each start that only reads a scenario
+        from scipy.signal import lfilter  # its import takes 0.4 s, which reading a scenario does not need
 
         spacing = time_s / _NODES_A_TIME
         rho = float(np.exp(-1.0 / _NODES_A_TIME))
@@ -91,7 +103,7 @@ class GaussMarkov(Interpolated):
 
 
 def _interpolate_sigma(rho: float) -> float:
-    """Return the standard deviation between nodes, root mean square, of a process of standard deviation 1."""
+    """Return the root mean square between nodes of an interpolated process of standard deviation 1."""
     u = (np.arange(200) + 0.5) / 200.0
     weight = 0.5 * np.stack(
         [-u + 2 * u**2 - u**3, 2 - 5 * u**2 + 3 * u**3, u + 4 * u**2 - 3 * u**3, -(u**2) + u**3], axis=-1
@@ -101,7 +113,7 @@ def _interpolate_sigma(rho: float) -> float:
 
 
 class ClockWalk(Interpolated):
-    """Variation of a receiver's clock [m]: random walks of bias [m / sqrt(s)] and drift [m/s / sqrt(s)]."""
+    """Variation of a receiver clock [m] by random walks of the bias [m / sqrt(s)] and of the drift [m/s / sqrt(s)]."""
 
     def __init__(
         self, key: Sequence[int], *, walk: float, frequency_walk: float, interval_s: float, duration_s: float
@@ -112,32 +124,31 @@ class ClockWalk(Interpolated):
         drift = np.cumsum(frequency_walk * white[:, 0])
         bias = np.cumsum(walk * white[:, 1])
         drift, bias = drift - drift[start], bias - bias[start]
-        # The trapezoid rule: the drift is linear from node to node.
+        # The drift is linear between nodes, so it is integrated by the trapezoid rule.
         turned = np.concatenate([[0.0], np.cumsum((drift[1:] + drift[:-1]) / 2.0)]) * interval_s
         bias = bias + turned - turned[start]
         super().__init__(bias[:, None], interval_s)
 
 
-_COSINES: Final = 64  #: Number of cosines of one function.
+_COSINES: Final = 64  #: Number of cosines whose sum is a `RandomFunction`.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomFunction:
-    """Realisation of a stationary Gaussian function."""
+    """Realisation of a stationary, nearly Gaussian random function, a sum of W cosines."""
 
-    amplitude: float  #: Of each cosine.
-    #: Radians per unit of the variable, and radians; shape (W,).
-    frequency: Floats
-    phase: Floats
+    amplitude: float  #: Amplitude of each cosine.
+    frequency: Floats  #: Angular frequencies [rad per unit of the variable], shape (W,).
+    phase: Floats  #: Phases [rad], shape (W,).
 
     @classmethod
     def smooth(cls, rng: np.random.Generator, *, sigma: float, correlation: float) -> Self:
-        """Return the function with the correlation exp(-d^2 / (2 correlation^2))."""
+        """Return a function of standard deviation `sigma` with the correlation exp(-d^2 / (2 correlation^2))."""
         return cls._draw(rng, sigma, rng.normal(0.0, 1.0 / correlation, _COSINES))
 
     @classmethod
     def periodic(cls, rng: np.random.Generator, *, sigma: float, period: float) -> Self:
-        """Return the oscillation about one period, with a relative bandwidth of 15 percent."""
+        """Return an oscillation of standard deviation `sigma` around a period, with a relative bandwidth of 15 %."""
         return cls._draw(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _COSINES)))
 
     @classmethod
@@ -146,7 +157,7 @@ class RandomFunction:
         return cls(amplitude=sigma * float(np.sqrt(2.0 / _COSINES)), frequency=frequency, phase=phase)
 
     def at(self, x: ArrayLike) -> Floats:
-        """Return values at positions or times, same shape as `x`."""
+        """Return the values of the function at positions or times `x`, in the shape of `x`."""
         where = np.asarray(x, dtype=np.float64)
         if self.amplitude == 0.0:
             return np.zeros(where.shape)
@@ -156,14 +167,14 @@ class RandomFunction:
         return self.amplitude * total
 
 
-#: Spacing of the nodes between which the axes of an orbit are interpolated [s]; they turn by half a degree.
+#: Spacing of the nodes between which the axes of an orbit are interpolated [s]; the axes turn by half a degree.
 _AXES_S: Final = 60.0
 #: Streams of random numbers: clock, three axes, group delay, ionosphere, troposphere.
 _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
 
 
 class CommonErrors:
-    """Errors of satellites and the atmosphere as functions of time since `start` and position."""
+    """Satellite and atmospheric errors as functions of position and of the time since `start`."""
 
     def __init__(
         self,
@@ -187,7 +198,10 @@ class CommonErrors:
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
     def _of_satellites(self, stream: int, sigma: str, time: str) -> list[tuple[list[int], GaussMarkov]]:
-        """Return the processes of each constellation that has this error, with the columns of its satellites."""
+        """Return the processes of an error per constellation, each with the columns of its satellites.
+
+        `sigma` and `time` are the names of the settings; constellations with a sigma of 0 are left out.
+        """
         found = []
         for letter, table in sorted(self._settings.satellites.items()):
             columns = [k for k, name in enumerate(self._satellites) if name[0] == letter]
@@ -214,7 +228,7 @@ class CommonErrors:
 
     @cached_property
     def _axes(self) -> CubicSpline[np.float64]:
-        """Radial, along and cross of each satellite in the Earth-fixed frame, shape (T, S, axis, xyz)."""
+        """Radial, along-track and cross-track unit vectors in the Earth-fixed frame, shape (T, S, axis, xyz)."""
         nodes = np.arange(-2.0, self._duration_s / _AXES_S + 3.0) * _AXES_S
         time = self._start + timedelta(nodes)
         axes = np.empty((len(nodes), len(self._satellites), 3, 3))
@@ -245,7 +259,7 @@ class CommonErrors:
         return GaussMarkov([(self._seed, stream)], sigma=sigma_m, time_s=time_s, duration_s=self._duration_s)
 
     def orbit_error_m(self, time_s: Floats) -> Floats:
-        """True minus broadcast position, shape (T, S, 3) [m], in the Earth-fixed frame."""
+        """Return the true minus the broadcast satellite positions, shape (T, S, 3) ECEF [m]."""
         error = np.zeros((len(time_s), len(self._satellites), 3))
         if self._orbits:
             axes = self._axes(time_s)
@@ -254,14 +268,17 @@ class CommonErrors:
         return error
 
     def clock_error_m(self, time_s: Floats) -> Floats:
-        """True minus broadcast clock of each satellite, shape (T, S) [m]; a clock that is fast shortens the code."""
+        """Return the true minus the broadcast satellite clocks, shape (T, S) [m]; a fast clock shortens the code."""
         error = np.zeros((len(time_s), len(self._satellites)))
         for columns, process in self._clocks:
             error[:, columns] += process.at(time_s)
         return error
 
     def path_m(self, time_s: Floats, sight: Floats, elevation_deg: Floats) -> Floats:
-        """Sum orbit, clock and troposphere for T times and `sight`, shape (T, S, 3), shape (T, S) [m]."""
+        """Return the sum of the range errors by orbit, clock and troposphere, shape (T, S) [m].
+
+        `sight` are the unit vectors from receiver to satellite, shape (T, S, 3).
+        """
         added = -self.clock_error_m(time_s)
         if self._orbits:
             added += np.einsum("tsi,tsi->ts", self.orbit_error_m(time_s), sight)
@@ -272,7 +289,10 @@ class CommonErrors:
     def ionosphere_m(
         self, time_s: Floats, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> Floats:
-        """Return the ionospheric delay on L1 beyond the model, shape (T, S) [m]; positions of shape (T, 1) [deg]."""
+        """Return the ionospheric delay on L1 in addition to the model, shape (T, S) [m].
+
+        The receiver's latitudes and longitudes have shape (T, 1) [deg].
+        """
         atmosphere = self._settings.ionosphere
         vertical = np.zeros(np.shape(elevation_deg))
         if atmosphere.vertical_sigma_m > 0.0:
@@ -287,7 +307,7 @@ class CommonErrors:
         return np.asarray(vertical * thin_shell_obliquity(elevation_deg))
 
     def group_delay_m(self, satellites: Sequence[str], signals: Sequence[str]) -> Floats:
-        """Return the constant error of each channel's code, shape (M,) [m]."""
+        """Return the constant group-delay error of the code of each channel, shape (M,) [m]."""
         delays = []
         for name, signal in zip(satellites, signals, strict=True):
             rng = np.random.default_rng([self._seed, _DELAY, *satellite_key(name), *(ord(c) for c in signal)])
@@ -297,7 +317,7 @@ class CommonErrors:
 
 
 def fault_m(faults: Sequence[SatelliteFault], time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-    """Return the range errors of faults [m] and their rates [m/s], shapes (T, M), at seconds after the start."""
+    """Return the range errors of faults [m] and their rates [m/s], shapes (T, M), at times after the start [s]."""
     names = np.asarray(satellites)
     added, rate = np.zeros((2, len(time_s), len(names)))
     for fault in faults:
