@@ -14,16 +14,16 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
-#: Klobuchar coefficients that GPS broadcast on 2004-01-01, at moderate solar activity; RTKLIB too uses them where none
-#: were received. Their vertical delay is 2.8 m RMS over day and latitude; on five other available days from 2005 to
-#: 2024 the delay differs from it by 0.7 to 1.7 m RMS.
+#: Klobuchar coefficients broadcast by GPS on 2004-01-01, at moderate solar activity, which RTKLIB also uses where none
+#: were received. Their vertical delay is 2.8 m RMS over time of day and latitude; on five other days from 2005 to 2024
+#: the delay differs from it by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
-#: Radius of the Earth over the radius of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
+#: Ratio of the radii of the Earth and of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
-    """Return the slant over vertical delay of a thin-shell ionosphere (DO-229D A.4.4.10.4); NaN below the horizon."""
+    """Return the ratio of slant to vertical delay of a thin-shell ionosphere (DO-229D A.4.4.10.4); NaN to 0.1 deg."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 
@@ -44,8 +44,9 @@ def klobuchar_delay_m(
 ) -> Floats:
     """Return the ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
-    Latitude and longitude (T,), angles (T, M), `coefficients` alpha 0 to 3, beta 0 to 3, `frequency_hz` (M,): carriers
-    other than L1 scale by (f1/f)^2. NaN where an input is NaN, and at or below the horizon.
+    Latitude and longitude, shape (T,), are those of the receiver; elevation and azimuth have shape (T, M).
+    `coefficients` are alpha 0 to 3 and beta 0 to 3. The delay on `frequency_hz`, shape (M,), is that on L1 times
+    (f1/f)^2. NaN where an input is NaN, and at or below the horizon.
     """
     _, seconds_of_week = to_week(time)
     alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
@@ -72,8 +73,8 @@ def saastamoinen_delay_m(
 ) -> Floats:
     """Return Saastamoinen's tropospheric delay in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
 
-    Both parts are mapped by 1/sin(elevation). Ellipsoidal heights below sea level count as sea level. NaN where an
-    input is NaN, at or below the horizon, and outside -100 m to 10 km.
+    The hydrostatic and wet delays are mapped by 1/sin(elevation). Negative ellipsoidal heights are replaced by 0. NaN
+    where an input is NaN, at or below the horizon, and outside -100 m to 10 km.
     """
     height = np.where((height_m >= -100.0) & (height_m <= 1e4), np.maximum(height_m, 0.0), np.nan)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
@@ -87,7 +88,7 @@ def saastamoinen_delay_m(
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Directions to the satellites from a receiver position good to some hundred metres: T epochs by K channels."""
+    """Directions to the satellites from a receiver position accurate to hundreds of metres: T epochs by K channels."""
 
     receiver_ecef_m: Floats  #: Shape (T, 3).
     #: Geodetic coordinates of the receiver, shape (T,).
@@ -119,7 +120,7 @@ class SeenFrom:
 class Delays:
     """Delays of T epochs by K channels, and the standard deviation of the residual errors."""
 
-    #: On the channel's own carrier; 0 where a model is off, NaN where SBAS has none; shape (T, K).
+    #: Delays on the channel's carrier; 0 where a model is off, NaN where SBAS gives none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
     #: Standard deviation in addition to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
@@ -136,7 +137,7 @@ def model_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Return the delays of the Klobuchar and Saastamoinen models, 0 for a model that is off (`klobuchar` None)."""
+    """Return the delays of the Klobuchar and Saastamoinen models; 0 for a model that is off (`klobuchar` None)."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:

@@ -1,4 +1,4 @@
-"""Range errors measured by a base station at a known position, and differences of a train's ranges with them."""
+"""Range errors measured by a base station at a known position, and their use as corrections of a train's ranges."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from railfix.ranges.channels import Channels
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDelays, SourceSatellites
 
 Values = TypeVar("Values", Floats, Integers)
-#: An epoch of the base station is used for epochs of the train up to this time before it [s]: receiver clocks differ.
+#: An epoch of the station is also used for epochs of the train up to this time before it [s]: receiver clocks differ.
 _SAME_S: Final = 0.05
-#: Age up to which codes, and phases, of the station are used. Without selective availability, code errors change by
+#: Largest age of the station's codes, and of its phases [s]. Without selective availability, code errors change by
 #: centimetres in 30 s, and phase errors by millimetres in a second.
 LONGEST_AGE_S: Final = 60.0
 _PHASE_AGE_S: Final = 1.1
-#: Added per kilometre between station and train: differences of ionospheric, tropospheric and orbit errors.
+#: Sigma per kilometre between station and train, of differences in ionospheric, tropospheric and orbit errors [m].
 _PER_KM_M: Final = 0.004
-LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
+LONGEST_KM: Final = 100.0  #: Largest distance at which the station is used [km].
 
 
 class BaseLimits(Settings):
@@ -34,7 +34,7 @@ class BaseLimits(Settings):
 
     #: Standard deviation of a difference in addition to the train's noise: the station's smoothed multipath.
     sigma_m: float = Field(default=0.3, gt=0)
-    #: Random walk of the differences of phases, which replaces `PhaseLimits.drift_m` [m/sqrt(s)].
+    #: Random walk of phase differences, used in place of `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
 
 
@@ -42,14 +42,14 @@ class BaseLimits(Settings):
 class BaseErrors:
     """Range errors of a base station by channel, B epochs by S channels."""
 
-    ecef_m: Floats  #: Shape (3,).
+    ecef_m: Floats  #: Position of the station, shape (3,).
     time: Datetimes  #: Shape (B,).
     #: Shape (S,).
     satellite: Strings
     signal: Strings
     #: Corrected code less range and receiver clock of its constellation; NaN where not observed; shape (B, S).
     code_m: Floats
-    phase_m: Floats  #: Error of the phase, less one clock for all constellations, with its ambiguity; shape (B, S).
+    phase_m: Floats  #: Corrected phase less range and one clock of all constellations, with ambiguity; shape (B, S).
     arc: Integers  #: Number of the arc of each phase, shape (B, S).
 
     def __len__(self) -> int:
@@ -75,7 +75,7 @@ class BaseErrors:
         return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
 
     def drop_before(self, time: np.datetime64) -> BaseErrors:
-        """Return the errors of epochs from `time` on, and of channels that have any."""
+        """Return the errors of epochs from `time` on, of channels with a code error at any of these epochs."""
         rows = self.time >= time
         seen = np.isfinite(self.code_m[rows]).any(axis=0)
         return replace(
@@ -89,11 +89,10 @@ class BaseErrors:
     def at(
         self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
     ) -> BaseDifferences:
-        """Return the newest errors at the epochs of a train (T,), for its channels (K,), near approximate positions (T,
-        3) [m].
+        """Return the newest errors at the epochs of a train (T,), for its channels (K,), at approximate positions.
 
-        A channel that the station observes on another signal of the same band uses that signal: they differ by a
-        constant of the constellation.
+        For a channel that the station does not observe, another signal of the same band is used: they differ by a
+        constant of the constellation. NaN (arc -1) without a recent error, or beyond `LONGEST_KM`.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -120,7 +119,7 @@ class BaseErrors:
 
 
 def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Values:
-    """Return values of channels in the order of another list."""
+    """Return values of the channels `own` in the order of `keys`, `blank` for other channels."""
     place = {key: k for k, key in enumerate(keys)}
     columns: Indices = np.array([place[key] for key in own], dtype=np.intp)
     full = np.full((len(values), len(keys)), blank, dtype=values.dtype)
@@ -130,9 +129,9 @@ def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str
 
 @dataclass(frozen=True, kw_only=True)
 class BaseStationSource:
-    """Another source, and the code errors that a base station at a known position has measured with it."""
+    """Correction source with the range errors that a base station at a known position measured with another source."""
 
-    other: CorrectionSource
+    other: CorrectionSource  #: Source of satellites and delays.
     errors: BaseErrors
     limits: BaseLimits
     floor_sigma_m: float  #: Error floor of codes that the station does not correct (`CodeNoise`) [m].
@@ -150,7 +149,7 @@ class BaseStationSource:
         return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the other source and the station's errors, whose sigma replaces the source's sigma."""
+        """Return the delays of the other source and the station's errors; their sigma replaces that of the source."""
         given = self.other.delays(time, channels, satellites, seen)
         base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
         differenced = np.isfinite(base.code_m)

@@ -37,7 +37,7 @@ SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "C": ("7I", "7Q", "7X", "6I", "6Q", "6X", "5P", "5X", "5D"),
 }
 
-#: Signals that SBAS on L5 corrects, first and second, by constellation.
+#: First and second signals that SBAS on L5 corrects, by constellation.
 DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
     "G": (("1C",), ("5Q", "5X", "5I")),
     "E": (("1C", "1X", "1B"), ("5Q", "5X", "5I")),
@@ -46,8 +46,8 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 
 #: Signals with ten times the chip rate of L1 C/A, by constellation and band.
 _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
-#: Their noise and multipath relative to L1 at the same C/N0: 0.4 on a phone (L5 against L1), 0.8 on an F9P (E5b against
-#: E1).
+#: Noise and multipath of these signals relative to L1 at the same C/N0: 0.4 on a phone (L5 to L1), 0.8 on an F9P (E5b
+#: to E1).
 _FAST_NOISE: Final = 0.5
 
 
@@ -68,7 +68,7 @@ def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
 def channel_order(
     satellite: Strings, signal: Strings, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
 ) -> Indices:
-    """Return usable channels by preference of `signals`, with channels of one clock adjacent, shape (K,)."""
+    """Return the indices of usable channels, sorted by clock, satellite and preference of `signals`, shape (K,)."""
     keys = []
     for i, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
         letter = name[0]
@@ -93,28 +93,29 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
 class Channels:
     """M channels of a log, and the K channels among them that the settings allow."""
 
-    #: Their columns in the observations, channels of one clock adjacent, a satellite's best signal first; shape (K,).
+    #: Columns of the K channels in the observations; channels of one clock are adjacent, a satellite's preferred signal
+    #: is first; shape (K,).
     columns: Indices
     #: Shape (K,).
     satellite: Strings
     signal: Strings
-    groups: tuple[slice, ...]  #: Channels of one receiver clock.
+    groups: tuple[slice, ...]  #: Channels of each receiver clock.
     clocks: tuple[str, ...]  #: Letter of each receiver clock.
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
     frequency_hz: Floats  #: Shape (K,).
     every_frequency_hz: Floats  #: Shape (M,).
-    left_out: Integers  #: Reason of the channels that settings leave out, 0 for the others; shape (M,).
-    member: Integers  #: 1 where a channel belongs to a satellite, S satellites; shape (M, S).
-    #: Columns of the second signals of each channel's satellite, in order of preference; -1 for none. P is 0 with one
-    #: frequency; shape (K, P).
+    left_out: Integers  #: Reason of the channels that settings leave out, 0 for the other channels; shape (M,).
+    member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
+    #: Columns of the second signals of each channel's satellite, in order of preference, -1 for none; shape (K, P). P
+    #: is 0 with one frequency.
     second: Indices
-    #: Signal with the letter of the constellation, squared ratio of the first frequency to it, and its noise relative
-    #: to L1 C/A; shape (K, P).
+    #: Second signal with the letter of the constellation, squared ratio of the first frequency to the second, and noise
+    #: of the second signal relative to L1 C/A; shape (K, P).
     second_signal: Strings
     second_ratio: Floats
     second_noise: Floats
-    pair_names: tuple[str, ...]  #: Satellite and both signals, length K P.
-    pair_groups: Integers  #: Number of the group of pairs with a common receiver delay, shape (K P,).
+    pair_names: tuple[str, ...]  #: Satellite and both signals of each pair, length K P.
+    pair_groups: Integers  #: Group of each pair, whose pairs have a common receiver delay; shape (K P,).
 
     @cached_property
     def names(self) -> Strings:
@@ -123,7 +124,7 @@ class Channels:
 
     @cached_property
     def clock_number(self) -> Indices:
-        """Number of the receiver clock of each channel, shape (K,)."""
+        """Index in `clocks` of the receiver clock of each channel, shape (K,)."""
         return np.array([self.clocks.index(letter) for letter in self.clock.tolist()], dtype=np.intp)
 
 
@@ -137,7 +138,7 @@ def select_channels(
     second_signals: Mapping[str, Sequence[str]] | None = None,
     glonass_channel: Mapping[str, int] | None = None,
 ) -> Channels:
-    """Return the channels of a log that may be used (P1 3.3: constellations; here their signals too).
+    """Select the channels of a log by constellation (P1 3.3) and signal.
 
     Parameters
     ----------
@@ -150,14 +151,14 @@ def select_channels(
     exclude : collection of str
         Satellites or letters of constellations that are left out.
     second_signals : mapping of str to sequence of str, optional
-        Signals of a second frequency, likewise; none by default.
+        Second-frequency signals of each constellation in order of preference; none by default.
     glonass_channel : mapping of str to int, optional
         Frequency numbers of GLONASS satellites.
 
     Raises
     ------
     ValueError
-        A letter names no constellation.
+        A letter of `systems` is not that of a constellation.
     """
     if unknown := [letter for letter in systems if letter not in CLOCK_GROUP]:
         raise ValueError(
@@ -198,7 +199,7 @@ def _second_channels(
     frequency_hz: Floats,
     wanted: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
-    """Return the second signals of the channels (`Channels`)."""
+    """Return the fields of `Channels` on second signals."""
     of_satellite: dict[str, dict[str, int]] = {}
     for i, (name, signal) in enumerate(zip(every_satellite.tolist(), every_signal.tolist(), strict=True)):
         of_satellite.setdefault(name, {})[signal] = i
@@ -212,7 +213,7 @@ def _second_channels(
     letter = np.char.add(every_satellite.astype("<U1"), every_signal)
     signals = np.where(second >= 0, letter[second], "") if width else np.empty(second.shape, dtype="<U3")
     satellite, first = every_satellite[columns].tolist(), every_signal[columns].tolist()
-    # BeiDou-2 (C01 to C16) and BeiDou-3 differ by metres in a receiver
+    # the receiver delays of BeiDou-2 (C01 to C16) and BeiDou-3 differ by metres
     kind = ["C3" if name[0] == "C" and name > "C16" else name[0] for name in satellite]
     pairs = [
         (f"{name} {own} {other[1:]}", f"{group} {own} {other[1:]}")

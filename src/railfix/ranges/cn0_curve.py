@@ -1,9 +1,9 @@
 """Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
 
 It is fitted per constellation and signal; BeiDou and QZSS have satellites in two kinds of orbits, with separate curves.
-The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the median). Between the
-middles of the bins the curve runs by monotone cubic interpolation (PCHIP). Above the highest bin the last mean is used;
-below the lowest bin there is no curve. The file is TOML.
+The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the median). Between bin
+centres the curve is interpolated by monotone cubics (PCHIP). Above the highest bin the last mean is used; below the
+lowest bin there is no curve. The file is TOML.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "Cn0Curve", "Cn0CurveSource", "Cn0Mean", "SourceFile", "satellite_kind"]
 
 
-#: Numbers of BeiDou satellites 36 000 km above (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
+#: Numbers of BeiDou satellites at a height of 36 000 km (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
 _QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 
@@ -61,7 +61,7 @@ class Cn0Mean:
 
     kind: str  #: Key of `KINDS`.
     signal: str
-    elevation_deg: Floats  #: Bin centres, rising; shape (B,).
+    elevation_deg: Floats  #: Bin centres in ascending order, shape (B,).
     #: Mean and robust standard deviation, shape (B,) [dB-Hz] [dB].
     mean_dbhz: Floats
     spread_db: Floats
@@ -83,7 +83,7 @@ class Cn0Mean:
         return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
 
     def at(self, elevation_deg: ArrayLike) -> Floats:
-        """Return the mean C/N0 at elevations [dB-Hz]; NaN below the lowest bin's lower half and for NaN."""
+        """Return the mean C/N0 at elevations [dB-Hz]; NaN below the lowest bin and where the elevation is NaN."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         lowest, highest = self.elevation_deg[0], self.elevation_deg[-1]
         half = (self.elevation_deg[1] - lowest) / 2.0
@@ -92,16 +92,16 @@ class Cn0Mean:
 
 
 class SourceFile(Settings):
-    """A file that a curve was fitted on, and its SHA-256."""
+    """File to which a curve was fitted, and its SHA-256."""
 
     name: str
     sha256: str
 
 
 class Cn0CurveSource(Settings):
-    """Log that a curve was fitted on."""
+    """Log to which a curve was fitted."""
 
-    #: From the header of the log, as written.
+    #: As in the header of the log.
     antenna: str = ""
     receiver: str = ""
     marker: str = ""
@@ -151,7 +151,7 @@ class Cn0Curve:
         return result
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return differences of antenna and receiver between the log of the curve and another, one sentence each."""
+        """Return one sentence for each difference of antenna or receiver between the log of the curve and `header`."""
         notes = []
         for what in ("antenna", "receiver"):
             ours, theirs = _plain(getattr(self.source, what)), _plain(getattr(header, what))
@@ -164,5 +164,5 @@ class Cn0Curve:
 
 
 def _plain(text: str) -> str:
-    """Type of an antenna or receiver with normalised blanks."""
+    """Return the type of an antenna or receiver with single blanks."""
     return " ".join(text.split())

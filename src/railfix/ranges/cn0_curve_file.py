@@ -16,7 +16,7 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean
 __all__ = ["FORMAT", "read_cn0_curve", "write_cn0_curve"]
 
 FORMAT: Final = "railfix C/N0 curve 1"
-#: Columns of a curve, and the digits that they are written with.
+#: Columns of a curve, and the number of decimals that are written.
 _DIGITS: Final = {"elevation_deg": 3, "mean_dbhz": 2, "spread_db": 2, "count": 0}
 
 
@@ -51,7 +51,7 @@ class _CurveFile(Settings):
 
 
 def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
-    """Write a curve; the file appears whole or not at all. OutputError: it cannot be written."""
+    """Write a curve atomically; raise OutputError if the file cannot be written."""
     curves = [
         {
             "kind": mean.kind,
@@ -69,7 +69,8 @@ def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
 def read_cn0_curve(path: FilePath) -> Cn0Curve:
     """Read a curve.
 
-    InputFileError: the file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
+    Raises InputFileError if the file is missing, unreadable or not a C/N0 curve, or if an entry is unknown, missing or
+    out of range.
     """
     file = read_model_file(_CurveFile, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
     means = tuple(

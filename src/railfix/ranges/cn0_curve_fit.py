@@ -31,13 +31,13 @@ class CurveFit(Settings):
 
 
 class Cn0Samples:
-    """C/N0 and elevation collected piece by piece, by kind and signal, in single precision."""
+    """C/N0 and elevation collected from parts of a log, by kind and signal, in single precision."""
 
     def __init__(self) -> None:
         self._parts: dict[tuple[str, str], list[NDArray[np.float32]]] = defaultdict(list)
 
     def add(self, cn0_dbhz: ArrayLike, elevation_deg: ArrayLike, satellite: Strings, signal: Strings) -> None:
-        """Add samples of shape (T, M); those with NaN in either are left out."""
+        """Add samples of shape (T, M); samples with NaN, or below the horizon, are left out."""
         cn0, elevation = np.asarray(cn0_dbhz), np.asarray(elevation_deg)
         finite = np.isfinite(cn0) & np.isfinite(elevation) & (elevation >= 0.0)
         for m, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
@@ -47,7 +47,7 @@ class Cn0Samples:
                 self._parts[satellite_kind(name), code].append(pair)
 
     def keys(self) -> list[tuple[str, str]]:
-        """Kinds and signals of which there are samples."""
+        """Return the kinds and signals that have samples."""
         return sorted(self._parts)
 
     def of(self, kind: str, signal: str) -> tuple[Floats, Floats]:
@@ -64,8 +64,8 @@ def fit_cn0_curve(
 ) -> Cn0Curve:
     """Fit the mean C/N0 over elevation, one curve per kind and signal with enough bins.
 
-    `samples` is a `Cn0Samples`, or pieces of C/N0 (T, M), elevation (T, M), satellite and signal (M,), of an antenna
-    with open sky. ValueError: no kind and signal has enough samples.
+    `samples` is a `Cn0Samples`, or parts with C/N0 (T, M), elevation (T, M), satellite and signal (M,), of an antenna
+    under open sky. Raises ValueError if no kind and signal has enough samples.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):
@@ -83,7 +83,7 @@ def fit_cn0_curve(
 
 
 def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
-    """Return the curve of one kind and signal, None with too few bins."""
+    """Return the curve of one kind and signal; None with too few bins."""
     which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
     bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
     if len(bins) < fit.least_bins:
@@ -100,9 +100,9 @@ def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFi
 
 
 def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
-    """Return the mean without outliers, and robust standard deviation."""
+    """Return the mean without outliers, and the robust standard deviation."""
     middle = float(np.median(values))
     spread = _NORMAL_MAD * float(np.median(np.abs(values - middle)))
-    # C/N0 is reported in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
+    # C/N0 is reported in steps of up to 1 dB-Hz, so that the spread of a few samples can be 0
     kept = values[np.abs(values - middle) <= clip_sigma * max(spread, 0.5)]
     return float(kept.mean()), spread

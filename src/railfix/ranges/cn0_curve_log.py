@@ -26,14 +26,14 @@ _SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) requires about a day; a shorter log 
 _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
 #: Lowest elevation of that check [deg], and the fraction of rejected calibration samples that gives a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
-#: Elevation below which a satellite cannot be received: the position of the antenna is wrong [deg].
+#: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Fraction of satellites below the horizon that faulty navigation records may cause.
+_BELOW_SHARE: Final = 0.05  #: Largest fraction of such satellites that is attributed to faulty navigation records.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Calibration:
-    """A curve with the samples it was fitted to."""
+    """C/N0 curve with the samples to which it was fitted."""
 
     curve: Cn0Curve
     samples: Cn0Samples
@@ -41,7 +41,7 @@ class Cn0Calibration:
 
 
 def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
-    """Elevation of each satellite from a fixed position (3,), shape (T, M) [deg]; NaN without orbit or code."""
+    """Return the elevation of each satellite from a fixed position (3,), (T, M) [deg]; NaN without orbit or code."""
     names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
     code = np.full((len(observations), len(names)), np.nan)
     for m, k in enumerate(which.tolist()):
@@ -62,12 +62,12 @@ def cn0_curve_from_log(
     reader: Reader = "railfix",
     date: np.datetime64 | None = None,
 ) -> Cn0Calibration:
-    """Fit a curve on the log of a receiver, about a day, whose antenna stood under open sky.
+    """Fit a curve to about a day of a receiver's log, whose antenna was under open sky.
 
-    `position_ecef_m`: position of the antenna, shape (3,), to some kilometres; by default the header's.
-    InputFileError: a file is missing or not of the expected kind; the log has no C/N0. SettingsError: the header has no
-    position and none was given. MismatchError: satellites were tracked that are below the horizon of the position, or
-    the navigation files have none of them, or too few samples for any curve.
+    `position_ecef_m`, shape (3,), is the position of the antenna to a few kilometres, by default that of the header.
+    Raises InputFileError if a file is missing or of another kind, or the log has no epochs or no C/N0; SettingsError if
+    neither the header nor the caller gives a position; MismatchError if tracked satellites are below the horizon of the
+    position, the navigation files have no orbit for the log, or there are too few samples for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0

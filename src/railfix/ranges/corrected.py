@@ -20,7 +20,7 @@ from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.second_codes import SecondCodes, second_codes
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
 
-#: Distances from the centre of the Earth at which navigation satellites are [m].
+#: Least and largest distance of navigation satellites from the centre of the Earth [m].
 ORBITS_M: Final = (2e7, 6e7)
 
 
@@ -34,7 +34,7 @@ class AntennaRanges(NotebookTable):
     satellite: Strings
     signal: Strings
     frequency_hz: Floats
-    #: As observed, shape (T, K).
+    #: Observations, shape (T, K).
     code_m: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
@@ -56,21 +56,20 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
-    #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none; shape (T, K).
+    #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS gives none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `NominalErrors`; shape (T, K).
+    #: Standard deviation of satellite and atmospheric errors, from SBAS, otherwise from `NominalErrors`; shape (T, K).
     nominal_m: Floats
     #: Standard deviation that `NominalErrors` assumes for the elevation alone; 0 with SBAS; shape (T, K).
     nominal_elevation_sigma_m: Floats
-    #: Overbounding sigma and largest nominal bias of each range by an error model; 0 without one; shape (T, K).
+    #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: A code is grossly wrong, but not clearly which one: such epochs are not used for noise and map estimates; shape
-    #: (T,).
+    #: Epochs with a gross error that cannot be identified, not used for noise and map estimates; shape (T,).
     unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
-    base: BaseDifferences | None = None  #: Corrections subtracted from a base station.
+    base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
 
     @property
     def columns(self) -> Indices:
@@ -79,12 +78,12 @@ class CorrectedRanges(AntennaRanges, OnDemand):
 
     @property
     def used_code_m(self) -> Floats:
-        """Corrected codes without a rejection reason, NaN for the others, shape (T, K)."""
+        """Corrected codes, NaN where there is a rejection reason, shape (T, K)."""
         return np.where(self.reason == 0, self.corrected_code_m, np.nan)
 
 
 class SatelliteRanges(NamedTuple):
-    """Satellites of the codes of a log, T epochs by K channels."""
+    """Satellites and clock corrections of the codes of a log, T epochs by K channels."""
 
     source: SourceSatellites
     correction_m: Floats  #: Satellite clock less group delay, to be added to the codes; shape (T, K).
@@ -101,18 +100,18 @@ def find_satellites(
 ) -> SatelliteRanges:
     """Return satellite positions and clocks at the times of transmission ``t - code / c - dt_sv`` (P1 2.2(2)).
 
-    The first healthy signal of each satellite, in the order of `channels`, is used; every other code has its reason.
+    The first plausible code of each satellite in the order of `channels` is used; every other code has a reason.
 
     Parameters
     ----------
     observations : Observations
         T epochs; codes outside 10,000 to 100,000 km are implausible.
     channels : Channels
-        Of `select_channels`.
+        Returned by `select_channels`.
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Largest distance of an epoch from the reference time of its record, where it is less than the record's validity.
+        Largest distance of an epoch from the reference time of its record, if less than the validity of the record.
     """
     code = observations.code_m[:, channels.columns]
     reason = _reasons_of_codes(channels.satellite, code)
@@ -155,23 +154,23 @@ def corrected_ranges(
     observations, channels, source
         As for `find_satellites`.
     satellites : SatelliteRanges
-        Of `find_satellites`.
+        Returned by `find_satellites`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
-        Approximate positions of the antenna, good to some hundred metres (`positioning.approximate_position`).
+        Approximate positions of the antenna, accurate to hundreds of metres (`positioning.approximate_position`).
     gross : ndarray of bool, shape (T, K), optional
-        Codes that are grossly wrong (`ApproximatePosition.gross`): rejected.
+        Codes with gross errors (`ApproximatePosition.gross`), which are rejected.
     noise : CodeNoise, optional
         Receiver noise and multipath by C/N0 and elevation.
 
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used keep their numbers and have a reason; NaN where a correction is missing.
+        Codes that cannot be used keep their values and have a reason; NaN where a correction is missing.
 
     Raises
     ------
     ValueError
-        A position is not on the Earth.
+        `near_ecef_m` has another shape.
     """
     noise, time = noise or CodeNoise(), observations.time
     near = _check_near(near_ecef_m, len(time))
@@ -223,7 +222,7 @@ def is_orbit(sat_ecef_m: Floats) -> Masks:
 
 
 def _check_near(near_ecef_m: ArrayLike, epochs: int) -> Floats:
-    """Return approximate positions, shape (T, 3); ValueError where they are not on the Earth."""
+    """Return approximate positions, shape (T, 3); ValueError if they have neither shape (3,) nor (T, 3)."""
     near = np.asarray(near_ecef_m, dtype=np.float64)
     if near.shape not in ((3,), (epochs, 3)):
         raise ValueError(f"near_ecef_m has shape {near.shape}, expected (3,) or ({epochs}, 3)")

@@ -1,7 +1,7 @@
 """Error model of pseudoranges on a railway: bias, sigma and overbound by direction and C/N0 (P1 7).
 
 The bins are elevation, azimuth relative to the car body and C/N0. The file is TOML with the bins, the conditions, and
-one array of numbers per column, in the order of elevation, then sector, then C/N0. `pooled` counts into `POOLED`.
+one array of numbers per column, in the order of elevation, then sector, then C/N0. `pooled` is an index into `POOLED`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
 
 
 class Conditions(Settings):
-    """Settings of a run that the errors of its corrected pseudoranges depend on."""
+    """Settings of a run on which the errors of its corrected pseudoranges depend."""
 
     systems: tuple[str, ...]  #: Letters of the constellations.
     signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
@@ -51,7 +51,7 @@ class Conditions(Settings):
 def condition_differences(
     first: Conditions, second: Conditions, *, names: tuple[str, str] = ("model", "run")
 ) -> tuple[str, ...]:
-    """Return fields in which two conditions differ, one text each: "codes: model raw, run smoothed".
+    """Return one text for each field in which two conditions differ: "codes: model raw, run smoothed".
 
     The order of screens and constellations does not matter; the order of signals, which is a preference, does.
     """
@@ -73,20 +73,20 @@ def _text(value: object) -> str:
     return f"{value:g} deg" if isinstance(value, float) else str(value)
 
 
-#: Sets of samples that the figures of a bin may come from.
+#: Sets of samples from which the statistics of a bin are computed, from its own to those of all bins.
 POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
 
 
 class ErrorBins(Settings):
     """Edges of the bins."""
 
-    #: Edges, rising, E + 1 of them.
+    #: E + 1 edges in ascending order; values beyond the outer edges belong to the outer bins.
     elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
         "Edges of the bins of elevation.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
     )
     sectors: int = option("Sectors of azimuth, the first centred ahead of the car.", 4, metavar="N", ge=1)
-    #: Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations without C/N0 go
-    #: into the lowest.
+    #: C + 1 edges in ascending order; values beyond the outer edges belong to the outer bins, and observations without
+    #: C/N0 to the lowest bin.
     cn0_dbhz: tuple[float, ...] = option(
         "Edges of the bins of C/N0; 0,60 puts all into one.",
         (0.0, 30.0, 35.0, 40.0, 45.0, 60.0),
@@ -109,7 +109,7 @@ class ErrorBins(Settings):
     def index(self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike) -> Integers:
         """Return the flat index of the bin of each observation, any shape; -1 where elevation or azimuth is NaN.
 
-        The azimuth is from the car's forward direction, clockwise.
+        The azimuth is clockwise from the car's forward direction.
         """
         elevation, azimuth, cn0 = np.broadcast_arrays(
             np.asarray(elevation_deg, dtype=np.float64),
@@ -128,21 +128,21 @@ class ErrorBins(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BinStatistics:
-    """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool."""
+    """Statistics of every bin, shape (E, A, C); NaN where the pooled samples are fewer than three."""
 
-    count: Integers  #: Samples of the bin itself.
-    blocks: Integers  #: Passes of a satellite through the bin, counted once per block of time: samples are correlated.
+    count: Integers  #: Number of samples of the bin itself.
+    blocks: Integers  #: Number of blocks of time and satellite in the bin; samples of one block are correlated.
     #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
     #: `error_model_fit.gaussian_overbound` of the same samples.
     bound_bias_m: Floats
     bound_sigma_m: Floats
-    pooled: Integers  #: Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
+    pooled: Integers  #: Index into `POOLED` of the samples used: of a wider set of bins if the bin has too few blocks.
 
 
 class ErrorModelSource(Settings):
-    """Runs that a model was fitted on, for its file."""
+    """Runs to which a model was fitted, for its file."""
 
     runs: tuple[str, ...] = ()
     base: str = ""  #: Marker of the reference station.
@@ -153,40 +153,39 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Measured priors above this rest on too few blocks for a finite level.
+LARGEST_PRIOR: Final = 0.05  #: Bounds of priors above this are from too few blocks for a finite protection level.
 
 
 class FaultRate(Settings):
     """Measured probability that a used range is faulty at a given time."""
 
-    #: A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
+    #: A range is faulty beyond this multiple of its sigma in the protection level: 5, exceeded by noise with 6e-7.
     beyond_sigma: float = Field(gt=0)
-    #: Ranges used, and those beyond.
+    #: Number of used ranges, and of faulty ranges.
     ranges: int = Field(ge=0)
     faulty: int = Field(ge=0)
-    #: Blocks of time of single satellites, which are independent of each other, and blocks with a faulty range.
+    #: Number of blocks of time of single satellites, which are independent, and of blocks with a faulty range.
     blocks: int = Field(ge=0)
     faulty_blocks: int = Field(ge=0)
     prior: float = Field(ge=0, le=1)  #: faulty / ranges.
-    #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior` to
-    #: use.
+    #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks), for `local_prior`.
     upper: float = Field(ge=0, le=1)
-    #: Blocks of time with two or more faulty satellites, over the number expected for independent satellites; 0 without
-    #: any.
+    #: Number of blocks of time with two or more faulty satellites, divided by the number expected for independent
+    #: satellites; 0 without faults.
     together: float = Field(ge=0)
-    #: Blocks of time with at least two low satellites on one side of the track, each side counted separately, and
-    #: blocks in which two of these satellites were faulty.
+    #: Number of blocks of time with at least two low satellites on one side of the track, each side counted separately,
+    #: and of blocks in which two of these satellites were faulty.
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
-    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by those
-    #: blocks: the `side_prior` to use, where it is small enough for a finite protection level. 1 without such blocks.
+    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by these
+    #: blocks, for `side_prior` where it is small enough for a finite protection level. 1 without such blocks.
     side_upper: float = Field(default=1.0, ge=0, le=1)
-    #: Stretches where local faults are more frequent than on the line (`faulty_stretches`), chainages from and to.
+    #: Stretches with more frequent local faults than the line (`faulty_stretches`), chainages from and to.
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property
     def bounds_priors(self) -> bool:
-        """Whether both priors are bounded well enough to be used."""
+        """Whether the bounds of both priors are at most `LARGEST_PRIOR`."""
         return max(self.upper, self.side_upper) <= LARGEST_PRIOR
 
 
@@ -202,16 +201,16 @@ class ErrorModel:
     #: "local": multipath and receiver noise alone (a reference station removed the other errors).
     #: "satellite_and_atmosphere": satellite and atmospheric errors of the days recorded as well.
     covers: Literal["local", "satellite_and_atmosphere"]
-    #: Settings under which the model is valid; None: unknown, compared with nothing.
+    #: Settings under which the model is valid; None if unknown, and then not compared with those of a run.
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
-    #: Rate of local faults among the ranges that the model was fitted on; None: not measured.
+    #: Rate of local faults among the ranges to which the model was fitted; None if not measured.
     faults: FaultRate | None = None
 
     def at(
         self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike
     ) -> tuple[Floats, Floats]:
-        """Return the overbounding sigma and bias of observations, shapes as broadcast [m].
+        """Return the overbounding sigma and bias of observations, broadcast to one shape [m].
 
         NaN where the direction is unknown or the model has no value.
         """
@@ -223,7 +222,7 @@ class ErrorModel:
 
 FORMAT: Final = "railfix error model 2"
 _COLUMNS: Final = tuple(item.name for item in fields(BinStatistics))
-_SIDES: Final = ("before", "after")  #: Of the screens.
+_SIDES: Final = ("before", "after")  #: Before and after the screens.
 _COUNTS: Final = ("count", "blocks", "pooled")
 _Count = Annotated[int, Field(ge=0)]
 
@@ -254,7 +253,7 @@ class _ErrorModelFile(Settings):
 
 
 def write_error_model(model: ErrorModel, path: FilePath) -> None:
-    """Write a model; the file appears whole or not at all. OutputError: it cannot be written."""
+    """Write a model atomically; raise OutputError if the file cannot be written."""
     columns = {side: _columns(getattr(model, side)) for side in _SIDES}
     file = _ErrorModelFile(format=FORMAT, **{**vars(model), **columns})
     comment = "Errors of corrected pseudoranges by elevation, azimuth from the car's front, and C/N0."
@@ -262,15 +261,15 @@ def write_error_model(model: ErrorModel, path: FilePath) -> None:
 
 
 def _columns(statistics: BinStatistics) -> _Columns:
-    """Return columns to the millimetre."""
+    """Return statistics as columns, rounded to the millimetre."""
     return _Columns(**{name: tuple(np.round(getattr(statistics, name).ravel(), 3).tolist()) for name in _COLUMNS})
 
 
 def read_error_model(path: FilePath) -> ErrorModel:
     """Read a model.
 
-    InputFileError: the file is missing, unreadable, no error model, of version 1, or an entry is missing or out of
-    range.
+    Raises InputFileError if the file is missing, unreadable, not an error model or of version 1, or if an entry is
+    missing or out of range.
     """
     file = read_model_file(
         _ErrorModelFile, path, what="an error model", format_name=FORMAT, command="railfix error-model"

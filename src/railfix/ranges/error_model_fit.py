@@ -1,9 +1,9 @@
-"""Error model from samples: bins, pooling where they are thin, statistics; and the rate of local faults on a line.
+"""Error model from samples: statistics of bins, pooled where samples are few; and the rate of local faults on a line.
 
 A normal distribution shifted by +b bounds the upper half of the errors, one shifted by -b the lower half (CDF
 overbounding, B. DeCleene, ION GPS 2000). Sums of independent errors stay bounded as long as the distribution after the
 shift is symmetric and has one peak (the two-step method of J. Blanch, T. Walter, P. Enge, 2019,
-doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
+doi:10.1109/TAES.2018.2876583). Neither property can be proven from samples.
 """
 
 from __future__ import annotations
@@ -20,24 +20,23 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
-TAIL_SCORE: Final = 1.0  #: Standard scores from which on a sample belongs to the tail, which alone sets sigma.
+TAIL_SCORE: Final = 1.0  #: Least standard score of a sample in the tail, which alone determines sigma.
 
 
 def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
-    """Bias and sigma of two normal distributions, shifted to either side, that bound a sample (n,), one for each half
-    [m].
+    """Return bias and sigma [m] of two normal distributions, shifted by +bias and -bias, that bound a sample (n,).
 
-    The k-th of n samples counts as the quantile of probability ``k / (n + 1)``, from either end. Sigma is the least
-    that bounds both tails (beyond one standard score) about the median's distance from zero; the bias is then the least
-    that bounds the rest. Beyond the largest sample the bound is only an extrapolation by the normal distribution.
-    ValueError: fewer than three samples, or one that is not finite.
+    The k-th of n samples from either end is the quantile of probability ``k / (n + 1)``. Sigma is the least value that
+    bounds both tails (beyond one standard score) about the median's distance from zero; the bias is then the least
+    value that bounds the other samples. Beyond the largest sample the bound is an extrapolation by the normal
+    distribution. Raises ValueError for fewer than three samples, or a sample that is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
     ordered = np.sort(error_m)
     score = scipy.special.ndtri(np.arange(1, len(ordered) + 1) / (len(ordered) + 1.0))
     half = score >= 0.0
-    # Both halves as distances from zero outward: the upper as it is, the lower mirrored.
+    # Distances outward from zero: the upper half unchanged, the lower half mirrored.
     score, sizes = score[half], (ordered[half], -ordered[::-1][half])
     center = abs(float(np.median(ordered)))
     tail = score >= min(TAIL_SCORE, float(score[-1]))
@@ -50,8 +49,8 @@ class ErrorModelFit(Settings):
     """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    #: Independent passes below which a bin uses the samples of a wider set of bins. 30: its largest error is then about
-    #: the quantile of 2 standard scores, so that at least the shoulder of the tail is sampled.
+    #: Independent passes below which a bin uses the samples of a wider set of bins. With 30 passes the largest error is
+    #: about the quantile of 2 standard scores, so that the beginning of the tail is sampled.
     least_blocks: int = option(
         "Passes of a satellite (30 s blocks) below which a bin has the values of a wider bin.", 30, metavar="N", ge=1
     )
@@ -69,17 +68,18 @@ class ErrorSamples:
     elevation_deg: Floats
     relative_azimuth_deg: Floats
     cn0_dbhz: Floats
-    block: Integers  #: Number of the satellite's block of time: samples of one block are not independent; shape (n,).
+    block: Integers  #: Number of the block of time and satellite; samples of one block are correlated; shape (n,).
     used: Masks  #: Samples that passed every screen, shape (n,).
-    sigma_m: Floats  #: Standard deviation that the protection level of the run gave the range, shape (n,).
+    sigma_m: Floats  #: Standard deviation of the range in the protection level of the run, shape (n,).
     chainage_m: Floats  #: Position of the train; NaN where unknown; shape (n,).
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
     """Return the statistics of the bins from some of the samples, a mask of shape (n,).
 
-    A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of all azimuths of its elevation and
-    C/N0, then of all C/N0 too, then of all elevations of its C/N0, then all.
+    A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of the first of these sets that has
+    enough: all azimuths of its elevation and C/N0, all azimuths and C/N0 of its elevation, all azimuths and elevations
+    of its C/N0, all samples.
     """
     bins = fit.bins
     kept = which & np.isfinite(samples.error_m)
@@ -88,7 +88,7 @@ def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStat
     error, block, index = samples.error_m[kept], samples.block[kept], index[kept]
     size = int(np.prod(bins.shape))
     count = np.bincount(index, minlength=size)
-    blocks = np.bincount(np.unique(np.stack([index, block]), axis=1)[0], minlength=size)  # different ones in each bin
+    blocks = np.bincount(np.unique(np.stack([index, block]), axis=1)[0], minlength=size)  # distinct blocks of each bin
     sets = _members(bins.shape)
     figures = np.full((4, size), np.nan)
     pooled = np.full(size, len(POOLED) - 1, dtype=np.int64)
@@ -139,11 +139,10 @@ _SIDES: Final = {1: ("all round",), 2: ("ahead", "behind"), 4: ("ahead", "right"
 
 
 def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
-    """Yield rows by elevation, by sector and by C/N0: name, then count, bias, sigma, overbound before and after the
-    screens.
+    """Yield rows by elevation, sector and C/N0: name, then count, bias, sigma, overbound before and after the screens.
 
-    Bias and sigma are of all samples of the row, from the bins' own figures; the overbound spans the bounding sigmas of
-    the bins.
+    Bias and sigma combine the statistics of the row's bins by their counts; the overbound is the range of their
+    bounding sigmas.
     """
     bins = model.bins
     width = 360.0 / bins.sectors
@@ -171,14 +170,14 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-#: A range that passed the screens is faulty beyond this many of its sigmas; confidence of the rate bounds.
+#: A range that passed the screens is faulty beyond this multiple of its sigma; confidence of the bounds of rates.
 _BEYOND_SIGMA: Final = 5.0
 _CONFIDENCE: Final = 0.95
 #: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
 _SIDE_ELEVATION_DEG: Final = 45.0
 #: Length of the parts of the line that are compared with the whole line [m].
 _STRETCH_M: Final = 100.0
-#: Blocks of one satellite are numbered by time and satellite (`ErrorSamples.block`): satellites in a block of time.
+#: A block's number is its time index times this value plus the index of its satellite (`ErrorSamples.block`).
 _SATELLITES: Final = 1_000_000
 
 
@@ -188,7 +187,7 @@ def fault_rate(samples: ErrorSamples) -> FaultRate:
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     every, bad = np.unique(samples.block[used]), np.unique(samples.block[faulty])
     ranges, count = int(used.sum()), int(faulty.sum())
-    # Within a faulty block only some of the ranges are faulty; without a faulty block, one range of a block is assumed.
+    # fraction of the ranges of a faulty block that are faulty; 1 without a faulty block
     part = (count / ranges) / (len(bad) / len(every)) if len(bad) else 1.0
     upper = _upper(len(bad), len(every))
     low = used & (samples.elevation_deg < _SIDE_ELEVATION_DEG)
@@ -209,12 +208,12 @@ def fault_rate(samples: ErrorSamples) -> FaultRate:
 
 
 def _upper(hits: int, trials: int) -> float:
-    """Return the upper end of the one-sided interval of a probability (Clopper and Pearson)."""
+    """Return the upper end of the one-sided 95 % interval of a probability (Clopper and Pearson); 1 without trials."""
     return float(scipy.special.betaincinv(hits + 1, trials - hits, _CONFIDENCE)) if trials > hits else 1.0
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
-    """Blocks of time with at least two satellites on a side of the track among some samples, each side separately."""
+    """Count blocks of time in which some samples have at least two satellites on a side of the track, by side."""
     right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
     one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
     _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
@@ -222,11 +221,11 @@ def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
 
 
 def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
-    """Stretches of the line, chainages from and to [m], where local faults are more frequent than on the whole line.
+    """Return stretches of the line, chainages from and to [m], with more frequent local faults than the whole line.
 
     A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of its fraction of faulty blocks exceeds
-    the upper limit of the whole line's; neighbouring stretches are joined. There no prior of the line bounds the local
-    faults, and by the settings the train has no protection level (`Config.no_level_m`).
+    the upper limit of the whole line's; neighbouring stretches are joined. The prior of the line does not bound local
+    faults there, and the setting `Config.no_level_m` excludes protection levels there.
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
@@ -249,7 +248,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Blocks of time with two faulty satellites or more, over the number that independent satellites would give."""
+    """Return the number of blocks of time with two or more faulty satellites relative to independent satellites."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.core.settings import Settings
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: A C/N0 above the cap counts as the cap.
+#: C/N0 of `zenith_sigma_m`, and C/N0 above which sigma does not decrease further.
 _CN0_REFERENCE_DBHZ: Final = 45.0
 _CN0_CAP_DBHZ: Final = 50.0
 
@@ -22,16 +22,19 @@ class CodeNoise(Settings):
     ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
     """
 
-    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" leaves the C/N0 factor out.
-    #: At the zenith and the reference C/N0. Only ratios matter to the position: its value for a receiver is estimated
-    #: from the residuals (`pipeline.AntennaState`).
+    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" omits the C/N0 factor.
+    #: Standard deviation at the zenith and the reference C/N0. Only ratios affect the position; the scale of a receiver
+    #: is estimated from the residuals (`pipeline.AntennaState`).
     zenith_sigma_m: float = Field(default=1.0, gt=0)
     #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
 
 
 def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
-    """Return the sigma of corrected pseudoranges (T, M) [m]; NaN C/N0 is the reference; NaN at or below the horizon."""
+    """Return the sigma of corrected pseudoranges, shape (T, M) [m]; NaN at elevations up to 0.1 deg.
+
+    The reference C/N0 is assumed where the C/N0 is NaN.
+    """
     noise = noise or CodeNoise()
     sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     sigma = noise.zenith_sigma_m / sine
@@ -53,23 +56,23 @@ class NominalErrors(Settings):
     (A.4.4.10.4 and A.4.2.4).
     """
 
-    #: Orbit and clock in the range; GPS and Galileo stay near half a metre; their service definitions state 2 m as the
-    #: 95 % bound.
+    #: Orbit and clock error in the range. It is about half a metre for GPS and Galileo, whose service definitions state
+    #: 2 m as the 95 % bound.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Vertical delay error of the Klobuchar model. Mostly common to all satellites, but treated as independent.
+    #: Vertical delay error of the Klobuchar model. It is mostly common to all satellites, but treated as independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
-    #: Added in quadrature with typical coefficients, and to the ranges: the difference of the two models.
+    #: Additional vertical delay error with typical coefficients, also added to the sigma of the ranges.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
     #: Vertical delay error of the standard atmosphere (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats) -> Floats:
-        """Return the standard deviation at elevations, any shape [m]; NaN below the horizon."""
+        """Return the standard deviation at elevations, any shape [m]; NaN up to 0.1 deg."""
         sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
         wet = 1.001 / np.sqrt(0.002001 + sine**2)
         parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
     def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
-        """Broadcast accuracies, any shape, where they are worse than usual; 0 for usual and for unknown accuracies."""
+        """Return broadcast accuracies that are worse than usual, any shape; 0 for usual and for unknown accuracies."""
         return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)

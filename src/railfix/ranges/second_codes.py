@@ -23,16 +23,16 @@ from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 class SecondCodes:
     """Second codes of satellites: T epochs by K channels of the first codes."""
 
-    code_m: Floats  #: Corrected by the models; NaN where missing; shape (T, K).
-    noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
+    code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
+    noise_m: Floats  #: Standard deviation of noise and multipath assumed by the weights, shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
-    group_delay_m: Floats  #: Already subtracted, shape (T, K).
+    group_delay_m: Floats  #: Group delay subtracted from the code, shape (T, K).
     #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
     #: shape (T, K).
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
-    pair: Integers  #: Number of satellite and signals among the names of pairs, shape (T, K).
-    column: Integers  #: Channel of the observations, shape (T, K).
+    pair: Integers  #: Index of satellite and signals in `Channels.pair_names`, shape (T, K).
+    column: Integers  #: Column of the observations, -1 where missing; shape (T, K).
 
 
 def second_codes(
@@ -46,9 +46,9 @@ def second_codes(
 ) -> SecondCodes | None:
     """Return the second code of each satellite, corrected like the first code; None where no channel has a second code.
 
-    The first signal of the order of preference that is observed, healthy and has a group delay. Satellite and clock are
-    the same as for the first code, and the group delay is from the same record; where that record lacks a part of it,
-    another message of the satellite is used.
+    It is the first signal in order of preference that is observed, healthy and has a group delay. Satellite position
+    and clock are those of the first code, and the group delay is from the same record; where that record lacks a part
+    of it, another message of the satellite is used.
     """
     second = channels.second
     if not second.size:
@@ -104,8 +104,8 @@ def _delays(
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
     """Return a signal's group delay, its standard deviation and whether it is unhealthy, by record, shape (n,) [m].
 
-    GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a missing delay is taken from
-    the satellite's record of another message with the nearest reference time.
+    For GPS, QZSS and BeiDou the clocks of all messages refer to the same signals, so a missing delay is taken from the
+    satellite's record of another message with the nearest reference time.
     """
     records = navigation.kepler
     clock = "ionosphere_free" if navigation.precise is not None else "broadcast"

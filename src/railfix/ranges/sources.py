@@ -1,9 +1,9 @@
-"""Sources of corrections behind one protocol: broadcast or precise orbits.
+"""Protocol of correction sources, and the source of broadcast records or precise orbits.
 
-`base_station` adds a base station, `sbas.sbas_sources` SBAS.
+`base_station` and `sbas.sbas_sources` contain the sources with a base station and with SBAS.
 
-A source gives the satellites at the times of transmission, then the delays of their signals as seen from an
-approximate position of the antenna.
+A source returns the satellites at the times of transmission, then the delays of their signals at an approximate
+position of the antenna.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from railfix.ranges.range_sigma import NominalErrors
 class SourceSatellites(NamedTuple):
     """Satellites of a source, T epochs by K channels."""
 
-    states: SatelliteStates  #: At the times of transmission, corrections of the source applied.
+    states: SatelliteStates  #: States at the times of transmission, with the source's corrections.
     fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
-    reason: Bits  #: Reasons of the satellites that the source does not correct, shape (T, K).
-    fixes: object = None  #: Corrections of the satellites, for the delays of the same source.
+    reason: Bits  #: Rejection reasons of satellites that the source does not correct, shape (T, K).
+    fixes: object = None  #: Corrections of the satellites, input of `delays` of the same source.
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaseDifferences:
     """Corrections from a base station to the ranges of a train, T epochs by K channels."""
 
-    #: NaN where the station has none that is new enough, shape (T, K).
+    #: Corrections of codes and phases; NaN without a recent value of the station; shape (T, K).
     code_m: Floats
     phase_m: Floats
     arc: Integers  #: Number of the arc of the station's phase, shape (T, K).
@@ -45,9 +45,9 @@ class BaseDifferences:
 class SourceDelays(NamedTuple):
     """Delays and standard deviations of a source, T epochs by K channels."""
 
-    delays: Delays  #: Subtracted from the codes.
+    delays: Delays  #: Delays that are subtracted from the codes.
     sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
-    #: Standard deviation of satellite and atmospheric errors, and its part assumed by elevation alone; (T, K).
+    #: Standard deviation of satellite and atmospheric errors, and its part assumed by elevation alone; shape (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
@@ -63,7 +63,7 @@ class CorrectionSource(Protocol):
 
     @property
     def second(self) -> Literal["none", "optional", "required"]:
-        """Whether second-frequency codes can be corrected in the same way, or are needed."""
+        """Whether second-frequency codes are not used, can be corrected in the same way, or are required."""
 
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
@@ -71,7 +71,7 @@ class CorrectionSource(Protocol):
         """Return the satellites at the times of transmission of codes, shape (T, K) [m]."""
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the signals as seen from approximate positions."""
+        """Return the delays of the signals at approximate positions of the antenna."""
 
 
 def choose_ionosphere(
@@ -79,7 +79,7 @@ def choose_ionosphere(
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
     """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
 
-    GPS coefficients, else QZSS coefficients, else typical coefficients; None where the ionosphere is "off". BeiDou's
+    The coefficients are those of GPS, else of QZSS, else `TYPICAL_KLOBUCHAR`; None if the ionosphere is "off". BeiDou's
     coefficients are for a different model.
     """
     if ionosphere == "off":
@@ -99,7 +99,7 @@ def choose_ionosphere(
 
 @dataclass(frozen=True, kw_only=True)
 class BroadcastSource:
-    """Broadcast records, or precise orbits and clocks where the navigation data has them, with delay models."""
+    """Source of broadcast records, or of precise orbits and clocks if the navigation data has them; delay models."""
 
     navigation: Navigation
     klobuchar: Floats | None  #: None leaves the ionosphere uncorrected; shape (8,).
@@ -130,7 +130,7 @@ class BroadcastSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites by their records; every satellite has its correction."""
+        """Return the satellites from navigation data, without rejection reasons."""
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s
         )

@@ -264,7 +264,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at the time step of `time`: absent arcs are eliminated, process noise is added to the others."""
+    """Return the memory at the time step of `time`: absent arcs are eliminated, the others get process noise."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)

@@ -1,4 +1,4 @@
-"""SBAS: messages read and decoded, and the corrections that they give (RTCA DO-229D, appendix A)."""
+"""SBAS: readers and decoders of messages, and their corrections (RTCA DO-229D, appendix A)."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Corrections of satellites at any epochs from one GEO's messages (DO-229D, A.4.4 and A.4.5)."""
+"""Satellite corrections at any epochs from one GEO's messages (DO-229D, A.4.4 and A.4.5)."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
     """Return the PRN with the most usable fast corrections, the smallest of equal PRNs, and a sentence on the choice.
 
-    The choice uses all messages: make it on recorded messages before positioning begins. For live messages the PRN must
-    be given.
+    The choice uses all messages, so it is made from recorded messages before positioning begins. For live messages the
+    PRN must be given.
     """
     limits, scores = limits or SbasLimits(), []
     for number in messages.prns:
@@ -68,7 +68,7 @@ def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[
 
 
 class SbasCorrections:
-    """Corrections by one GEO's messages at any epochs; the tables are built once, then searched.
+    """Corrections from one GEO's messages at any epochs; the tables are built once, then searched.
 
     A message is used from its time of reception on (`SbasMessages.time`), never before. Results are independent of the
     other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn`, which is
@@ -99,7 +99,7 @@ class SbasCorrections:
     def from_log(
         cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None
     ) -> SbasCorrections:
-        """Corrections from messages of the requested PRN or of `best_prn`; ValueError: there are none."""
+        """Return corrections from messages of the requested PRN or of `best_prn`; ValueError if there are none."""
         prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.describe_choice(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
         corrections.notes += tuple(corrections._leave_out(messages.of(prn)))
@@ -217,12 +217,11 @@ class SbasCorrections:
         latitude_deg: Floats,
         longitude_deg: Floats,
     ) -> Floats:
-        """Factor on sigma UDRE at a position, from the service region (type 27) or the covariance (type 28), shape (T,
-        K).
+        """Return the factor on sigma UDRE from service regions (type 27) or covariances (type 28), shape (T, K).
 
-        `corrections` are of these epochs, `line_of_sight`, shape (T, K, 3), unit vectors to the satellites in the
-        Earth-fixed frame, coordinates of the receiver (T,). 1 where the GEO sends neither; NaN where the service
-        messages are incomplete and incomplete data are rejected.
+        `corrections` are of these epochs, `line_of_sight`, shape (T, K, 3), are unit vectors to the satellites in the
+        Earth-fixed frame, and the coordinates, shape (T,), are those of the receiver. The factor is 1 where the GEO
+        sends neither type, and NaN where service messages are incomplete and incomplete data are rejected.
         """
         factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)
         along = delta_udre_covariance(self._tables, time, corrections.covariance, line_of_sight)
@@ -232,7 +231,7 @@ class SbasCorrections:
     def ionosphere(
         self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> IonosphereDelays:
-        """Slant delays on L1 from the grid at T positions, shape (T,), towards K satellites, angles of shape (T, K)."""
+        """Return slant delays on L1 from the grid at positions (T,), towards K satellites at angles (T, K)."""
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )
@@ -240,10 +239,10 @@ class SbasCorrections:
 
 @dataclass(frozen=True, kw_only=True)
 class SbasState:
-    """Messages of one GEO received so far; an immutable value, to which new messages are added as they arrive.
+    """Messages of one GEO received so far; `add_messages` returns a new state with further messages.
 
-    Corrections at an epoch are the same as from the whole log, however it was cut: a message counts from its
-    reception on, and `drop_before` drops only messages that no later epoch can use.
+    Corrections at an epoch are the same as from the complete log, for any division into parts: a message is used from
+    its reception on, and `drop_before` drops only messages that no later epoch can use.
 
     ::
 
@@ -253,7 +252,7 @@ class SbasState:
         state = state.drop_before(time[-1])  # what later epochs need
     """
 
-    prn: int  #: Chosen beforehand: which GEO is best is known only after all messages were received.
+    prn: int  #: Chosen beforehand, because the best GEO is known only after all messages were received.
     limits: SbasLimits = field(default_factory=SbasLimits)
     #: Messages of that PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
@@ -286,13 +285,13 @@ class SbasState:
         return self.corrections.notes if self.log_notes is None else self.log_notes
 
     def add_messages(self, messages: SbasMessages) -> SbasState:
-        """Return the state after more messages; other PRNs, and repeated ones of a second receiver, are left out."""
+        """Return the state after more messages, without other PRNs and messages repeated by a second receiver."""
         joined = self.messages.merge(messages.of(self.prn))
         return replace(self, messages=joined.take(~joined.repeated()), log_notes=None)
 
     @cached_property
     def corrections(self) -> SbasCorrections | DfmcService:
-        """Corrections by the messages received so far."""
+        """Corrections from the messages received so far."""
         if self.band == "L5":
             return DfmcService(self.messages, prn=self.prn)
         return SbasCorrections(self.messages, prn=self.prn, limits=self.limits)

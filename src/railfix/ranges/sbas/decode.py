@@ -1,6 +1,6 @@
-"""SBAS messages decoded by tables of bit fields (RTCA DO-229D, A.4.4), in SI units; nothing is applied here.
+"""Decoders of SBAS messages by tables of bit fields (RTCA DO-229D, A.4.4), in SI units.
 
-Every decoder returns arrays by name, all with n rows; `row` is the message that each row comes from.
+Every decoder returns arrays by name, all with n rows; `row` is the index of the message of each row.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
 from railfix.ranges.sbas.messages import SbasMessages
 
 Decoded = dict[str, NDArray[Any]]  #: Arrays by the name of their field.
-SLOTS: Final = 51  #: Satellites that a PRN mask may name; corrections are sent for its slots 0 to 50.
-BLOCK: Final = 13  #: Slots of one message of type 2 to 5.
-#: Regions of one message of type 27.
+SLOTS: Final = 51  #: Largest number of satellites of a PRN mask; corrections refer to its slots 0 to 50.
+BLOCK: Final = 13  #: Number of slots of one message of types 2 to 5.
+#: Largest number of regions of one message of type 27.
 _REGIONS: Final = 5
 _DO_NOT_USE_DELAY_M: Final = 0x1FF * 0.125
 #: Rows and columns of the elements above the diagonal of a covariance factor, in the order of the message.
@@ -26,16 +26,16 @@ _UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
-    """One number of a message, or `number` numbers that begin `step` bits (default: their length) apart."""
+    """One number of a message, or `number` numbers whose first bits are `step` (default `length`) apart."""
 
     first: int
     length: int
-    #: Unit of the number; None: an integer.
+    #: Value of the least significant bit; None for an integer.
     scale: float | None = None
     signed: bool = False
     number: int | None = None
     step: int | None = None
-    least: float = 0.0  #: Added to a number with a unit.
+    least: float = 0.0  #: Value added to a scaled number.
 
 
 def _read_signed(first: int, length: int, scale: float | None = None, number: int | None = None) -> BitField:
@@ -45,7 +45,7 @@ def _read_signed(first: int, length: int, scale: float | None = None, number: in
 #: Fields of a message or of a part of it; a sequence of fields becomes one array of as many columns.
 Layout = Mapping[str, BitField | Sequence[BitField]]
 
-#: Whole messages by type, and parts of messages, whose bits count from the beginning of the part.
+#: Complete messages by type, and parts of messages, whose bits are counted from the beginning of the part.
 LAYOUTS: Final[dict[str, Layout]] = {
     "type 1": {"member": BitField(14, 1, number=210), "iodp": BitField(224, 2)},
     "type 2": {
@@ -56,7 +56,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
     },
     "type 6": {"iodf": BitField(14, 2, number=4), "udrei": BitField(22, 4, number=SLOTS)},
     "type 7": {"latency_s": BitField(14, 4, 1.0), "iodp": BitField(18, 2), "indicator": BitField(22, 4, number=SLOTS)},
-    # Growth of errors (table A-9).
+    # degradation of corrections (table A-9)
     "type 10": {
         "range_rate_m": BitField(14, 10, 0.002),
         "long_term_step_m": BitField(24, 10, 0.002),
@@ -123,7 +123,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "square": BitField(70, 1, number=_REGIONS, step=35),
     },
     "type 28": {"iodp": BitField(14, 2)},
-    # Half of type 25 with velocity code 0: two satellites; their issue of the mask follows both.
+    # Half of type 25 with velocity code 0: two satellites, then the issue of their mask.
     "half of type 25": {"velocity_code": BitField(0, 1), "iodp": BitField(103, 2)},
     "satellite of type 25": {
         "slot": BitField(0, 6),
@@ -152,9 +152,9 @@ LAYOUTS: Final[dict[str, Layout]] = {
 
 
 def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
-    """Decode the fields of a layout from messages, shape (n, 32), whose part begins at the bit `offset`.
+    """Decode the fields of a layout from messages, shape (n, 32), from the bit `offset` on.
 
-    Shapes (n,) or (n, number): int64, or float64 where the field has a scale.
+    Arrays have shape (n,) or (n, number) and type int64, or float64 where the field has a scale.
     """
     unpacked = np.unpackbits(np.ascontiguousarray(bits), axis=1)
 
@@ -175,12 +175,12 @@ def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
 
 
 def find_rows(messages: SbasMessages, *types: int) -> Integers:
-    """Return the rows of some message types."""
+    """Return the rows of messages of some types."""
     return np.flatnonzero(np.isin(messages.type, types)).astype(np.int64)
 
 
 def decode(messages: SbasMessages, kind: int) -> Decoded:
-    """Return the fields of all messages of a type, as its layout has them."""
+    """Return the fields of all messages of a type, by its layout."""
     row = find_rows(messages, kind)
     return {"row": row, **read_fields(messages.bits[row], LAYOUTS[f"type {kind}"])}
 
@@ -193,7 +193,7 @@ def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
 
 
 def prn_masks(messages: SbasMessages) -> Decoded:
-    """Type 1: `iodp` (n,), and `number` (n, 51), the number in the PRN mask by slot, 0 where empty."""
+    """Return the masks of type 1: `iodp` (n,), and `number` (n, 51), the mask number of each slot, 0 for none."""
     decoded = decode(messages, 1)
     message, bit = np.nonzero(decoded.pop("member"))
     slot = np.arange(len(message)) - np.searchsorted(message, message)
@@ -204,7 +204,10 @@ def prn_masks(messages: SbasMessages) -> Decoded:
 
 
 def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2"]) -> Decoded:
-    """Types 2 to 5, 24, and 0 for 2, one row a slot: `slot`, `prc_m`, `udrei`, `iodf`, `iodp`, all (n,)."""
+    """Return the fast corrections of types 2 to 5 and 24, and of type 0 read as type 2, one row per slot.
+
+    The arrays are `slot`, `prc_m`, `udrei`, `iodf` and `iodp`, shape (n,).
+    """
     row = find_rows(messages, 2, 3, 4, 5)
     if type0 == "as_type2":
         zero = find_rows(messages, 0)
@@ -223,7 +226,7 @@ def has_data(bits: Bytes) -> Masks:
 
 
 def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
-    """Return one row a slot of fast corrections."""
+    """Return fast corrections with one row per slot, from slot `first` of each message."""
     slot = first[:, None] + np.arange(fields["prc_m"].shape[1])
     message, column = np.nonzero(slot < SLOTS)
     return {
@@ -234,7 +237,7 @@ def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
 
 
 def _join(parts: Sequence[Decoded]) -> Decoded:
-    """Return the rows of several decoders in the order of the messages, without empty slots."""
+    """Return the rows of several decoders in the order of the messages, without invalid slots."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     kept = np.flatnonzero((joined["slot"] >= 0) & (joined["slot"] < SLOTS))
     order = kept[np.argsort(joined["row"][kept], kind="stable")]
@@ -242,7 +245,7 @@ def _join(parts: Sequence[Decoded]) -> Decoded:
 
 
 def long_term(messages: SbasMessages) -> Decoded:
-    """Return the halves of types 25 and 24, one row per satellite; `reference` is NaT without velocity."""
+    """Return long-term corrections of types 25 and 24, one row per satellite; `reference` is NaT without velocity."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
         row = find_rows(messages, kind)
@@ -271,7 +274,7 @@ def long_term(messages: SbasMessages) -> Decoded:
 
 
 def grid_delays(messages: SbasMessages) -> Decoded:
-    """Type 26: `band`, `block`, `iodi` (n,), `delay_m` (n, 15), NaN for do not use, `givei` (n, 15)."""
+    """Return type 26: `band`, `block`, `iodi` (n,); `delay_m` (n, 15), NaN for "do not use"; `givei` (n, 15)."""
     decoded = decode(messages, 26)
     delay = decoded["delay_m"]
     return {**decoded, "delay_m": np.where(delay == _DO_NOT_USE_DELAY_M, np.nan, delay)}
@@ -285,7 +288,7 @@ def covariance_factor(sent: Decoded) -> Floats:
 
 
 def covariance(messages: SbasMessages) -> Decoded:
-    """Return both halves of type 28: `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled."""
+    """Return type 28, one row per satellite: `slot`, `iodp`, `scale` (n,); `factor` (n, 4, 4), upper triangular."""
     decoded = decode(messages, 28)
     row, parts = decoded["row"], []
     for start in (16, 121):
@@ -296,7 +299,7 @@ def covariance(messages: SbasMessages) -> Decoded:
 
 
 def service(messages: SbasMessages) -> Decoded:
-    """Type 27: `issue`, `messages`, `message`, `regions`, `priority`, `inside`, `outside` (n,); corners (n, 5)."""
+    """Return type 27: `issue`, `messages`, `message`, `regions`, `priority`, `inside`, `outside`; corners (n, 5)."""
     decoded = decode(messages, 27)
     return {
         **decoded,

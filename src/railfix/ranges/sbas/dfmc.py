@@ -3,8 +3,8 @@
 Messages of 250 bits with preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
 (integrity) and 37 (degradation and the scale of the integrity indicator) are decoded. The corrections are for
 ionosphere-free ranges of L1 C/A and L5, E1 and E5a, where biases between the signals are in the clock correction, and
-of B1C and B2a, less the group delays of B-CNAV1. GLONASS has slots, but is corrected on L1OC and L3OC, which are not
-read.
+of B1C and B2a, less the group delays of B-CNAV1. GLONASS has slots, but its corrections are for L1OC and L3OC, which
+are not read.
 
 The standard was not available. Layouts are taken from cssrlib (sbas.py), least values and degradation from MAAST
 (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots from both and from Wireshark (packet-sbas_l5.c). An hour of
@@ -15,8 +15,9 @@ differ by metres: they are not in its corrections.
 Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), are used for a note
 only. Layouts and scales are common to cssrlib and MAAST (L5_decodeMT39.m, 40, 47). Messages of SouthPAN of three days
 (`test_sbas_orbits.py`) determine the rest: the semi-major axis is counted from 6370 km, and the node from the meridian
-of Greenwich at midnight of GPS time. Open: a step of the inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6 rad/s;
-SouthPAN sends 0, and an orbit with another rate has no position here. BDSBAS has a different layout and is left out.
+of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is 7 pi / 6 or 7 pi times
+2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit with another rate. BDSBAS has a different
+layout and is left out.
 """
 
 from __future__ import annotations
@@ -39,18 +40,18 @@ from railfix.ranges.sbas.decode import BitField, Decoded, Layout, covariance_fac
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import first_that_holds, system_name
 
-AUGMENTED: Final = 92  #: Satellites of one mask.
-FIRST: Final = 53  #: The first ones are in type 35, the others in type 36.
-DO_NOT_USE: Final = 15  #: Indicators without a sigma: "not monitored" is left out of type 32, 15 means "do not use".
+AUGMENTED: Final = 92  #: Largest number of satellites of a mask.
+FIRST: Final = 53  #: Number of satellites in type 35; the others are in type 36.
+DO_NOT_USE: Final = 15  #: Indicator of "do not use", without a sigma; unmonitored satellites are absent from type 32.
 #: Sigma by indicator 0 to 14: least value and step [m].
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
-_ONE_MORE: Final = -2
+_ONE_MORE: Final = -2  #: Value of an indicator that type 34 increases by one.
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 in order.
 #: Validity of a mask, and of an indicator [s]; type 0 stops the use of its sender for the last value.
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
-#: Time, covariance and indicator, where types 32 and 40 have them.
+#: Time, covariance and indicator, at the same bits of types 32 and 40.
 _COVARIANCE: Final[Layout] = {
     "time_of_day_s": BitField(106, 13, 16.0),
     "exponent": BitField(119, 3, 1.0),
@@ -88,10 +89,10 @@ LAYOUTS: Final[dict[int, Layout]] = {
 
 
 class DfmcState(IntEnum):
-    """Why a satellite has no correction."""
+    """State of a satellite's correction: in force (OK), or the reason why there is none."""
 
     OK = 0
-    STOPPED = 1  #: Type 0: the whole service must not be used.
+    STOPPED = 1  #: Type 0 was received: the service must not be used.
     NO_MASK = 2
     NOT_IN_MASK = 3
     NO_CORRECTION = 4
@@ -106,33 +107,33 @@ class DfmcCorrections:
     """Corrections of T epochs by K satellites."""
 
     state: Integers  #: `DfmcState`, shape (T, K).
-    issue: Integers  #: Issue of data of the record that the correction belongs to; -1 without one; shape (T, K).
-    record: Integers  #: Row of `navigation.kepler` with that issue, -1 without; shape (T, K).
-    position_m: Floats  #: Added to the broadcast position, shape (T, K, 3).
-    clock_m: Floats  #: Added to c times the broadcast clock, without group delays; shape (T, K).
+    issue: Integers  #: Issue of data of the record to which the correction refers; -1 without one; shape (T, K).
+    record: Integers  #: Row of `navigation.kepler` with that issue, -1 without one; shape (T, K).
+    position_m: Floats  #: Correction added to the broadcast position, shape (T, K, 3).
+    clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
     sigma_m: Floats  #: Sigma by the indicator and its scale, before covariance and degradation; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
     growth_m: Floats  #: Degradation of the correction since it was sent, shape (T, K).
-    constant: Floats  #: Added to the factor along a line of sight, shape (T, K).
+    constant: Floats  #: Constant added to the factor along a line of sight, shape (T, K).
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:
         """Return the standard deviation of corrected ranges along unit vectors to the satellites, shape (T, K) [m]."""
         sight = np.concatenate([line_of_sight, np.ones((*self.state.shape, 1))], axis=-1)
         projected = np.einsum("tkij,tkj->tki", self.factor, sight)
         ratio = np.sqrt(np.einsum("tki,tki->tk", projected, projected)) + self.constant
-        # degradations are added to the sigma itself, which is never less than the root of their squares
+        # the degradation is added to sigma, which is never less than the root of the sum of squares
         return np.asarray(self.sigma_m * ratio + self.growth_m)
 
 
 def slot_satellite(slot: int) -> str:
-    """Return the satellite of a slot of the mask; empty where it is reserved."""
+    """Return the satellite of a slot of the mask; empty for a reserved slot."""
     for letter, first, last, number in (("G", 1, 32, 1), ("R", 38, 69, 1), ("E", 75, 110, 1), ("S", 120, 158, 20)):
         if first <= slot <= last:
             return f"{letter}{slot - first + number:02d}"
     return f"C{slot - 158:02d}" if 159 <= slot <= 195 else ""
 
 
-#: Slots of satellites.
+#: Slot of each satellite in the mask.
 SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_satellite(slot)}
 
 
@@ -142,14 +143,14 @@ def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
 
 
 def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
-    """Return the row of the newest of some messages at epochs, -1 without one, and its age, infinite then [s]."""
+    """Return the row of the newest of some messages at epochs, and its age [s]; -1 and infinite without one."""
     row = np.searchsorted(sent, time, side="right") - 1
     ages = seconds(time - np.append(sent, np.datetime64("NaT", "ns"))[row])
     return row, np.where(row >= 0, ages, np.inf)
 
 
 class DfmcService:
-    """Corrections by the L5 messages of one SBAS satellite at any epochs; a message is used from its reception on.
+    """Corrections from the L5 messages of one SBAS satellite at any epochs; a message is used from its reception on.
 
     Messages of other PRNs are left out; `notes` on their origin precede the notes on the corrections.
     """
@@ -173,10 +174,9 @@ class DfmcService:
 
     @classmethod
     def from_log(cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best") -> DfmcService:
-        """Return the corrections of recorded messages, of the requested PRN or of the PRN with the most messages of
-        type 32.
+        """Return the corrections from messages of the requested PRN, or of the PRN with the most messages of type 32.
 
-        ValueError: no message of that PRN exists.
+        Raises ValueError if the log has no message of the requested PRN.
         """
         if prn == "best":
             numbers, count = np.unique(messages.prn[messages.type == 32], return_counts=True)
@@ -192,7 +192,7 @@ class DfmcService:
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
         """Return the corrections of K satellites at T epochs.
 
-        With navigation data a correction is applied only if a record has its issue of data; otherwise unchecked.
+        With navigation data a correction is used only if a record has its issue of data; without, it is not checked.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -256,7 +256,7 @@ class DfmcService:
         own["growth_m"][good] = np.floor(age / interval) * scale["step_m"][ten, kind] + rate * age
 
     def _newest(self, kind: int, time: Datetimes, longest_s: float) -> Integers:
-        """Return the row of the newest message of a type, -1 without one that is new enough."""
+        """Return the row of the newest message of a type; -1 if it is older than `longest_s`."""
         row, age = _newest(self._time[kind], time)
         return np.where(age <= longest_s, row, -1)
 
@@ -269,9 +269,9 @@ class DfmcService:
         return (mask >= 0) & (member[:, slot - 1] == 1), member[:, : slot - 1].sum(axis=1)
 
     def _all_indicators(self) -> tuple[Datetimes, Integers, Integers]:
-        """Times, issue of the mask and indicators of all satellites of types 34 to 36; -1 where not transmitted.
+        """Return times, mask issues and indicators of all satellites from types 34 to 36; -1 where not transmitted.
 
-        Type 34: 0 nothing new, 1 an indicator of its own, 2 one more than before (`_ONE_MORE`), 3 do not use.
+        Codes of type 34: 0 unchanged, 1 new indicator, 2 indicator increased by one (`_ONE_MORE`), 3 do not use.
         """
         times, issues, values = [], [], []
         for kind in (34, 35, 36):
@@ -294,13 +294,13 @@ class DfmcService:
         return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
 
     def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
-        """Return the indicator in force: of type 32, or of a later message of types 34 to 36; -1 where too old."""
+        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 where it is too old."""
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)
         known = np.flatnonzero((mask >= 0) & np.isfinite(age))
         last = np.searchsorted(received, time[known], side="right")
-        # epochs between two messages have the same one
+        # epochs between two messages have the same indicator
         cases, case = np.unique(np.stack([mask[known], row[known], rank[known], last]), axis=1, return_inverse=True)
         renewed = np.empty(cases.shape[1], dtype="datetime64[ns]")
         current = np.empty(cases.shape[1], dtype=np.int64)
@@ -320,7 +320,7 @@ class DfmcService:
         return result
 
 
-_BDSBAS: Final = 5  #: Number of the service.
+_BDSBAS: Final = 5  #: Provider number of BDSBAS.
 _ANGLE: Final = np.pi * 2.0**-33
 _AXIS_M: Final = 6_370_000.0
 _BEFORE_FIRST_PRN: Final = 119
@@ -364,20 +364,20 @@ _ALMANACS_AT: Final = (10, 116)  #: First bits of the two satellites of type 47.
 class SbasOrbits:
     """Orbits of SBAS satellites, n rows."""
 
-    row: Integers  #: Time of the last message of each, shape (n,).
-    prn: Integers  #: Issue of data of the satellite, as in the message; shape (n,).
-    provider: Integers  #: Number of the service, 8 for SouthPAN; shape (n,).
-    reference: Datetimes  #: Shape (n,).
+    row: Integers  #: Row of the last message of each orbit, shape (n,).
+    prn: Integers  #: Shape (n,).
+    provider: Integers  #: Provider number of the service, 8 for SouthPAN; shape (n,).
+    reference: Datetimes  #: Reference time of each orbit, shape (n,).
     orbits: Orbits
     usable: Masks  #: Whether the inclination rate is 0, shape (n,).
 
     def position_ecef_m(self, time: Datetimes) -> Floats:
-        """Compute the position of each satellite at its own time, shape (n, 3) [m]; NaN where not `usable`."""
+        """Compute the position of each satellite at its time of `time`, shape (n, 3) [m]; NaN where not `usable`."""
         position = np.stack(kepler_state(self.orbits, seconds(time - self.reference))[0], axis=1)
         return np.where(self.usable[:, None], position, np.nan)
 
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on the last orbit with a position, none if no orbit has a position."""
+        """Return a sentence on the last orbit with a position; an empty tuple without one."""
         last = zip(self.prn[self.usable][-1:], self.position_ecef_m(self.reference)[self.usable][-1:], strict=True)
         return tuple(
             f"PRN {prn} is, by its own messages, at {float(geodetic_from_ecef(place)[1]):.1f} degrees east, "
@@ -387,7 +387,7 @@ class SbasOrbits:
 
 
 def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
-    """Return the ephemerides in messages of one sender: types 39 and 40 of one issue within `valid_s`."""
+    """Return the ephemerides of one sender, from messages of types 39 and 40 of one issue within `valid_s`."""
     rows = {kind: np.flatnonzero(messages.type == kind) for kind in (39, 40)}
     sent = {kind: read_fields(messages.bits[at], _ORBIT_LAYOUTS[kind]) for kind, at in rows.items()}
     newest: dict[tuple[int, int], int] = {}
@@ -413,7 +413,7 @@ def almanacs(messages: SbasMessages) -> SbasOrbits:
 
 
 def _orbits(messages: SbasMessages, row: Integers, sent: Decoded) -> SbasOrbits:
-    """Return decoded orbits in the order of their messages, without empty ones and without BDSBAS."""
+    """Return decoded orbits in the order of their messages, without empty orbits and without BDSBAS."""
     order = np.argsort(row, kind="stable")
     order = order[(sent["number"][order] > 0) & (sent["provider"][order] != _BDSBAS)]
     row, sent = row[order], {name: values[order] for name, values in sent.items()}

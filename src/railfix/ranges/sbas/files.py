@@ -34,13 +34,13 @@ _RTKLIB: Final = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+(\d+)\s+(\d+)\s*:\s*([0-
 _EMS: Final = re.compile(r"(\d+)((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)\s+(\d+)\s+([0-9A-Fa-f]+)")
 _RINEX_HEAD: Final = re.compile(r"(\d{1,3})((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)(?:\s+([A-Z]\d)\s+(\d+)\b.*)?")
 _RINEX_BYTES: Final = 18
-#: Seconds from the first bit, to which RINEX type B refers, to the reception of the whole message.
+#: Time from the first bit, to which RINEX type B refers, to the reception of the complete message.
 _RINEX_SHIFT_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One message as written: nanoseconds since 1980-01-06 in GPS time, PRN, type (-1: none), hexadecimal digits."""
+    """Message as in a file: GPS time in nanoseconds since 1980-01-06, PRN, type (-1 if absent), hexadecimal digits."""
 
     line: int
     time_ns: int
@@ -50,7 +50,10 @@ class RawMessage:
 
 
 def kind_of_file(path: str, lines: Sequence[str]) -> str:
-    """Return the format by the first line that is not empty or a comment: "rtklib", "ems" or "rinex"."""
+    """Return the format, "rtklib", "ems" or "rinex", from the first line that is neither empty nor a comment.
+
+    Raises InputFileError for any other format.
+    """
     for number, text in enumerate(lines, start=1):
         line = text.strip()
         if not line or line[0] in "#%":
@@ -73,7 +76,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
 
 
 def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iterator[RawMessage | InputFileError]:
-    """Yield every message of a file in its order; a broken message as the error that describes it."""
+    """Yield the messages of a file in their order, and for a broken message the error that describes it."""
     if kind == "rinex":
         yield from _parse_rinex(path, lines, band)
         return
@@ -115,7 +118,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
     if end is None:
         raise InputFileError(path, "the header has no END OF HEADER; the file is cut, give the whole one")
     rest = [(i, text) for i, text in enumerate(lines[end + 1 :], start=end + 2) if text.strip()]
-    at, broken = 0, False  # after a broken record or line everything up to the next header is skipped
+    at, broken = 0, False  # after a broken record or line, all lines up to the next header are skipped
     while at < len(rest):
         number, text = rest[at]
         at += 1
@@ -180,12 +183,12 @@ def _instant(date: str, second: str) -> int:
     return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
 
 
-_SHORT: Final = 58  #: Digits of a message cut after its data: 226 bits, and 6 of the parity or nothing.
+_SHORT: Final = 58  #: Number of digits of a message cut after its 226 data bits; 6 bits of parity or zeros follow.
 
 
 @dataclass
 class _Gathered:
-    """Messages of all files while they are read."""
+    """Messages of all files during reading."""
 
     raw: list[RawMessage] = field(default_factory=list)
     source: list[int] = field(default_factory=list)
@@ -196,7 +199,7 @@ class _Gathered:
 def read_sbas(
     paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop", band: Band = "L1"
 ) -> SbasMessages:
-    """Return SBAS messages of one or several files.
+    """Read SBAS messages from one or several files.
 
     Parameters
     ----------
@@ -204,23 +207,22 @@ def read_sbas(
         RTKLIB (.sbs), EGNOS message server (.ems), RINEX broadcast data (type B) or a receiver's log (UBX with
         RXM-SFRBX of SBAS, SBF with GEORawL1 or GEORawL5), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
-        A line that is no message stops the reading, or is counted under "line" in `rejected` and
-        named in `notes`. A message with a wrong parity or preamble was damaged: it is left out and counted in either
-        case.
+        A line that is not a message raises an error, or is counted under "line" in `rejected` and named in `notes`. A
+        message with a wrong parity or preamble is damaged; it is left out and counted in both cases.
 
     band : {"L1", "L5"}
-        Frequency of the messages; messages of the other band have another preamble, and are left out for that reason.
+        Frequency of the messages; messages of the other band have another preamble and are left out.
 
     Returns
     -------
     SbasMessages
-        In the order of reception. Times of RTKLIB and EMS files are used as the ends of the messages; times of RINEX,
-        which are of the first bit, are increased by 1 s.
+        Messages in the order of reception. Times in RTKLIB and EMS files are taken as the ends of messages; times in
+        RINEX refer to the first bit and are increased by 1 s.
 
     Raises
     ------
     InputFileError
-        A file is missing or of another kind, (stop) a line is broken, or no message is left.
+        A file is missing or of another kind, a line is broken (with "stop"), or no valid message is left.
     """
     sources = tuple(path_names(paths))
     gathered = _Gathered()
@@ -238,9 +240,9 @@ def read_sbas(
 
 
 def from_receiver(frames: SbasFrames, *, source: str = "receiver", band: Band = "L1") -> SbasMessages:
-    """SBAS messages as a receiver passes them on, parity and preamble checked; `source` names them in notes and counts.
+    """Return SBAS messages forwarded by a receiver, with parity and preamble checked; `source` is named in notes.
 
-    Messages before the receiver knew the time are left out, and counted under "line".
+    Messages from before the receiver had the time are left out and counted under "line".
     """
     gathered = _Gathered()
     _gather_frames(frames, 0, gathered, band)
@@ -280,7 +282,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
 
 
 def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMessages:
-    """Check the parity, preamble and order."""
+    """Check parity, preamble and order, and return the messages without damaged and repeated ones."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
     bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()
@@ -319,8 +321,8 @@ def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMes
 def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
     """Return the number of parity bits of each message: 24 in complete messages, 6 or 0 in cut messages.
 
-    A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as
-    they came: in a file of the latter most of them are the first of the parity, by chance 1 in 64.
+    A cut message ends with 6 bits that RTKLIB sets to zero and other programs leave as received. In files of the latter
+    these bits equal the first bits of the parity in most messages; by chance they do in 1 of 64.
     """
     carried = np.full(len(digits), 24, dtype=np.int64)
     short = digits == _SHORT
@@ -346,7 +348,7 @@ def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers)
 
 
 def _order_notes(log: SbasMessages) -> list[str]:
-    """Preambles follow each other second by second; where they do not, a time tag is wrong."""
+    """Return notes on messages whose preamble does not fit the sequence by seconds, which shows a wrong time tag."""
     notes = []
     second = log.time.astype("datetime64[s]").astype(np.int64)
     number, turn = preamble_number(log.bits, log.band), len(PREAMBLES[log.band])

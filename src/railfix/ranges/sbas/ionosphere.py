@@ -1,4 +1,4 @@
-"""The ionospheric grid of one GEO, and slant delays from it (DO-229D, A.4.4.9, A.4.4.10 and A.4.5.2)."""
+"""Ionospheric grid of one GEO, and slant delays from it (DO-229D, A.4.4.9, A.4.4.10 and A.4.5.2)."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from railfix.ranges.sbas.tables import SatelliteTables, Series, Stops
 
 Answer = TypeVar("Answer", bound=np.generic)
 
-#: Bands, bits of a mask, points of one message of type 26.
+#: Number of bands, of bits of a mask, and of points of one message of type 26.
 BANDS: Final = 11
 BITS: Final = 201
 BLOCK: Final = 15
-#: Grid points are numbered on a raster of 5 degrees from 90 south, 180 west.
+#: Columns and rows of the 5-degree raster on which grid points are numbered, from 90 south, 180 west.
 COLUMNS: Final = 72
 ROWS: Final = 37
 
@@ -68,7 +68,7 @@ def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.ge
 
 
 def _layout() -> tuple[Integers, Integers]:
-    """Return the point of each bit of each band (-1 without), and up to two (band, bit) cells of each point (-1)."""
+    """Return the point of each bit of each band, and up to two (band, bit) cells of each point; -1 for none."""
     point = np.full((BANDS, BITS), -1, dtype=np.int64)
     cells = np.full((ROWS * COLUMNS, 2), -1, dtype=np.int64)
     for band in range(BANDS):
@@ -85,9 +85,10 @@ POINT_OF_BIT, CELLS_OF_POINT = _layout()
 
 
 class GridTables:
-    """Masks and delays of the grid by point and time, the spans in which it is constant, and delays that match no mask.
+    """Masks and delays of the grid by point and time, spans in which they are constant, and a count of unused delays.
 
-    `delays`: by grid point the vertical `delay_m`, NaN for do not use; `givei`; `issue` of the mask (4 band + IODI).
+    `delays` has, by grid point, the vertical `delay_m` (NaN for "do not use"), `givei`, and the `issue` of the mask
+    (4 band + IODI). `unused` counts delays without a mask of their issue.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
@@ -105,7 +106,7 @@ class GridTables:
         self.delays = self._delays(messages)
 
     def _delays(self, messages: SbasMessages) -> Series:
-        """Return delays by point: the k-th of a block belongs to the k-th point of the mask of its issue."""
+        """Return delays by point; the k-th delay of block b belongs to point 15 b + k of the mask of its issue."""
         decoded = grid_delays(messages)
         kept = np.flatnonzero(decoded["band"] < BANDS)
         time, issue = messages.time[decoded["row"][kept]], 4 * decoded["band"][kept] + decoded["iodi"][kept]
@@ -139,25 +140,24 @@ class GridTables:
 
 
 class Spans:
-    """Spans of time between receptions, shape (N,), and time-outs, in which no value of the grid changes."""
+    """Spans between times of reception and time-outs of messages, in which no value of the grid changes."""
 
     def __init__(self, time: Datetimes, timeouts_s: Sequence[float]) -> None:
         ends = [time, *(time + timedelta(np.asarray(float(seconds))) for seconds in timeouts_s)]
         self._edges = np.unique(np.concatenate(ends)) if len(time) else time
 
     def number(self, time: Datetimes) -> Integers:
-        """Return the number of the span of instants; an instant that is an edge has a number of its own."""
+        """Return the number of the span of instants; an instant at an edge has a separate number."""
         before = np.searchsorted(self._edges, time, side="left")
         return np.asarray(before + np.searchsorted(self._edges, time, side="right"), dtype=np.int64)
 
 
 def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indices, Indices]:
-    """Return the first row of each different combination of span (M,) and four points (M, 4), and the combination of
-    each.
+    """Return the first row of each combination of span (M,) and four points (M, 4), and the combination of each row.
 
     Points are from -1 to below `points`.
     """
-    # Runs of one span have one number; a span that occurs twice may have two numbers.
+    # Successive rows of one span have one number; a span that occurs again later may have another number.
     key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
     pairs = (point[:, ::2] + 1) * (points + 1) + point[:, 1::2] + 1
     # Renumbered half-way, so that the keys stay small for logs of any length.
@@ -173,7 +173,7 @@ def look_up(
     time: Datetimes,
     points: int,
 ) -> NDArray[Answer]:
-    """Return the value of `answer` at four points and an instant, computed once for each span: shape (M, ...)."""
+    """Return the value of `answer` at four points and an instant, computed once per span and points, shape (M, ...)."""
     first, which = distinct_lookups(span, point, points)
     return np.asarray(answer(point[first], time[first])[which])
 
@@ -190,7 +190,7 @@ _NO_POINT: Final = -1
 def pierce_point(
     latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Pierce points [deg] in the ionospheric layer, and obliquity factors, shape (T, K); NaN below the horizon."""
+    """Return pierce points in the ionospheric layer [deg] and obliquity factors, (T, K); NaN below the horizon."""
     elevation, azimuth = np.radians(np.where(elevation_deg > 0.0, elevation_deg, np.nan)), np.radians(azimuth_deg)
     own_latitude, own_longitude = np.radians(latitude_deg)[:, None], np.radians(longitude_deg)[:, None]
     ratio = EARTH_RADIUS_KM / (EARTH_RADIUS_KM + LAYER_HEIGHT_KM) * np.cos(elevation)
@@ -206,7 +206,7 @@ def pierce_point(
 
 
 def triangle_weights(x: Floats, y: Floats, missing: int) -> Floats:
-    """Return weights of SW, NW, SE, NE without one of them, shape (..., 4); one is negative outside the triangle."""
+    """Return weights of SW, NW, SE, NE without one corner, shape (..., 4); one is negative outside the triangle."""
     zero = np.zeros_like(x)
     weights = {
         0: (zero, 1.0 - x, 1.0 - y, x + y - 1.0),
@@ -243,7 +243,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return the corner points (M, 4), -1 where not used, and the position in the cell (M,), (M,) below 75 degrees."""
+    """Return corner points (M, 4), -1 where not used, and the position in the cell, (M,) and (M,), below 75 degrees."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
@@ -272,7 +272,7 @@ def _choose(
 
 
 def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
-    """Return points and weights at 75 degrees and above; all four are needed."""
+    """Return points and weights, (M, 4), at 75 degrees and above; -1 and NaN if one of the four is not in the mask."""
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0
@@ -309,7 +309,7 @@ def ionosphere(
     elevation_deg: Floats,
     azimuth_deg: Floats,
 ) -> IonosphereDelays:
-    """Return delays at epochs; arguments as `SbasCorrections.ionosphere`."""
+    """Return slant delays at epochs; the arguments are those of `SbasCorrections.ionosphere`."""
     latitude, longitude, obliquity = pierce_point(latitude_deg, longitude_deg, elevation_deg, azimuth_deg)
     shape = latitude.shape
     t = np.repeat(np.arange(len(time)), shape[1])
@@ -378,7 +378,7 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Return the corners' weights (M, 4) and validity: four good corners, or three around the position."""
+    """Return weights of the corners (M, 4), and whether four good corners, or three around the position, exist (M,)."""
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)
@@ -395,7 +395,7 @@ def _weights(
 def _values(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
-    """Vertical delay and variance of corners (M, 4), and where type 10 is in force (M,); t is the epoch of each."""
+    """Return vertical delay and variance of corners (M, 4), and where type 10 is in force (M,), at epochs `t`."""
     newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
     of_ten, delays, ten = newest[t], grid.delays, tables.degradation
     variance = _GIVE_VARIANCE[delays["givei"][row]]

@@ -17,16 +17,16 @@ Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections
 #: Preambles of successive messages: three alternating patterns of eight bits (DO-229D, A.4.3.1); on L5 six patterns of
 #: four bits.
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
-#: Preamble, type and data; bytes of a message in `SbasMessages.bits`.
+#: Number of bits of preamble, type and data; bytes of a message in `SbasMessages.bits`.
 DATA_BITS: Final = 226
 ROW_BYTES: Final = 32
-#: The same message twice within this time was forwarded by two receivers.
+#: A message that occurs twice within this time was forwarded by two receivers.
 _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
 
 def message_parity(bits: Bytes) -> Integers:
-    """Parity that belongs to the 226 data bits of each message, shape (N,); `bits` (N, 32) from the first bit on."""
-    # Six zero bits in front make whole bytes of 226 bits and do not change the parity.
+    """Compute the parity of the first 226 bits of each message, shape (N,); `bits` have shape (N, 32)."""
+    # Six leading zero bits extend 226 bits to whole bytes and do not change the parity.
     data = bits[:, :29].astype(np.int64)
     before = np.concatenate([np.zeros((len(bits), 1), dtype=np.int64), data[:, :-1]], axis=1)
     rows = ((before << 2) & 0xFF | data >> 6).astype(np.uint8)
@@ -35,13 +35,13 @@ def message_parity(bits: Bytes) -> Integers:
 
 
 def carried_parity(bits: Bytes) -> Integers:
-    """Return the 24 bits after the data bits of each message, shape (N,)."""
+    """Return the received parity, the 24 bits after the data bits of each message, shape (N,)."""
     tail = bits[:, 28:32].astype(np.int64)
     return ((tail[:, 0] & 0x3F) << 18) | (tail[:, 1] << 10) | (tail[:, 2] << 2) | (tail[:, 3] >> 6)
 
 
 def with_parity(bits: Bytes) -> Bytes:
-    """Return the same messages with the parity that belongs to them, shape (N, 32); the bits after it are zero."""
+    """Return the messages with the computed parity, shape (N, 32); the bits after the parity are zero."""
     complete = np.zeros((len(bits), ROW_BYTES), dtype=np.uint8)
     complete[:, :29] = bits[:, :29]
     parity = message_parity(complete)
@@ -53,7 +53,7 @@ def with_parity(bits: Bytes) -> Bytes:
 
 
 def preamble_number(bits: Bytes, band: Band) -> Integers:
-    """Index of each preamble in the cycle of three, -1 for anything else, shape (N,)."""
+    """Return the index of each message's preamble in `PREAMBLES` of its band, -1 for other values, shape (N,)."""
     number = np.full(len(bits), -1, dtype=np.int64)
     first = bits[:, 0] if band == "L1" else bits[:, 0] >> 4
     for i, preamble in enumerate(PREAMBLES[band]):
@@ -62,7 +62,7 @@ def preamble_number(bits: Bytes, band: Band) -> Integers:
 
 
 def message_type(bits: Bytes, band: Band = "L1") -> Integers:
-    """Types, the six bits after the preambles, shape (N,)."""
+    """Return the message types, the six bits after the preambles, shape (N,)."""
     second = bits[:, 1].astype(np.int64)
     return second >> 2 if band == "L1" else (bits[:, 0].astype(np.int64) & 15) << 2 | second >> 6
 
@@ -71,17 +71,17 @@ def message_type(bits: Bytes, band: Band = "L1") -> Integers:
 class SbasMessages(RowArrays, NotebookTable):
     """Messages that passed every check, N rows in the order of their reception."""
 
-    #: GPS time at which the message was completely received: from then on it may be used; shape (N,).
+    #: GPS time at which the message was completely received, from which it is used; shape (N,).
     time: Datetimes
     prn: Integers  #: Shape (N,).
     type: Integers  #: 0 to 63, shape (N,).
-    #: The message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains
-    #: it, then zeros; shape (N, 32).
+    #: Message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains it,
+    #: then zeros; shape (N, 32).
     bits: Bytes
-    parity_bits: Integers  #: Parity bits in the source, which were checked: 24, 6 or 0; shape (N,).
-    source: Integers  #: Row of `sources`, shape (N,).
+    parity_bits: Integers  #: Number of parity bits in the source, which were checked: 24, 6 or 0; shape (N,).
+    source: Integers  #: Index in `sources`, shape (N,).
     line: Integers  #: 1-based line of the file, shape (N,).
-    sources: tuple[str, ...] = ()  #: Files.
+    sources: tuple[str, ...] = ()  #: Names of the files.
     #: Messages left out, by reason: "parity", "preamble", "line", "duplicate".
     rejected: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  #: Warnings for the reader of the results, one sentence each.
@@ -95,11 +95,11 @@ class SbasMessages(RowArrays, NotebookTable):
 
     @property
     def prns(self) -> tuple[int, ...]:
-        """PRNs that sent any message, rising."""
+        """PRNs with messages, in ascending order."""
         return tuple(int(prn) for prn in np.unique(self.prn))
 
     def describe_choice(self, prn: int) -> str:
-        """Return a sentence on a requested PRN; ValueError where none of the messages is of it."""
+        """Return a sentence on a requested PRN; raise ValueError if it has no message."""
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
@@ -111,13 +111,13 @@ class SbasMessages(RowArrays, NotebookTable):
 
     @classmethod
     def none(cls) -> SbasMessages:
-        """No message."""
+        """Return an empty table of messages."""
         time, number = np.zeros(0, dtype="datetime64[ns]"), np.zeros(0, dtype=np.int64)
         bits = np.zeros((0, ROW_BYTES), dtype=np.uint8)
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
     def merge(self, later: SbasMessages) -> SbasMessages:
-        """Return these messages and others, in the order of reception; counts are added, repeated notes dropped."""
+        """Return these and later messages in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
         both = join_rows([self, later])
@@ -135,9 +135,9 @@ class SbasMessages(RowArrays, NotebookTable):
         return joined.take(np.argsort(both.time, kind="stable"))
 
     def repeated(self) -> Masks:
-        """Return messages that another receiver has forwarded before: the same bits of one PRN within 1 s, shape (N,).
+        """Return messages already forwarded by another receiver (the same bits of one PRN within 1 s), shape (N,).
 
-        The preambles of messages that follow each other differ, so that no GEO sends the same 250 bits twice in a row.
+        The preambles of successive messages differ, so no GEO sends the same 250 bits twice in succession.
         """
         again = np.zeros(len(self), dtype=bool)
         order = np.lexsort((self.time, self.prn))

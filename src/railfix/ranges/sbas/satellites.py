@@ -1,4 +1,4 @@
-"""Corrections of satellites in force at epochs: fast, long-term, degradation, sigma UDRE (DO-229D, A.4.4 and A.4.5)."""
+"""Satellite corrections in force at epochs: fast, long-term, degradation, sigma UDRE (DO-229D, A.4.4 and A.4.5)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR, TIMEOUT_S, SbasLimits
 from railfix.ranges.sbas.tables import ALARM, SatelliteTables, Series
 
-#: A rate may be applied to a fast correction for this multiple of the time between the two corrections it was computed
-#: from.
+#: A range rate is applied for at most this multiple of the time between the two fast corrections that determine it.
 _RATE_REACH: Final = 8.0
 _ACCELERATION: Final = np.array(FAST_DEGRADATION_MPS2)
 _FACTOR: Final = np.array(SERVICE_FACTOR)
@@ -33,16 +32,16 @@ class FastInForce:
     timed_out: Masks
     no_factor: Masks
     no_rate: Masks
-    udrei: Integers  #: -1 without one.
+    udrei: Integers  #: UDREI, -1 without one.
     correction_m: Floats
     rate_mps: Floats
-    #: Age of the fast correction (A.4.5.1.1). a Ifc / 4, or its replacement after an alarm, and the time between the
-    #: two corrections; 0 and infinite where the rate does not degrade (A.4.5.1.2).
+    #: Degradation by the age of the correction (A.4.5.1.1). Degradation of the range rate per second, and the time
+    #: between the two corrections of the rate; 0 and infinite where the rate does not degrade (A.4.5.1.2).
     growth_m: Floats
     rate_growth_mps: Floats
     rate_span_s: Floats
-    since_s: Floats  #: Since the time of applicability.
-    aged: Masks  #: Older than precision approach allows.
+    since_s: Floats  #: Time since the time of applicability.
+    aged: Masks  #: Corrections older than the time-out of precision approach.
 
 
 def fast_in_force(
@@ -80,7 +79,10 @@ def fast_in_force(
 def _factors(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Integers, Floats, Masks]:
-    """Return the indicator of type 7, the largest of its message, latency; the worst where type 7 is missing."""
+    """Return the indicator of type 7, the largest indicator of its message, and the latency; and where it is missing.
+
+    Both indicators are the worst where type 7 is missing.
+    """
     table = tables.fast_degradation
     row, worst = table.newest(number, time), len(_ACCELERATION) - 1
     active = table.in_force(row, time, stop, limits.timeout_s("fast_degradation"))
@@ -101,9 +103,9 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range-rate correction, degradation per second, time between its corrections, and where it is missing.
+    """Return the range-rate correction, its degradation per second, time between its corrections, and where missing.
 
-    After an alarm (IODF 3) the earlier of the two is the correction nearest to half the time-out before.
+    After an alarm (IODF 3) the earlier correction is the one nearest to half the time-out before the newest.
     """
     zero = np.zeros(row.shape)
     if limits.range_rate == "off":
@@ -126,7 +128,7 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Return the earlier row of the satellite whose time is nearest to `before` ahead of a row; the later of two."""
+    """Return the earlier row of the satellite that is nearest to the time `before` ahead of a row; the later of two."""
     wanted = fast.time[row] - before
     first = fast["fresh"][row]
     low = np.maximum(fast.newest(fast.series[row], wanted), first)
@@ -137,7 +139,7 @@ def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> In
 
 @dataclass(frozen=True, kw_only=True)
 class LongTermInForce:
-    """Active long-term corrections, all (T, K): row in the table, row of the record; reason where missing."""
+    """Active long-term corrections, all (T, K): row in the table, row of the record, and reasons why one is missing."""
 
     row: Integers
     record: Integers
@@ -155,7 +157,7 @@ def long_term_in_force(
     stop: Datetimes,
     navigation: Navigation | None,
 ) -> LongTermInForce:
-    """Find the newest long-term corrections whose issue of data a record has; satellites of SBAS itself need none.
+    """Find the newest long-term corrections whose issue of data a record has; SBAS satellites do not require one.
 
     `number`, shape (K,), is the number in the PRN mask. Without `navigation` the newest correction is used unchecked.
     """
@@ -206,7 +208,7 @@ def covariance_in_force(
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """Degradation terms [m], all (T, K); `missing` where type 10 is, `rss` where squares are summed."""
+    """Degradation terms [m], all (T, K); `missing` where there is no type 10, `rss` where squares are summed."""
 
     fast_m: Floats
     rate_m: Floats
@@ -250,7 +252,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the growth of long-term corrections (A.4.5.1.3), and which are older than precision approach allows."""
+    """Return the degradation of long-term corrections (A.4.5.1.3), and which exceed the precision-approach time-out."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
@@ -266,7 +268,7 @@ def _long_term_growth(
 
 
 def delta_udre_covariance(tables: SatelliteTables, time: Datetimes, row: Integers, line_of_sight: Floats) -> Floats:
-    """Factor on sigma UDRE along lines of sight (A.4.4.16), 1 without a covariance."""
+    """Return the factor on sigma UDRE along lines of sight (A.4.4.16); 1 without a covariance."""
     table, ten = tables.covariance, tables.degradation
     newest = ten.newest(0, time)
     constant = np.where(newest >= 0, ten["covariance"][newest], 0.0)
@@ -286,11 +288,10 @@ class ServiceTable:
         self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
-        """Return the factor on sigma UDRE at positions, NaN without type 27, and where a set is incomplete, shapes
-        (T,).
+        """Return the factor on sigma UDRE at positions, NaN without type 27, and where a set is incomplete, shape (T,).
 
-        The newest complete set of one issue is used; inside several regions the highest priority, of equal ones the
-        smallest factor; outside all, the factor outside.
+        The newest complete set of one issue is used. Inside several regions the factor of the highest priority applies,
+        or the smallest factor of equal priorities; outside all regions the factor of the outside applies.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1
@@ -329,7 +330,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return whether positions are in a region: a rectangle by corners, or its half at (latitude 1, longitude 2)."""
+    """Return whether positions are in a region: a rectangle, or its triangular half at (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

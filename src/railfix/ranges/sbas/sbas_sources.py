@@ -1,7 +1,7 @@
 """SBAS on L1 and on L5 as sources of corrections.
 
-The variances are summed as in DO-229D (J.2.2), without the airborne receiver's: ``sigma_flt^2 + sigma_UIRE^2 +
-sigma_tropo^2``; multipath and receiver noise on a railway are added to it (P1 2.4).
+The variances are summed as in DO-229D (J.2.2), without that of the airborne receiver: ``sigma_flt^2 + sigma_UIRE^2 +
+sigma_tropo^2``; the variance of multipath and receiver noise on a railway is added (P1 2.4).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class SbasSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites with long-term and fast corrections, by the records that they are for."""
+        """Return the satellites with long-term and fast corrections, from the records to which they refer."""
         fixes = self.corrections.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -46,7 +46,7 @@ class SbasSource:
         return SourceSatellites(states, np.nan_to_num(fixes.fast_m), lacking, fixes)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays by the ionospheric grid and DO-229D's troposphere."""
+        """Return the delays of the ionospheric grid and of the troposphere model of DO-229D."""
         fixes = satellites.fixes
         assert isinstance(fixes, SatelliteCorrections)
         delays = sbas_delays(self.corrections, fixes, time, seen, channels.frequency_hz)
@@ -55,7 +55,7 @@ class SbasSource:
 
 @dataclass(frozen=True, kw_only=True)
 class DfmcSource:
-    """SBAS on L5 (EUROCAE ED-259A), for ionosphere-free codes; the modelled delays serve the screens, and cancel."""
+    """SBAS on L5 (EUROCAE ED-259A), for ionosphere-free codes; the ionosphere is modelled for the screens only."""
 
     models: BroadcastSource
     service: DfmcService
@@ -69,7 +69,7 @@ class DfmcSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites with the corrections applied, by the records that they are for."""
+        """Return the satellites with the corrections applied, from the records to which they refer."""
         fixes = self.service.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -79,14 +79,14 @@ class DfmcSource:
         return SourceSatellites(states, None, lacking, fixes)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the modelled ionosphere and DO-229D's troposphere, with the sigmas of the corrections."""
+        """Return the modelled ionosphere and the troposphere of DO-229D, with the sigmas of the corrections."""
         fixes = satellites.fixes
         assert isinstance(fixes, DfmcCorrections)
         delays = dfmc_delays(fixes, time, seen, self.models.delays(time, channels, satellites, seen).delays)
         return SourceDelays(delays, delays.sigma_m, delays.sigma_m, np.zeros(delays.sigma_m.shape))
 
 
-SBAS_SIGNAL: Final = "1C"  #: Signal that the corrections are for: GPS L1 C/A, as RINEX 3 calls it.
+SBAS_SIGNAL: Final = "1C"  #: Signal to which the corrections refer: GPS L1 C/A, in RINEX 3 notation.
 
 _REASON_OF: Final = {
     **dict.fromkeys(SatelliteState, Reason.SBAS_NO_CORRECTION),
@@ -110,14 +110,14 @@ _DFMC_REASON_OF: Final = {
     DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
     DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
 }
-#: Reasons of the states of SBAS on L5.
+#: Reason of each `DfmcState`, by its number.
 DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
 
 
 def apply_dfmc(
     states: SatelliteStates, fixes: DfmcCorrections, satellite: Strings, signal: Strings
 ) -> tuple[SatelliteStates, Bits]:
-    """Return satellites with the corrections of SBAS on L5 applied, and the reasons of those without, shape (T, K)."""
+    """Return satellites with the corrections of SBAS on L5 applied, and the reasons of the others, shape (T, K)."""
     covered = [code in DFMC_SIGNALS.get(name[0], ((),))[0] for name, code in zip(satellite, signal, strict=True)]
     moved, clock = states.position_ecef_m + fixes.position_m, states.clock_m + fixes.clock_m
     reason = np.where(covered, DFMC_REASONS[fixes.state], int(Reason.SBAS_NOT_COVERED))
@@ -125,9 +125,10 @@ def apply_dfmc(
 
 
 def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelled: Delays) -> Delays:
-    """Troposphere of DO-229D, with the sigma of corrected ionosphere-free codes; the modelled ionosphere cancels there.
+    """Return the troposphere of DO-229D and the modelled ionosphere, with the sigma of corrected ionosphere-free codes.
 
-    ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without the receiver's.
+    ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without receiver noise. The
+    modelled ionosphere cancels in these codes.
     """
     sight = seen.satellite_ecef_m - seen.receiver_ecef_m[:, None, :]
     along = fixes.sigma_along_m(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
@@ -142,7 +143,7 @@ def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelle
 
 
 def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Satellites with long-term corrections applied to their records, and reasons of the others (T, K)."""
+    """Return satellites with long-term corrections applied, and the rejection reasons of the others, shape (T, K)."""
     moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
     clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
     return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]
@@ -151,7 +152,7 @@ def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tup
 def sbas_delays(
     sbas: SbasCorrections, fixes: SatelliteCorrections, time: Datetimes, seen: SeenFrom, frequency_hz: Floats
 ) -> Delays:
-    """Delays from the SBAS grid and DO-229D's troposphere, with the sigma of the corrected codes; others rejected."""
+    """Return delays of the SBAS grid and of the DO-229D troposphere, with the sigma of corrected codes; else NaN."""
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
     reason = np.zeros(shape, dtype=np.int64)

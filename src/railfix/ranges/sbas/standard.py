@@ -1,4 +1,4 @@
-"""Names, time-outs and variances of RTCA DO-229D, the settings that choose between them, and the results."""
+"""Names, time-outs and variances of RTCA DO-229D, the settings that select them, and classes of results."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ GEO_PRNS: Final = (*range(120, 159), *range(183, 203))
 
 
 def system_name(prn: int) -> str:
-    """Return the name of the system that a PRN belongs to ("MSAS"); "SBAS" where it is not assigned."""
+    """Return the name of the system of a PRN ("MSAS"); "SBAS" for a PRN that is not assigned."""
     return _SYSTEM_OF.get(prn, "SBAS")
 
 
 def mask_satellite(number: int) -> str:
-    """Return the satellite of a PRN mask number (DO-229D, table A-1; QZSS by IS-QZSS L1-SAIF), else ""."""
+    """Return the satellite of a PRN mask number (DO-229D, table A-1; QZSS: IS-QZSS L1-SAIF); empty without one."""
     if 1 <= number <= 37:
         return f"G{number:02d}"
     if 38 <= number <= 61:
@@ -50,8 +50,8 @@ def mask_satellite(number: int) -> str:
     return ""
 
 
-#: Seconds since reception for which a message may be used, (precision approach, en route to
-#: non-precision approach) (DO-229D, table A-25). Fast corrections have `FAST_TIMEOUT_S`.
+#: Time since reception for which a message may be used [s], for precision approach, and for en route to non-precision
+#: approach (DO-229D, table A-25). Fast corrections have `FAST_TIMEOUT_S`.
 TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
     "mask": (600.0, 600.0),
     "udrei": (12.0, 18.0),
@@ -85,31 +85,31 @@ GIVE_VARIANCE_M2: Final = (
 )  # fmt: skip
 #: Factor on sigma UDRE by indicator of message type 27 (DO-229D, table A-20).
 SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0, 40.0, 50.0, 100.0)
-#: UDREI from which a satellite is not monitored, and must not be used.
+#: UDREI of a satellite that is not monitored, and of a satellite that must not be used.
 NOT_MONITORED: Final = 14
 DO_NOT_USE: Final = 15
 STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for this time [s] (DO-229D, A.4.4.1).
-#: No message older than this counts, however long type 6 renews a fast correction: the longest time-out but for regions
-#: of service [s].
+#: Messages older than this are not used, even if type 6 renews a fast correction: the longest time-out except that of
+#: service regions [s].
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
-#: Types that affect later messages for a further period of that length: stops and masks.
+#: Types that affect messages received later (stops and masks), and are therefore kept for twice that time.
 LEANT_ON: Final = (0, 1, 18)
 INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 
 
 class SbasLimits(Settings):
-    """How SBAS messages are used."""
+    """Settings of the use of SBAS messages."""
 
-    #: Time-outs: for precision approach (shorter, the default), or for en route to non-precision approach.
+    #: Time-outs of precision approach (shorter), or of en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
     type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops use of its GEO for 60 s, or is read as type 2.
-    range_rate: Literal["mops", "off"] = "mops"  #: Fast corrections change with their rate (DO-229D, A.4.4.3).
-    #: Use of a satellite without degradation data: rejected, or used with the shortest time-out and its sigma increased
-    #: by 8 m (DO-229D, J.2.2).
+    range_rate: Literal["mops", "off"] = "mops"  #: Range-rate part of fast corrections (DO-229D, A.4.4.3), or none.
+    #: Satellites without degradation data are rejected, or used with the shortest time-out and a sigma increased by 8 m
+    #: (DO-229D, J.2.2).
     incomplete: Literal["reject", "inflate"] = "reject"
     #: Largest UDREI used; None is 11 for precision approach and 13 en route.
     max_udrei: int | None = Field(default=None, ge=0, le=13)
-    message_s: float = Field(default=1.0, ge=0.0, le=2.0)  #: [s] From the first bit of a message to its reception.
+    message_s: float = Field(default=1.0, ge=0.0, le=2.0)  #: Time from the first bit of a message to its reception.
 
     def timeout_s(self, kind: str) -> float:
         """Return the time-out of a kind of message in this mode [s]."""
@@ -142,7 +142,7 @@ class SatelliteState(IntEnum):
 
 
 class IonosphereState(IntEnum):
-    """Whether the delay at a pierce point is known, or the reason why not."""
+    """State of the delay at a pierce point: known, or the reason why it is not."""
 
     OK = 0
     GEO_STOPPED = 1
@@ -154,25 +154,25 @@ class IonosphereState(IntEnum):
 
 
 def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: int) -> Integers:
-    """Return the value of the first condition that is true, any shape."""
+    """Return the value of the first condition that is true, any shape; `otherwise` where none is."""
     conditions, values = zip(*cases, strict=True)
     return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SatelliteCorrections(FrozenArrays):
-    """Corrections of T epochs by K satellites; NaN and -1 where `state` is not OK, but for `udrei` and `iode`.
+    """Corrections of T epochs by K satellites; NaN and -1 where `state` is not OK, except in `udrei` and `iode`.
 
     The corrected code is ``code + fast_m``, with the satellite at ``broadcast + position_m`` and
     its clock ``broadcast + clock_s``, both of the record with the issue of data `iode`.
     """
 
     state: Integers  #: `SatelliteState`, shape (T, K).
-    fast_m: Floats  #: To be added to the code, range-rate part included; shape (T, K).
+    fast_m: Floats  #: Correction to be added to the code, including its range-rate part; shape (T, K).
     rate_mps: Floats  #: Range-rate correction, shape (T, K).
     position_m: Floats  #: Shape (T, K, 3).
     clock_s: Floats  #: Shape (T, K).
-    iode: Integers  #: Issue of data of the long-term correction taken, -1 without one; shape (T, K).
+    iode: Integers  #: Issue of data of the long-term correction used, -1 without one; shape (T, K).
     record: Integers  #: Row of `navigation.kepler` with that issue, -1 without navigation data; shape (T, K).
     udrei: Integers  #: -1 where none was received, shape (T, K).
     sigma_udre_m: Floats  #: Shape (T, K).
@@ -181,9 +181,9 @@ class SatelliteCorrections(FrozenArrays):
     rate_growth_m: Floats
     long_term_growth_m: Floats
     en_route_m: Floats
-    inflated: Masks  #: Degradation data are missing: sigma is sigma UDRE plus 8 m; shape (T, K).
-    rss: Masks  #: The terms are summed as squares (RSS_UDRE of type 10), shape (T, K).
-    covariance: Integers  #: Row of the covariance (type 28) in force, -1 without; shape (T, K).
+    inflated: Masks  #: True where degradation data are missing and sigma is sigma UDRE plus 8 m, shape (T, K).
+    rss: Masks  #: True where the squares of the terms are summed (RSS_UDRE of type 10), shape (T, K).
+    covariance: Integers  #: Row of the covariance (type 28) in force, -1 without one; shape (T, K).
 
     def take_satellites(self, which: Integers) -> SatelliteCorrections:
         """Return the corrections of some satellites, by index."""
@@ -202,13 +202,13 @@ class SatelliteCorrections(FrozenArrays):
 
 @dataclass(frozen=True, kw_only=True)
 class IonosphereDelays(FrozenArrays):
-    """Delays of T epochs by K satellites from the grid."""
+    """Ionospheric delays of T epochs by K satellites from the grid."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).
-    delay_m: (
-        Floats  #: Slant delay on L1, to be subtracted from the code; other carriers scale by (f1/f)^2; shape (T, K).
-    )
-    sigma_uire_m: Floats  #: Shape (T, K).
+    #: Slant delay on L1, to be subtracted from the code (times (f1/f)^2 on other carriers), and its standard deviation;
+    #: NaN where unknown; shape (T, K).
+    delay_m: Floats
+    sigma_uire_m: Floats
     #: Pierce point, shape (T, K).
     latitude_deg: Floats
     longitude_deg: Floats

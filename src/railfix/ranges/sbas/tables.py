@@ -1,4 +1,4 @@
-"""Messages of one GEO by satellite and time of reception: slots resolved by the PRN mask, ready to be searched."""
+"""Tables of one GEO's messages by satellite and time of reception, with slots resolved by the PRN mask."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from railfix.ranges.sbas.decode import (
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S, SbasLimits
 
-LONG_AGO: Final = GPS_EPOCH  #: Before every message.
+LONG_AGO: Final = GPS_EPOCH  #: Time before every message.
 ALARM: Final = 3  #: IODF of an alarm.
 #: Longest time that is resolved [ms]: 278 years, all that `datetime64[ns]` reaches.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
 _OLDEST_MS: Final = np.int64(1000.0 * OLDEST_S)
-_NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, which no search looks for.
+_NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, which no search returns.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
     """Rows of many series (satellites, grid points ...) sorted by series and time of reception.
 
-    An empty table has one row that is never used, so that `columns` can be indexed with -1. A row's time is rounded
-    up to the millisecond, an instant's down: no row is used before it was received.
+    An empty table has one row that is never used, so that `columns` can be indexed with -1. Times of rows are rounded
+    up to the millisecond, and instants down, so that no row is used before it was received.
     """
 
     series: Integers  #: Shape (n,).
     time: Datetimes  #: Shape (n,).
     columns: Mapping[str, NDArray[Any]]  #: Shape (n, ...).
-    key: Integers  #: Series and time in one rising number, shape (n,).
+    key: Integers  #: Series and time in one number, in ascending order; shape (n,).
 
     @classmethod
     def of(cls, series: Integers, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Series:
@@ -67,7 +67,7 @@ class Series:
         return bool(self.series[0] == _NO_SERIES)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Column of that name."""
+        """Return the column of a name."""
         return self.columns[name]
 
     def add_columns(self, **columns: NDArray[Any]) -> Series:
@@ -75,7 +75,7 @@ class Series:
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
-        """Find the newest row of each series (-1: none) at or before each instant; -1 without, or beyond `OLDEST_S`."""
+        """Return the newest row of each series at or before each instant; -1 without one, or older than `OLDEST_S`."""
         since = (time - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64) // _MS
         wanted_series, wanted_time = np.broadcast_arrays(series, np.clip(since, 0, _SPAN - 1))
         wanted = wanted_series * _SPAN + wanted_time
@@ -84,11 +84,11 @@ class Series:
         return np.where(known, at, -1).astype(np.int64)
 
     def received(self, row: Integers) -> Datetimes:
-        """Return the time of reception of rows; a time long ago for -1."""
+        """Return the time of reception of rows; `LONG_AGO` for row -1."""
         return np.where(row >= 0, self.time[row], LONG_AGO)
 
     def in_force(self, row: Integers, time: Datetimes, stop: Datetimes, limit_s: float) -> Masks:
-        """Return whether rows, -1 for none, came after a stop of the GEO and are not older than a limit at instants."""
+        """Return whether rows (-1 for none) were received after a stop of the GEO, and at most `limit_s` before."""
         received = self.received(row)
         return np.asarray((row >= 0) & (received > stop) & (seconds(time - received) <= limit_s))
 
@@ -103,7 +103,7 @@ class Stops:
         self.time = messages.time[stops]
 
     def last(self, time: Datetimes) -> Datetimes:
-        """Return the newest stop at or before instants; long ago where there was none."""
+        """Return the newest stop at or before instants; `LONG_AGO` where there was none."""
         if not len(self.time):
             return np.full(np.shape(time), LONG_AGO)
         at = np.searchsorted(self.time, time, side="right") - 1
@@ -111,7 +111,7 @@ class Stops:
 
 
 class MaskTable:
-    """Type 1: the satellite of each slot when a message with an IODP came."""
+    """PRN masks (type 1), which give the satellite of each slot of a message with an IODP."""
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
         masks = prn_masks(messages)
@@ -125,7 +125,7 @@ class MaskTable:
         self._stops = stops
 
     def resolve(self, iodp: Integers, slot: Integers, time: Datetimes) -> Integers:
-        """Return the mask numbers of slots of messages, 0 where the mask leaves one out, -1 without an active mask."""
+        """Return the mask numbers of slots of messages; 0 for an empty slot, -1 without an active mask."""
         mask = self.by_issue.newest(iodp, time)
         return np.where(self._in_force(self.by_issue, mask, time), self.by_issue["number"][mask, slot], -1)
 
@@ -137,13 +137,13 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return whether there is an active mask (T,), and whether the newest names the satellites (T, K)."""
+        """Return whether there is an active mask (T,), and whether the newest contains the satellites (T, K)."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
 
     def current(self, slot: Integers, time: Datetimes) -> Integers:
-        """Return the mask numbers of slots by the newest mask of any issue, for messages that name none; -1 without."""
+        """Return the mask numbers of slots by the newest mask, for messages without an IODP; -1 without a mask."""
         rows = self.by_issue.newest(np.arange(4)[None, :], time[:, None])
         issue = np.argmax(self.by_issue.received(rows), axis=1)
         best = np.take_along_axis(rows, issue[:, None], axis=1)[:, 0]
@@ -151,13 +151,13 @@ class MaskTable:
 
 
 class SatelliteTables:
-    """Everything one GEO sent about satellites, by number of the PRN mask.
+    """All messages of one GEO on satellites, by number of the PRN mask.
 
     `fast`: `fresh` is the first row since the satellite was last out of use. `udre`: UDREI from fast corrections and
-    type 6; `grows_from` is the reception of the message that its error and the time-out are counted from.
-    `fast_degradation` (type 7): `shortest` is the smallest time-out of the message's satellites. `long_term`: `other`
-    is the last row with another IODE, -1 without. `covariance` is type 28, `degradation` type 10; `unused` counts
-    corrections that no mask, or no fast correction, fits.
+    type 6; `grows_from` is the reception time from which the degradation and the time-out are counted.
+    `fast_degradation` (type 7): `shortest` is the indicator of the smallest time-out of the message's satellites.
+    `long_term`: `other` is the last row with another IODE, -1 without one. `covariance` is type 28, `degradation`
+    type 10; `unused` counts corrections without a matching mask or fast correction.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:
@@ -176,15 +176,16 @@ class SatelliteTables:
         self.degradation = Series.of(np.zeros(len(row), dtype=np.int64), messages.time[row], ten)
 
     def _by_satellite(self, kind: str, messages: SbasMessages, decoded: Decoded) -> Series:
-        """Return the rows of satellites in an active mask; the others are counted."""
+        """Return the rows of satellites in an active mask; count the rows without a mask of their issue."""
         time = messages.time[decoded["row"]]
         number = self.masks.resolve(decoded["iodp"], decoded["slot"], time)
         self.unused[f"{kind} without a mask of their IODP"] += int((number < 0).sum())
         return Series.of(np.where(number > 0, number, -1), time, decoded)
 
     def _udre(self, messages: SbasMessages) -> Series:
-        """Fast corrections have their own UDREI; type 6 updates the UDREI of the corrections with its IODF, an alarm
-        updates all.
+        """Return the UDREI of fast corrections, and those of type 6.
+
+        Type 6 updates the UDREI of the corrections with its IODF; an alarm updates those of all corrections.
         """
         fast, six = self.fast, decode(messages, 6)
         time = np.repeat(messages.time[six["row"]], SLOTS)
@@ -205,7 +206,7 @@ class SatelliteTables:
         )
 
     def _fast_degradation(self, messages: SbasMessages) -> Series:
-        """Type 7, one row per satellite."""
+        """Return the rows of type 7, one per satellite."""
         seven = decode(messages, 7)
         count = len(seven["row"])
         rows = {name: np.repeat(seven[name], SLOTS) for name in ("row", "iodp", "latency_s")}
@@ -226,14 +227,14 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add the row where each series begins: the first of its satellite, or the row after one that was not monitored."""
+    """Add where the run of each row begins: at the satellite's first row, or after a row that was not monitored."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
 
 
 def _with_other(table: Series) -> Series:
-    """Add the number of the last row of the same satellite with another issue of data."""
+    """Add the index of the last row of the same satellite with another issue of data; -1 without one."""
     number, iode = table.series, table["iode"]
     changed = np.ones(len(number), dtype=bool)
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])

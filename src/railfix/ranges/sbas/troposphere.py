@@ -1,4 +1,4 @@
-"""Tropospheric delay and its standard deviation of RTCA DO-229D (A.4.2.4), which SBAS users apply."""
+"""Tropospheric delay and its standard deviation for SBAS users, by RTCA DO-229D (A.4.2.4)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from railfix.core.arrays import Datetimes, Floats
 
 #: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravity [m/s^2].
 _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
-_RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of its tables [deg].
-#: Pressure [mbar], temperature [K], vapour pressure [mbar], lapse of temperature [K/m] and of vapour (table A-2).
+_RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of table A-2 [deg].
+#: Mean, then seasonal variation, of pressure [mbar], temperature [K], vapour pressure [mbar], temperature lapse rate
+#: [K/m] and vapour lapse rate (table A-2).
 _RTCA_MEAN: Final = np.array(
     [
         [1013.25, 1017.25, 1015.75, 1011.75, 1013.00],
@@ -36,7 +37,7 @@ _LOWEST_DEG: Final = 2.0
 
 
 def rtca_mapping(elevation_deg: Floats) -> Floats:
-    """Return the slant over vertical tropospheric delay of DO-229D (A.4.2.4), any shape; NaN below 2 degrees."""
+    """Return the ratio of slant to vertical tropospheric delay of DO-229D (A.4.2.4), any shape; NaN below 2 degrees."""
     elevation = np.where(elevation_deg >= _LOWEST_DEG, elevation_deg, np.nan)
     low = 1.0 + 0.015 * np.maximum(0.0, 4.0 - elevation) ** 2
     return np.asarray(1.001 / np.sqrt(0.002001 + np.sin(np.radians(elevation)) ** 2) * low)
@@ -50,8 +51,8 @@ def rtca_troposphere_sigma_m(elevation_deg: Floats) -> Floats:
 def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
     """Return the tropospheric slant delay of RTCA DO-229D (A.4.2.4) by latitude and day of year, shape (T, K) [m].
 
-    Height above mean sea level is meant; the ellipsoidal one differs by 1 mm in 3 m. NaN below 2 degrees, and outside
-    -100 m to 10 km.
+    The model is for heights above mean sea level; with ellipsoidal heights the delay changes by 1 mm per 3 m. NaN below
+    2 degrees, and outside -100 m to 10 km.
     """
     year = time.astype("datetime64[Y]").astype("datetime64[ns]")
     day = (time - year) / np.timedelta64(1, "D") + 1.0
