@@ -21,13 +21,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-<<<<<<< HEAD
-#: Types of containers by their names in the file.
-=======
 from railfix.core.settings import Settings
 
-#: Containers by their names in the file.
->>>>>>> 0c2abf94 (A state of railfix live can have SBAS messages: --state with --sbas stream ended in a traceback)
+#: Container classes by their names in the file.
 _MAPPINGS: Final[dict[str, Any]] = {
     "dict": dict, "proxy": MappingProxyType, "counter": Counter, "ordered": OrderedDict,
 }  # fmt: skip
