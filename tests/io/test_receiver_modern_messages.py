@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from nav_pages import bcnav1_frame, bcnav2_messages, cnav_pages, fnav_pages, sbf_block, sbf_page, ubx_page
+from nav_pages import TOW_S, WEEK, bcnav1_frame, bcnav2_messages, cnav_pages, fnav_pages, sbf_block, sbf_page, ubx_page
 from railfix.core.timescale import from_week
 from railfix.gnss.navigation import Navigation
 from railfix.io import read_navigation
@@ -63,6 +63,7 @@ def test_cnav_pages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str)
         assert getattr(record, name)[0] == pytest.approx(CNAV[name], abs=half * np.pi), name
     assert record.health[0] == CNAV["health"]
     assert record.toc[0] == record.toe[0] == np.datetime64("2025-02-15T17:30:00", "ns")
+    assert record.transmitted[0] == from_week(WEEK, TOW_S)
     assert set(found.klobuchar) == {"G"}
 
 
@@ -74,7 +75,7 @@ def test_fnav_pages_give_the_record_they_are_made_of_and_cssrlibs(protocol: str)
     for name, value in expected.items():
         assert float(getattr(record, name)[0]) == pytest.approx(value, rel=1e-12, abs=1e-22), name
     assert record.data_source[0] == 0b1_0000_0010, "E5a, clock of E5a and E1"
-    assert record.accuracy_m[0] == pytest.approx(3.12)
+    assert (record.accuracy_m[0], record.transmitted[0]) == (pytest.approx(3.12), from_week(WEEK, TOW_S))
     assert record.health[0] == 1 << 4 | 0 << 3
 
 

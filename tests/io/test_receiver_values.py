@@ -625,6 +625,16 @@ def test_a_message_that_is_broken_counts_unless_it_lies_inside_another() -> None
         assert found.skipped_bytes == len(broken) * bad
 
 
+@pytest.mark.parametrize(
+    ("data", "protocol", "kind"),
+    [(frame(0x0A04, b""), "ubx", 0x0A04), (rtcm_message([(4095, 12)]), "rtcm3", 4095), (block(5914, b""), "sbf", 5914),
+     (b"$GPA*56\r\n", "nmea", 0)],
+)  # fmt: skip
+def test_the_shortest_message_of_a_protocol_is_found(data: bytes, protocol: str, kind: int) -> None:
+    found = frames_of(data)
+    assert (found.protocol.tolist(), found.kind.tolist(), found.skipped_bytes) == ([protocol], [kind], 0)
+
+
 @pytest.mark.requirement("B8")
 def test_a_log_of_signals_without_events_says_that_there_is_none() -> None:
     nothing = np.array([1, 0, 0, 0, 0, 0, 0, 0], dtype=np.uint8)

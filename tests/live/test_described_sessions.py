@@ -147,9 +147,8 @@ def _messages(_: Path) -> Iterator[Iterable[str]]:
         ):  # fmt: skip
             yield [_short(output(result(front=(own, track)), frame, settings, 1).message)]
     for kinds, motion in product(((), *((kind,) for kind in Kind)), (MotionState.NORMAL, MotionState.INERTIAL_SLIDE)):
-        yield [
-            _short(output(result(front=(single(), filtered(kinds=kinds, motion=motion))), frame, settings, 1).message)
-        ]
+        found = result(front=(single(), filtered(kinds=kinds, motion=motion)))
+        yield [_short(output(found, frame, settings, 1).message)]
     yield [_short(no_input_message(settings, frame, -1, 123_456_789))]
     vehicle = clean_trajectories()
     ends = ({}, {"front_offset_m": 7.5}, {"length_m": 40.0}, {"front_offset_m": 7.5, "length_m": 40.0})
@@ -227,36 +226,26 @@ def _console(_: Path) -> Iterator[Iterable[str]]:
         patch.setattr(console.time, "monotonic", lambda: now[0])
         metrics = Metrics(started=3.0)
         yield metrics.text().splitlines(), metrics.summary()
-        messages = [
-            SimpleNamespace(part=part, message=SimpleNamespace(status=status))
-            for part, status in zip(
-                ("both", "rows", "message"), [MessageStatus.POSITION] * 2 + [MessageStatus.NO_INPUT], strict=True
-            )
-        ]
+        kinds = {"both": MessageStatus.POSITION, "rows": MessageStatus.POSITION, "message": MessageStatus.NO_INPUT}
+        messages = [SimpleNamespace(part=part, message=SimpleNamespace(status=kinds[part])) for part in kinds]
         for at, taken in ((10.0, messages[:1]), (10.125, messages), (11.0, messages[1:])):
             now[0] = at
             metrics.took(0.3, taken)  # type: ignore[arg-type]
         metrics.epochs, metrics.skipped = {"paired": 3, "late": 1}, Counter({'a "b"\\': 2, "none": 0})
         metrics.lost["tcp://a"] = 1200
         metrics.hangups = 4
-        metrics.sinks = [
-            SimpleNamespace(name="json@-", dropped=5, failed=0),
-            SimpleNamespace(name="b", dropped=0, failed=6),
-        ]  # type: ignore[list-item]
+        sinks = (("json@-", 5, 0), ("b", 0, 6))
+        metrics.sinks = [SimpleNamespace(name=n, dropped=d, failed=f) for n, d, f in sinks]  # type: ignore[list-item]
         yield metrics.text().splitlines(), metrics.summary()
         yield from _watch(patch)
         yield from _observed(patch)
         said: list[str] = []
         check = iter([RailfixError("elsewhere")])
         patch.setattr(console, "ENOUGH_TO_STOP", 3)
-        patch.setattr(
-            console, "check_same_place", lambda _: (_ for _ in ()).throw(console.MismatchError(str(next(check))))
-        )
-        patch.setattr(
-            console.AntennaTally,
-            "add_conventional",
-            lambda tally, _: setattr(tally, "conventional", tally.conventional + 1),
-        )
+        thrown = (console.MismatchError(str(error)) for error in check)
+        patch.setattr(console, "check_same_place", lambda _: (_ for _ in ()).throw(next(thrown)))
+        added = lambda tally, _: setattr(tally, "conventional", tally.conventional + 1)  # noqa: E731
+        patch.setattr(console.AntennaTally, "add_conventional", added)
         places = PlaceWatch(said.append)
         for _ in range(5):
             places.take(SimpleNamespace(result=SimpleNamespace(antennas={"front": None})))  # type: ignore[arg-type]
@@ -317,18 +306,14 @@ def _watch(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
                 100.0 + second, kinds=(Kind.DOPPLER,) if second % 20 else (), speed=NAN if second == 5 else 1.0
             )
             before = len(said)
-            for result_ in (result(front=(own, track)), result(rear=(own, track)), result(front=(own, None))):
+            given = [{"front": (own, track)}] * 2 + [{"rear": (own, track)}, {"front": (own, None)}]  # counts once
+            for result_ in (result(**antennas) for antennas in given):
                 watch.take(LiveOutput(message=None, result=result_))  # type: ignore[arg-type]
             watch.take(LiveOutput(message=None, result=None))  # type: ignore[arg-type]
             if len(said) > before:
                 yield [f"table {table}, dark {dark}, {second} s: {said[before:]}"]
-        kept = (
-            len(watch._place_ns),
-            len(watch._speed_ns),
-            len(watch._samples),
-            len(watch._blocks),
-            len(watch._radar.radar),
-        )
+        stores = (watch._place_ns, watch._speed_ns, watch._samples, watch._blocks, watch._radar.radar)
+        kept = tuple(map(len, stores))
         watch.judge()
         yield [f"kept {kept}; {len(said)} sentences, the last {said[-1:]}"]
 
@@ -356,7 +341,6 @@ class Processor(SimpleNamespace):
             antennas[name] = single(place, seconds=seconds)
         received = SimpleNamespace(notes=self.notes_later.pop(0)) if self.notes_later else None
         state = State(received=received)  # type: ignore[arg-type]
-        return result(**{name: (own, None) for name, own in antennas.items()}), state
         return result(**{name: (own, None) for name, own in antennas.items()}), state
 
 
@@ -566,17 +550,8 @@ def _streams(_: Path) -> Iterator[Iterable[str]]:
     priors = [{"satellite_prior": dict(pairs)} for pairs in ((("G", 1e-5), ("E", 2e-5)), (("E", 2e-5), ("G", 1e-5)))]
     heads = [belongs_to({}, {"settings": parse_config({"risk": risk})}, ("front",)) for risk in priors]
     yield [f"the order of keys in settings changes nothing: {heads[0] == heads[1]}, {list(heads[0])}"]
-    for target in (
-        "json@-",
-        "json",
-        "@a",
-        "word@a",
-        "json@",
-        "json@udp://h",
-        "json@tcp-server://:5",
-        "json@udp://h:x",
-        "json@/",
-    ):
+    targets = "json@- json @a word@a json@ json@udp://h json@tcp-server://:5 json@udp://h:x json@/"
+    for target in targets.split():
         try:
             sink: Any = asyncio.run(open_sink(target))
             said = f"{sink.name} {sink.dropped} {sink.failed}"
@@ -604,11 +579,8 @@ def _prepared(_: Path) -> Iterator[Iterable[str]]:
         patch.setattr(warm_up, "subprocess", popen)
         patch.setattr(warm_up.kernels, "is_compiled", lambda: False)
         patch.setattr(warm_up.kernels, "record_compiled", lambda: calls.append("recorded"))
-        patch.setattr(
-            warm_up.kernels.off_tangent,
-            "forms_of_hypotheses",
-            _noted(calls, (np.zeros((1, 2)), np.zeros((1, 2, 3)), *np.zeros((3, 1, 2)))),
-        )
+        noted = _noted(calls, (np.zeros((1, 2)), np.zeros((1, 2, 3)), *np.zeros((3, 1, 2))))
+        patch.setattr(warm_up.kernels.off_tangent, "forms_of_hypotheses", noted)
         patch.setattr(warm_up.kernels.off_tangent, "risk_beyond", _noted(calls, 0.0))
         patch.setattr(warm_up.sys, "stderr", SimpleNamespace(isatty=lambda: True, write=calls.append))
         patch.setattr(warm_up.time, "monotonic", iter([1.0, 8.4]).__next__)
@@ -618,14 +590,10 @@ def _prepared(_: Path) -> Iterator[Iterable[str]]:
         yield [f"compiled {warm_up.prepare_kernels()}", *calls]
         logs = warm_up._read_logs()
         for name, log in logs.items():
-            yield [
-                name,
-                *describe(log.satellite, "satellites"),
-                *describe(np.nanmax(log.code_m, axis=0), "largest codes"),
-            ]
-        patch.setattr(
-            warm_up.Recursion, "run", lambda _self, _state, *more, **named: calls.append(f"run {more} {named}")
-        )
+            largest = describe(np.nanmax(log.code_m, axis=0), "largest codes")
+            yield [name, *describe(log.satellite, "satellites"), *largest]
+        ran = lambda _self, _state, *more, **named: calls.append(f"run {more} {named}")  # noqa: E731
+        patch.setattr(warm_up.Recursion, "run", ran)
         warm_up.compile_filter()
         yield calls
 

@@ -26,9 +26,9 @@ OK = b"HTTP/1.1 200 OK\r\n"
 
 
 def received(
-    answer: bytes, settings: LiveSettings = SETTINGS, most: int = 100, piece: int = 3
+    answer: bytes, settings: LiveSettings = SETTINGS, most: int = 100, piece: int = 3, hold_s: float = 0.0
 ) -> list[bytes | Connected | Lost]:
-    """What comes of a caster that sends an answer, in pieces of some bytes, and closes the connection."""
+    """What comes of a caster that sends an answer, in pieces of some bytes, and closes the connection after a time."""
 
     async def caster(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError), contextlib.closing(writer):
@@ -36,6 +36,7 @@ def received(
             for k in range(0, len(answer), piece):
                 writer.write(answer[k : k + piece])
                 await writer.drain()
+            await asyncio.sleep(hold_s)
 
     async def run() -> list[bytes | Connected | Lost]:
         server = await asyncio.start_server(caster, "127.0.0.1", 0)
@@ -60,7 +61,7 @@ def received(
 )
 def test_chunks_are_joined_however_the_header_is_written(coding: bytes) -> None:
     body = b"5\r\ncorre\r\n6;name=value\r\nctions\r\n0\r\n\r\n"
-    parts = received(OK + coding + b"\r\n\r\n" + body)
+    parts = received(OK + coding + b"\r\n\r\n" + body, hold_s=10.0)  # the last chunk ends the stream
     assert b"".join(part for part in parts if isinstance(part, bytes)) == b"corrections"
 
 

@@ -15,6 +15,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from io import StringIO
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -134,6 +136,7 @@ def test_readers_of_a_server_and_datagrams() -> None:
             lines = [await asyncio.wait_for(reader.readline(), 5) for _ in range(3)]
             udp.close()
             datagrams = [receiver.recv(2000) for _ in range(3)]
+            assert (server.dropped, server.failed, udp.dropped, udp.failed) == (0, 0, 0, 0)
             writer.close()
             server.close()
         return [from_json(line.decode()) for line in lines], [decode(data) for data in datagrams]
@@ -382,6 +385,23 @@ def test_an_output_on_a_full_disk_ends_alone(tmp_path: Path) -> None:
 
 
 # --- what a person sees -------------------------------------------------------
+
+
+@pytest.mark.parametrize(("terminal", "status"), [*product((True, False), repeat=2)])
+def test_a_status_line_is_drawn_on_a_terminal_alone_and_removed(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool, status: bool
+) -> None:
+    screen = StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: terminal)
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    log = SessionLog(None, LiveSettings(), status=status)
+    for write, words in ((log.show, "at 1 m"), (log.say, "a note"), (log.show, "at 2 m")):
+        write(words)
+    log.close()
+    text, drawn = screen.getvalue(), terminal and status
+    assert ("at 1 m" in text, "at 2 m" in text, "railfix live: a note\n" in text) == (drawn, drawn, True)
+    assert text.endswith("\x1b[1A\x1b[2K" if drawn else "a note\n"), "the line above the cursor is erased"
 
 
 def test_the_log_rotates(tmp_path: Path) -> None:

@@ -44,12 +44,13 @@ def _shown(case: Motion, limits: SlipLimits, body: np.ndarray | None, *, line: b
 
 
 def _slips(_: Path) -> Iterator[Iterable[str]]:
-    """Slip and slide on the level, noise, a curve with cant and a gyro, a wheel without pulses, each rule."""
+    """Slip and slide, one downhill, noise, a curve with cant and a gyro, a wheel without pulses, each rule."""
     slip = even_motion(16.0, 4.0, 2.0, 3.0)
     slide = Motion(slip.time_s, slip.speed, 40.0 - slip.wheel, slip.force, slip.sine)
     noisy = motion(20.0, [(8.0, 2.0, 0.3)], noise=0.05, pitching=0.003, seed=5)
     silent = Motion(slip.time_s, slip.speed, np.where(slip.time_s > 9.0, np.nan, slip.wheel), slip.force, slip.sine)
-    for name, case in (("slip", slip), ("slide", slide), ("noisy", noisy), ("silent", silent)):
+    hill = Motion(slip.time_s, slip.speed, slip.wheel, slip.force - 0.3923, slip.sine - 0.04)
+    for name, case in (("slip", slip), ("slide", slide), ("noisy", noisy), ("silent", silent), ("hill", hill)):
         for rule in ("map", "p2"):
             yield [f"{name} {rule}", *_shown(case, SlipLimits(rule=rule), None)]
     # body in a curve of 400 m with a cant of 3 degrees less than the speed asks for; then leaning beyond the limit
@@ -64,8 +65,8 @@ def _pulses(_: Path) -> Iterator[Iterable[str]]:
     gaps = np.array([0.0, 0.5, 0.25, 0.25, 0.1, 0.1, 0.1, 0.05, 0.05, 0.4, 0.1])
     time, number = START + timedelta(np.cumsum(gaps)), np.array([0, 1, 2, 3, 4, 5, 7, 8, 9, 8, 7])
     at = START + timedelta(np.arange(-0.1, 2.4, 0.1))
-    for direction in (np.zeros(11, int), np.array([1] * 9 + [-1] * 2)):
-        pulses = TachometerPulses(time=time, pulse=number, direction=direction)
+    for direction, some in ((np.zeros(11, int), 11), (np.array([1] * 9 + [-1] * 2), 11), (np.ones(1, int), 1)):
+        pulses = TachometerPulses(time=time[:some], pulse=number[:some], direction=direction)
         for limits in (TachometerLimits(), TachometerLimits(jitter_s=1e-3, resolution_s=1e-2, window_s=0.3)):
             yield [*describe(pulse_speeds(pulses, at, limits=limits)), *describe(distance_m(pulses, at, limits=limits))]
         lost, doubled = tooth_faults(pulses)

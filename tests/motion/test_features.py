@@ -80,20 +80,18 @@ def test_two_equal_features_in_the_window_are_refused() -> None:
 
 
 @pytest.mark.requirement("E3")
-def test_a_shifted_database_is_refused_by_the_gap() -> None:
+@pytest.mark.parametrize("share", [-1.05, -0.95, 0.95, 1.05])
+@pytest.mark.parametrize(("earlier_m", "way_m"), [(0.0, 1.0), (0.7, 1.0), (3.0, 400.0), (0.0, 900.0)])
+def test_the_gap_to_the_last_feature_agrees_within_three_sigmas(earlier_m: float, way_m: float, share: float) -> None:
+    """Of this position, of the earlier one and of the distance by wheel, of 2 permille; each is the largest once."""
     line = _line()
-    first = _locate(line, POINTS[1], POINTS[1] + 2.0, 4)
-    shifted = LineSeries(
-        arc_m=line.arc_m,
-        gradient=np.interp(line.arc_m - np.where(line.arc_m > 550.0, 5.0, 0.0), line.arc_m, line.gradient),
-        curvature_1pm=line.curvature_1pm,
+    free = _locate(line, POINTS[2], POINTS[2], 5)
+    allowed = 3.0 * np.sqrt(free.sigma_m**2 + earlier_m**2 + (2e-3 * way_m) ** 2)
+    last = (free.arc_m - way_m - share * allowed, earlier_m, way_m)
+    found = _locate(line, POINTS[2], POINTS[2], 5, last=last)
+    assert (found.verdict, found.reason) == (
+        ("accepted", "") if abs(share) < 1.0 else ("none", "distance to the last feature disagrees")
     )
-    measured = _measured(line, POINTS[2], 5)
-    way = POINTS[2] - POINTS[1]
-    last = (first.arc_m, first.sigma_m, float(way))
-    found = locate(measured, shifted, POINTS[2], 8.0, quantity="gradient", noise=NOISE, last=last)
-    assert (found.verdict, found.reason) == ("none", "distance to the last feature disagrees")
-    assert _locate(line, POINTS[2], POINTS[2], 5, last=last).verdict == "accepted"
 
 
 @pytest.mark.requirement("E3")

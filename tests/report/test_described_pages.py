@@ -142,15 +142,13 @@ def _plans() -> Iterator[Chart]:
 
 def _line() -> Iterator[Chart]:
     errors, positions = errors_table(), positions_table()
-    for table in (errors, positions, long_errors()):
+    crept = positions.with_columns(pl.col("chainage_m", "conventional_chainage_m") * 0.01)
+    for table in (errors, errors.head(1), positions, crept, long_errors()):
         yield plots.interval_over_chainage(table)
         yield plots.interval_distribution(table)
     yield plots.satellites_over_time(positions)
-    chunks = {
-        "first_epoch_gpst": [str(t) for t in times([0.0, 60.0])],
-        "epochs": [100, 50],
-        "positioning_s": [0.2, 0.3],
-    }
+    chunks = {"epochs": [100, 50], "positioning_s": [0.2, 0.3]}
+    chunks["first_epoch_gpst"] = [str(t) for t in times([0.0, 60.0])]
     yield plots.processing_time(chunks)
     yield plots.processing_time({name: [] for name in chunks})
     places = positions.with_columns(error_m=pl.Series([0.1, 1.5, None, 7.0, -80.0]), protection_level_m=pl.lit(12.0))
@@ -186,7 +184,8 @@ def _signals() -> Iterator[Any]:
     many = pl.concat([observations, observations.with_columns(elevation_deg=pl.lit(90.0))] * 6)
     limits = Cn0Limits(floor_dbhz=30.0)
     yield from plots.cn0_over_elevation(observations, limits=limits, mask_deg=20.0)
-    yield from plots.cn0_over_elevation(many, limits=limits, curve=_curve())
+    for given in (limits, Cn0Limits(deficit_dbhz=None)):
+        yield from plots.cn0_over_elevation(many, limits=given, curve=_curve())
     yield plots.sky_epochs(observations, title="Sky over the roof")
     more = pl.concat([observations.head(4).with_columns(time_gpst=pl.lit(t)) for t in times(np.arange(100.0))])
     yield plots.sky_epochs(more, epochs=20, wanted=times([33.0, 77.0, 5000.0]))
@@ -280,13 +279,8 @@ def _layers() -> Iterator[Iterable[str]]:
     yield describe_axes(plots.draw_chart(Chart(layers=bars, **scaled, **frame), Figure().subplots()))
     yield describe_axes(plots.draw_chart(Chart(layers=(), equal=True, **frame), Figure().subplots()))
     ranges = RangeBars(label="range", colour="#0072b2", names=("a", "b", "c"), low=x, mid=y, high=x + 2.0)
-    logs = Chart(
-        layers=(Curve(label="curve", colour="#0072b2", x=x + 1.0, y=x + 2.0),),
-        x_scale="log",
-        y_scale="log",
-        width="half",
-        **frame,
-    )
+    curve = Curve(label="curve", colour="#0072b2", x=x + 1.0, y=x + 2.0)
+    logs = Chart(layers=(curve,), x_scale="log", y_scale="log", width="half", **frame)
     for chart in (logs, Chart(layers=(ranges,), **frame), Chart(layers=(), equal=True, **frame)):
         yield describe_figure(plots.draw_figure(chart))
     polar = Figure().subplots(subplot_kw={"projection": "polar"})
@@ -367,6 +361,9 @@ def _explained(folder: Path) -> Iterator[Iterable[str]]:
     for second in (0, 1, 2, 3, 6, 8, 11, 13, 15, 23, 50):
         yield explain_epoch(run, f"01:{second // 60:02d}:{second % 60:02d}").sentences
     yield describe(explain_epoch(bare, "2024-03-05 01:00:04").satellites)
+    record = json.loads((bare / "run.json").read_text())
+    record["settings_used"] |= {"map_plan_sigma_m": 0.75, "map_height_sigma_m": 3.0}
+    (bare / "run.json").write_text(json.dumps(record))
     for made, time in ((run, "01:00:05"), (bare, "01:01:29")):
         page = write_explanation(explain_epoch(made, time), folder / f"{made.name}.html")
         yield page_text(page.read_text(encoding="utf-8"), {str(folder): "FOLDER"})
@@ -376,12 +373,8 @@ def _campaigns(folder: Path) -> Iterator[Iterable[str]]:
     rows = []
     for number, name in enumerate(("a", "b", "c")):
         run = made_report_run(folder / name / "run", filtered=number != 1, observations=number == 0)
-        facts = {
-            "epochs": 90 + number,
-            "positioning_rate": 0.75,
-            "ok_rate": 0.5,
-            "folder": str(run.relative_to(folder)),
-        }
+        facts = {"epochs": 90 + number, "positioning_rate": 0.75, "ok_rate": 0.5}
+        facts["folder"] = str(run.relative_to(folder))
         rows.append({"train": name, "day": 3, "status": "done", "error": None, **facts})
     rows.append({"train": "d", "day": 4, "status": "failed", "error": "no log"})
     for reference in ("a/truth.csv", None, "line.csv"):
