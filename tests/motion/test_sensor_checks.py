@@ -69,7 +69,7 @@ def test_the_place_of_the_device_is_found_whichever_way_the_train_runs_and_faces
     right = SensorLimits(range_ahead_m=8.0, range_above_m=1.0)
     assert list(range_notes(made, UNITS, table, trajectory, right)) == []
     (note,) = range_notes(made, UNITS, table, trajectory, SensorLimits(range_above_m=1.0))
-    assert f"8.0 m {'ahead of' if sign > 0 else 'behind'} those by satellites" in note
+    assert f"8.0 m {'ahead of' if sign > 0 else 'behind'} satellite positions" in note
     assert "sensors.range_ahead_m = 8.0 would fit" in note
 
 
@@ -77,7 +77,7 @@ def test_the_place_of_the_device_is_found_whichever_way_the_train_runs_and_faces
 def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> None:
     table, limits = places(10.0), SensorLimits(range_above_m=1.0)
     (note,) = range_notes(ranges(table, 0.0, 5.0), UNITS, table, LINE, limits)
-    assert "the ranges are 5.0 m too long against the satellites" in note
+    assert "the ranges are 5.0 m too long compared with satellite positions" in note
     both = list(range_notes(ranges(table, -6.0, -4.0), UNITS, table, LINE, limits))
     assert "6.0 m behind" in both[0]
     assert "4.0 m too short" in both[1]
@@ -201,7 +201,7 @@ def test_exchanged_axes_are_told_and_nothing_else_rests_on_them() -> None:
     assert "inertial: gravity is in force_forward_mps2, not in force_down_mps2; swap the columns" in notes[0]
     assert not any("tachometer" in note for note in notes)
     right = checks.notes(on_the_circle(1.0), None, round_line(), SensorLimits())
-    assert any("tachometer: the distance by its wheel" in note for note in right)
+    assert any("tachometer: its distance differs by" in note for note in right)
 
 
 @pytest.mark.requirement("E4")

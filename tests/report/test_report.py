@@ -388,7 +388,7 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     ].item()
     beyond = len(evaluation.integrity["train"].beyond.filter(pl.col("usable"), antenna="front"))
     assert f"<dd>{level:.1f} m</dd>" in document
-    assert f", filtered {beyond:,}</dd>" in document
+    assert f"; of the filter: {beyond:,}</dd>" in document
     assert "Stanford diagram, usable levels (filter along the track)" in document
     assert "filter-stanford-train" in document
 

@@ -260,7 +260,7 @@ def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:
     assert fetched(text) == []
     assert "default-src &#39;none&#39;" in text or "default-src 'none'" in text
     assert "0a and far &lt;b&gt; end 2.00 m apart" in text
-    assert f"{len(on):,} positions, 100.0 % on a track" in text
+    assert f"{len(on):,} positions were matched: 100.0 % are on a track" in text
     row = text[text.index('<th scope="row">02</th>') :].split("</tr>")[0]
     assert ["1,120" in row, ">0a<" in row, ">0b<" in row, f"{(on == 2).sum()}<" in row] == [True] * 4
     if browser() is not None:

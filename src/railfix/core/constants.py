@@ -59,7 +59,7 @@ CLEAR_M: Final = 200.0
 #: Largest distance from a tangent at which a point counts as lying on the tangent [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Smallest prior probability of a joint fault of the low satellites on one side of the track that the largest data set
-#: supports: 2 of 30 943 blocks of 30 s in 70 simulated hours in a city, 95 % (docs/level-results.md). The recordings
-#: are shorter and support 1e-2.
+#: Prior probability of a joint fault of the low satellites on one side of the track. It is the upper bound, with 95 %
+#: confidence, from the largest data set, with faults in 2 of 30 943 blocks of 30 s in 70 simulated hours in a city
+#: (docs/level-results.md). The recordings are shorter and support 1e-2 only.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

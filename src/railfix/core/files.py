@@ -74,9 +74,11 @@ class ByteStream(io.BufferedIOBase):
         try:
             return self._source.read(-1 if size is None else size)
         except EOFError as error:
-            raise InputFileError(self.path, "the packed data end early; copy or download it again") from error
+            raise InputFileError(self.path, "the packed data end early; copy or download the file again") from error
         except damage_errors() as error:
-            raise InputFileError(self.path, f"the packed data are damaged ({error}); download it again") from error
+            raise InputFileError(
+                self.path, f"the packed data are damaged ({error}); download the file again"
+            ) from error
         except OSError as error:
             raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
 
@@ -118,7 +120,7 @@ class _HatanakaStream(ByteStream):
         where = re.search(r"line\s*:?\s*(\d+)", text)
         reason = what.group(1).strip().rstrip(".") if what else "the decoder crx2rnx gives no reason"
         place = f" at line {where.group(1)} of the compressed text" if where else ""
-        return f"the Hatanaka (CRX) data are cut short or damaged{place}: {reason}; download it again"
+        return f"the Hatanaka (CRX) data are cut short or damaged{place}: {reason}; download the file again"
 
 
 def path_names(paths: Paths) -> list[str]:
@@ -316,7 +318,7 @@ def _unpack_compress(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[b
     try:
         ncompress.decompress(source, unpacked)
     except ValueError as error:
-        raise InputFileError(path, f"the compress (.Z) data are damaged ({error}); download it again") from error
+        raise InputFileError(path, f"the compress (.Z) data are damaged ({error}); download the file again") from error
     unpacked.seek(0)
     return unpacked
 

@@ -19,9 +19,9 @@ class Reason(IntFlag):
     """Reasons for rejecting an observation (epoch, channel); 0 = used."""
 
     USED = 0
-    #: No pseudorange at this epoch.
+    #: There is no pseudorange at this epoch.
     NOT_OBSERVED = 1 << 0
-    #: Implausible pseudorange: outside 10 000 to 100 000 km.
+    #: The pseudorange is implausible: outside 10 000 to 100 000 km.
     IMPLAUSIBLE_CODE = 1 << 1
     #: The constellation is not selected.
     SYSTEM_NOT_SELECTED = 1 << 2
@@ -33,7 +33,7 @@ class Reason(IntFlag):
     EPHEMERIS_TOO_OLD = 1 << 5
     #: The newest valid record flags the satellite or signal as unhealthy.
     UNHEALTHY = 1 << 6
-    #: Below the elevation mask.
+    #: The satellite is below the elevation mask.
     ELEVATION_MASK = 1 << 7
     #: The only usable satellite of its clock group: its range only determines the clock of that group.
     ALONE_ON_ITS_CLOCK = 1 << 8
@@ -45,13 +45,14 @@ class Reason(IntFlag):
     SBAS_NO_CORRECTION = 1 << 11
     #: SBAS: the corrections have timed out.
     SBAS_TIMED_OUT = 1 << 12
-    #: SBAS: do not use, not monitored, UDRE too large, or the GEO sends "do not use" (message type 0).
+    #: SBAS: the satellite is flagged "do not use" or "not monitored", its UDRE is too large, or the GEO sends message
+    #: type 0, "do not use".
     SBAS_DO_NOT_USE = 1 << 13
-    #: SBAS: no ionospheric delay at the pierce point, or, for SBAS on L5, no code on the second frequency.
+    #: SBAS: there is no ionospheric delay at the pierce point, or, for SBAS on L5, no code on the second frequency.
     SBAS_NO_IONOSPHERE = 1 << 14
-    #: C/N0 below the absolute limit.
+    #: The C/N0 is below the absolute limit.
     CN0_FLOOR = 1 << 15
-    #: C/N0 below the open-sky curve at this elevation.
+    #: The C/N0 is too far below the open-sky curve at this elevation.
     CN0_CURVE = 1 << 16
     #: The change of the pseudorange disagrees with the Doppler.
     DOPPLER = 1 << 17

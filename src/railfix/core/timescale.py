@@ -100,7 +100,7 @@ def gps_now_ns() -> int:
 
 
 def gpst_to_utc(time: ArrayLike) -> Datetimes:
-    """Convert GPS time to UTC; a time in an inserted leap second becomes the time one second later in UTC's count."""
+    """Convert GPS time to UTC; a time in an inserted leap second is mapped to the second after it."""
     at = np.asarray(time, dtype="datetime64[ns]")
     leap = np.searchsorted(utc_to_gpst(_LEAP_UTC), at, side="right") - 1
     return np.asarray(at - leap.astype("timedelta64[s]"), dtype="datetime64[ns]")
@@ -129,7 +129,7 @@ def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Return the GPS times with given seconds of week [s] nearest to reference times, right to within half a week."""
+    """Return the GPS times with given seconds of week [s] nearest to reference times, which may err by half a week."""
     week, sow = to_week(near)
     shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)
     return from_week(week + shift.astype(np.int64), seconds_of_week)

@@ -51,9 +51,8 @@ class CampaignReport:
     """Content of the page on a campaign."""
 
     sentences: tuple[str, ...]  #: At most five sentences on the number of runs, failures, accuracy and the worst run.
-    tables: tuple[
-        Table, ...
-    ]  #: Tables of all runs, failed runs (if any) and the worst epochs (if there are positions).
+    #: Tables of all runs, of failed runs if there are any, and of the worst epochs if there are positions.
+    tables: tuple[Table, ...]
     charts: tuple[Chart, ...]
     notes: tuple[str, ...]  #: Notes on runs that could not be compared with their reference.
 

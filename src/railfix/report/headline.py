@@ -22,7 +22,7 @@ class KeyFigure:
     """Key figure of a run."""
 
     name: str
-    value: str  #: Value of single epochs; of the filter if `filtered` is empty and the figure has one value only.
+    value: str  #: Value of single epochs.
     filtered: str = ""  #: Value of the filter along the track; "" without it.
     beside: str = ""  #: Value of conventional positions, or a remark.
 
@@ -112,7 +112,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
-    """Return the number of errors above the protection level at usable positions; without levels, errors over sigma."""
+    """Return a remark on errors above the protection level at usable positions, or, without levels, on error/sigma."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         len(evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna))

@@ -124,7 +124,7 @@ def check_sbas_time(sbas: SbasCorrections | DfmcService | None, tally: Tally) ->
         if sbas is not None and spans_apart(span, sbas.span):
             raise MismatchError(
                 f"the SBAS messages of {_period(*sbas.span)} and the {name} log of {_period(*span)} (GPS time) have no "
-                "time in common; give those of that day"
+                "time in common; give the SBAS messages of the day of the log"
             )
 
 
@@ -138,7 +138,7 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
         if all(spans_apart(span, of_sensor) for span in spans):
             raise MismatchError(
                 f"the samples of --{name} of {_period(*of_sensor)} and the logs of {_period(*spans[0])} (GPS time) "
-                "have no time in common; give those of that day"
+                "have no time in common; give the samples of the day of the logs"
             )
 
 

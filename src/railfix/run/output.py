@@ -2,7 +2,7 @@
 and never replace an input.
 
 Staging folders are hidden and locked. If a process is killed, its staging folder remains, but the operating system
-releases the lock. A staging folder without a lock therefore belongs to a process that has ended.
+releases the lock. A staging folder that is not locked therefore belongs to a process that has ended.
 """
 
 from __future__ import annotations
@@ -399,7 +399,7 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
     """Raise OutputError if an output file cannot or must not be written.
 
     This is the case if its folder does not exist or is not writable, if it is a folder or one of `inputs`, if it exists
-    (with "refuse"), or if its name has not the ending of its kind.
+    (with "refuse"), or if its name lacks the ending of its kind.
     """
     with _writing(target):
         check_not_input(target, inputs)

@@ -34,7 +34,7 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Limits for which the filter's protection levels below them are counted [m].
+#: Limits within which protection levels of the filter are counted [m].
 WITHIN_M: Final = (20, 50)
 #: Figures of an antenna without rows in the tables.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}

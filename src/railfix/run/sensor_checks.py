@@ -158,7 +158,7 @@ def _late(name: str, lag_s: float, time: np.datetime64) -> str:
     leap = int(gpst_minus_utc(time))
     utc = "they are UTC, GPS time is expected" if abs(lag_s + leap) <= 1.0 else "correct them"
     way = "late" if lag_s > 0 else "early"
-    return f"{name}: its time tags are {abs(lag_s):.0f} s {way} against the satellites'; {utc}"
+    return f"{name}: its time tags are {abs(lag_s):.0f} s {way} compared with GPS time; {utc}"
 
 
 def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
@@ -312,14 +312,14 @@ def range_notes(
         fits = limits.range_ahead_m + trajectory.front_sign * moved
         which = "ahead of" if moved > 0 else "behind"
         yield (
-            f"ranging: positions by the ranges are {abs(moved):.1f} m {which} those by satellites in rising chainage; "
+            f"ranging: positions by the ranges are {abs(moved):.1f} m {which} satellite positions in rising chainage; "
             f"sensors.range_ahead_m = {fits:.1f} would fit, or the units' surveyed positions are displaced"
         )
     if abs(excess) > _RANGE_M:
         which = "long" if excess > 0 else "short"
         yield (
-            f"ranging: the ranges are {abs(excess):.1f} m too {which} against the satellites; the devices may have a "
-            "delay"
+            f"ranging: the ranges are {abs(excess):.1f} m too {which} compared with satellite positions; the devices "
+            "may have a delay"
         )
 
 
@@ -350,7 +350,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
         fits = f"sensors.tachometer.wheel_diameter_m = {real:.3f}"
         if found is not None and abs(found.ratio - 1.0) > _OTHER_TEETH:
             fits = f"sensors.tachometer.pulses_per_turn = {found.ratio * tachometer.pulses_per_turn:.0f} or {fits}"
-        scale = f"the distance by its wheel is {{:+.1f}} % off that by satellites; {fits} would fit"
+        scale = f"its distance differs by {{:+.1f}} % from the satellite distance; {fits} would fit"
         notes += _sentences("tachometer", found, scale)
     return tuple(notes)
 
@@ -378,4 +378,4 @@ def _sentences(name: str, found: SpeedCheck | None, scale: str) -> Iterator[str]
         yield f"{name}: {scale.format(100.0 * (found.ratio - 1.0))}"
     if abs(found.lag_s) >= _LAG_S:
         late = "late" if found.lag_s > 0 else "early"
-        yield f"{name}: its time tags are {abs(found.lag_s):.1f} s {late} against the satellites'; correct them"
+        yield f"{name}: its time tags are {abs(found.lag_s):.1f} s {late} compared with GPS time; correct them"

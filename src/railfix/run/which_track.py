@@ -241,7 +241,7 @@ class WhichTrackInputs(InputFiles):
 class WhichTrackOptions(Settings):
     """Options of `railfix which-track`.
 
-    With `same_frame`, the train's position, too, is not transformed to the frame of the map.
+    With `same_frame`, the position of the train, which is relative to the base station, is in the frame of the map too.
     """
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)

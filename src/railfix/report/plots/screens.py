@@ -294,7 +294,7 @@ def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple
             yield (
                 "protection_level",
                 ScreenPicture(
-                    title=f"{antenna}: finite protection levels along the line, and the alarm limit",
+                    title=f"{antenna}: finite protection levels along the line against the alarm limit",
                     label="protection level [m]",
                     metric=level,
                     reject=level > config.alarm_limit_m,
