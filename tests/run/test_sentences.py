@@ -44,7 +44,7 @@ def test_an_offset_of_the_map_has_its_side_its_height_and_its_cause(
 def test_time_tags_that_come_after_the_satellites_are_late(lag_s: float, word: str) -> None:
     found: Any = SimpleNamespace(unit="m/s", ratio=1.0, lag_s=lag_s)
     (text,) = _sentences("radar", found, "scale {:.1f} %")
-    assert f"0.6 s {word} against" in text
+    assert f"0.6 s {word} compared with" in text
 
 
 @pytest.mark.parametrize(
