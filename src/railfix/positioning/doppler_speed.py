@@ -55,7 +55,7 @@ class DopplerSpeedLimits(Settings):
 class Dopplers(FrozenArrays):
     """Dopplers of one receiver with their satellites, T epochs by K channels."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Receiver time of each epoch, shape (T,).
     #: Satellite of each channel, shape (K,). Of several channels of one satellite, only one per epoch has values.
     satellite: Strings
     rate_mps: Floats  #: ``-lambda D``: positive when the satellite recedes; NaN where absent; shape (T, K).
@@ -76,7 +76,7 @@ class DopplerSpeed:
 
     #: Positive along the tangent; NaN with too few satellites or singular geometry; shape (T,).
     speed_mps: Floats
-    sigma_mps: Floats
+    sigma_mps: Floats  #: Standard deviation of `speed_mps`, shape (T,).
     clock_drift_mps: Floats  #: c times the drift of the receiver clock, shape (T,).
     residual_mps: Floats  #: Measured less fitted, of used and rejected Dopplers; NaN elsewhere; shape (T, K).
     #: Dopplers used in the fit, and Dopplers rejected as outliers; shape (T, K).

@@ -1,7 +1,7 @@
 """Detect grossly wrong codes before any fit to all codes.
 
 A least-squares position absorbs part of every error: a code error of 10 km moves it by kilometres, to where neither the
-atmospheric models nor the map are valid, and the largest residuals are those of other satellites. The position with the
+atmospheric models nor the map are valid, and other satellites have the largest residuals. The position with the
 least sum of absolute residuals does not move further when an error grows, because each outlying range has the same
 influence.
 """
@@ -237,8 +237,8 @@ class GrossErrors(NamedTuple):
     """Gross errors of raw ranges, T epochs by M channels."""
 
     gross: Masks  #: Ranges with gross errors, shape (T, M).
-    #: Arc length of the best-fitting point of the line at epochs that no position in space is accepted for; NaN
-    #: elsewhere; shape (T,).
+    #: Arc length of the best-fitting point of the line, at epochs whose gross errors cannot be identified or whose 3-D
+    #: position is missing or implausible; NaN at other epochs; shape (T,).
     unsure_arc_m: Floats
     unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
 

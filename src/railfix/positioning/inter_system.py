@@ -55,7 +55,7 @@ class OffsetState:
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
     def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
-        """Return the state after epoch `last`, with new sums of some clocks; those of other clocks are unchanged."""
+        """Return the state after epoch `last`, with the sums of some clocks replaced by `sums`."""
         count = len(letters)
         return OffsetState(
             information={**self.information, **dict(zip(letters, sums[:count], strict=True))},

@@ -25,7 +25,7 @@ from railfix.positioning.section_search import Section, SectionLimits, find_sect
 class FixLimits(NamedTuple):
     """Limits of the stages from 3-D position to position on the line."""
 
-    min_satellites: int = 3  #: P1 3.2: 2 satellites are possible, but give wrong sections on sharp curves.
+    min_satellites: int = 3  #: Fewest satellites of a position; 2 give wrong sections on sharp curves (P1 3.2).
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
     constrained: ConstrainedLimits = ConstrainedLimits()

@@ -1,8 +1,8 @@
 """Mean offset of the 3-D positions from the line over minutes, for the detection of map errors.
 
-A constant offset is hidden by the noise of single epochs, but not by that of the mean over a window. The covariance of
-the mean has three parts: noise, which the window averages; satellite and atmospheric errors, which it does not average;
-and the stated error of the map.
+A constant offset can be smaller than the noise of a single epoch, but larger than the noise of the mean over a window.
+The covariance of the mean has three parts: noise, which the window averages; satellite and atmospheric errors, which
+are not averaged; and the stated error of the map.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ class MapOffsetState:
 class MapOffset(NotebookTable):
     """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples."""
 
-    #: Right of the line in the direction of rising chainage, and above it; shape (T,).
+    #: Offset to the right of the line in the direction of rising chainage, and above the line; shape (T,).
     across_m: Floats
     up_m: Floats
-    #: Covariance across and up for a correct map: noise, satellites, atmosphere and the stated error of the map; shape
-    #: (T, 2, 2).
+    #: Covariance across and up for a correct map, from noise, satellite and atmospheric errors and the stated error of
+    #: the map; shape (T, 2, 2).
     covariance_m2: Floats
     statistic: Floats  #: Squared Mahalanobis distance of the offset from zero, shape (T,).
     #: Smallest offset across, and smallest offset up, that the test detects without an offset in the other component;
@@ -122,7 +122,7 @@ class OffsetErrors(NamedTuple):
 class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
-    arc_m: Floats  #: NaN where missing, shape (T,).
+    arc_m: Floats  #: Arc length; NaN without a position; shape (T,).
     #: Epochs at which the train is off the line, shape (T,). They have a separate window, because positions off the
     #: line contain no information on the map after the train returns to it.
     off_map: Masks
@@ -218,7 +218,7 @@ def means_of_windows(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of sums (T, 9).
 
-    They are fields of `MapOffset`. The sigmas are those of the map, and `MapOffsetLimits.detectable_sigmas`.
+    They are fields of `MapOffset`. `detectable_sigmas` is a property of `MapOffsetLimits`.
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])

@@ -134,7 +134,7 @@ def _on_line(
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
     """Return arc lengths (T,), and the values of `_from` with the epochs on the last axis.
 
-    Positions clamped to an end of a closed line are also solved from the other end; the better fit is kept.
+    Positions clamped to an end of a closed line are also solved from where the line continues; the better fit is kept.
     """
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):

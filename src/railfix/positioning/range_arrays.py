@@ -140,7 +140,7 @@ def weighted_ranges(
     ------
     ValueError
         Shapes do not match, an array is not numeric or has single precision, a standard deviation is not positive,
-        a satellite or a code is at an impossible distance, or a letter is not that of a constellation.
+        a satellite or a code is at an impossible distance, or a letter denotes no constellation.
     """
     code = _check_floats("code_m", code_m, 2)
     sigma = _check_floats("sigma_m", sigma_m, 2)

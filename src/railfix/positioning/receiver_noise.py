@@ -1,8 +1,8 @@
 """Receiver noise scale and single-epoch sigma.
 
 Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting. The robust scale, from
-the ranges of each epoch that agree with each other, is that of the RAIM test and independent of its results. The stated
-scale, from the ranges that RAIM accepted, is that of every sigma and protection level. Epochs that RAIM did not
+the ranges of each epoch that agree with each other, is used in the RAIM test and does not depend on its results. The
+stated scale, from the ranges that RAIM accepted, is used in every sigma and protection level. Epochs that RAIM did not
 resolve, and epochs off the map, contribute to neither scale.
 """
 

@@ -1,10 +1,10 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
-P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares ``q``
-equals that of the residuals after each constellation's clock is eliminated. `find_section` returns the point with the
-least ``q`` in a time that does not grow with the length of the line. Where a 3-D position exists, ``q`` grows from it
-as a quadratic form, so stretches outside a ball are dropped. Otherwise the search is coarse to fine: the root of ``q``
-changes at most by the root of the summed weights times the distance moved. Both searches are exact.
+P1 2.2(2) compares ranges with distances by between-satellite single differences. Their weighted sum of squares ``q``
+equals the sum for the residuals after each constellation's clock is eliminated. `find_section` returns the point with
+the least ``q`` in a time that does not grow with the length of the line. Where a 3-D position exists, ``q`` grows from
+it as a quadratic form, so stretches outside a ball are dropped. Otherwise the search is coarse to fine: the root of
+``q`` changes at most by the root of the summed weights times the distance moved. Both searches are exact.
 """
 
 from __future__ import annotations

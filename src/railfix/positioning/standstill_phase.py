@@ -115,8 +115,8 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Largest number of integer vectors in the sum, and least log likelihood of a vector relative to that of uniform
-#: phases.
+#: Largest number of integer vectors in the sum of likelihoods. A vector is left out if its log likelihood, less the log
+#: likelihood of uniform phases, is below the second value.
 _VECTORS: Final = 20
 _NEGLIGIBLE: Final = -5.0
 
@@ -127,7 +127,7 @@ class MeanPhases:
 
     difference_m: Floats  #: Observed less computed at the origin, up to multiples of the wavelength; shape (n,).
     away: Floats  #: Derivative of the double difference by position east, north and up; shape (n, 3).
-    wavelength_m: Floats  #: Shape (n,).
+    wavelength_m: Floats  #: Wavelength of the carrier of each pair, shape (n,).
     covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).
 
 

@@ -65,7 +65,7 @@ class StandstillErrors(Settings):
     #: Map error across the track common to all tracks of a yard, including the shift of the antenna on canted track.
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
 
-    #: If not given, `ANTENNA_UP_M` with a standard deviation of `ANTENNA_SIGMA_M`: from bogies to roofs.
+    #: If not given, `ANTENNA_UP_M` with a standard deviation of `ANTENNA_SIGMA_M`, which covers bogies and roofs.
     antenna_up_m: float | None = option(
         "Height of the antennas above the rails, for tracks above each other; by default about 2.5 m.",
         None,
@@ -104,7 +104,7 @@ def _sine(elevation_deg: Floats) -> Floats:
 class StandstillFix:
     """Mean position of one antenna at rest."""
 
-    east_north_m: Floats  #: From the origin of the yard's coordinates, shape (2,).
+    east_north_m: Floats  #: Position east and north of the origin of the yard's coordinates, shape (2,).
     own_m2: Floats  #: Covariance of this antenna's own errors: code bias and noise; shape (2, 2).
     common_m2: Floats  #: Covariance of satellite and atmospheric errors, common to both antennas; shape (2, 2).
     misfit: float  #: Weighted sum of squares of the residuals.
@@ -177,14 +177,14 @@ class TrackPosterior:
     """Probabilities of tracks."""
 
     names: tuple[str, ...]  #: Names of the tracks, then `NONE`.
-    probability: Floats  #: Shape (tracks + 1,).
+    probability: Floats  #: Posterior probability of each of `names`, shape (tracks + 1,).
     with_rising: Floats  #: Probability that the train is on the track and faces its direction, shape (tracks,).
     fits: bool  #: Whether the codes agree with the error model.
     #: Distance of the code position from each track, in its standard deviations; shape (tracks + 1,), NaN for `NONE`.
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
-        """Return the track (or `NONE`) whose probability exceeds one minus the risk; empty if undecided or no fit."""
+        """Return the track (or `NONE`) with a probability above one minus the risk; empty if undecided or no fit."""
         best = int(np.argmax(self.probability))
         if not self.fits or self.misfit_sigmas[best] > _LARGEST_MISFIT:
             return ""

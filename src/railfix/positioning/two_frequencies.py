@@ -77,7 +77,7 @@ class Combined(NotebookTable):
     """One pseudorange per satellite from two codes: T epochs by K channels; NaN where only the first code is used."""
 
     code_m: Floats  #: Combined code, shape (T, K).
-    variance_m2: Floats  #: Variance less that of the first code, shape (T, K).
+    variance_m2: Floats  #: Difference of variance between the combined and the first code, shape (T, K).
     share: Floats  #: Weight of the second code; the first code has 1 - `share`; shape (T, K).
     #: Ionospheric delay on the first frequency beyond the model, and its sigma; shape (T, K).
     ionosphere_m: Floats

@@ -44,9 +44,9 @@ def klobuchar_delay_m(
 ) -> Floats:
     """Return the ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
-    Latitude and longitude, shape (T,), are those of the receiver; elevation and azimuth have shape (T, M).
-    `coefficients` are alpha 0 to 3 and beta 0 to 3. The delay on `frequency_hz`, shape (M,), is that on L1 times
-    (f1/f)^2. NaN where an input is NaN, and at or below the horizon.
+    Latitude and longitude of the receiver have shape (T,), elevation and azimuth shape (T, M). `coefficients` are
+    alpha 0 to 3 and beta 0 to 3. The delay on L1 is multiplied by (f1/f)^2 for `frequency_hz`, shape (M,). NaN where an
+    input is NaN, and at or below the horizon.
     """
     _, seconds_of_week = to_week(time)
     alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
@@ -90,13 +90,13 @@ def saastamoinen_delay_m(
 class SeenFrom:
     """Directions to the satellites from a receiver position accurate to hundreds of metres: T epochs by K channels."""
 
-    receiver_ecef_m: Floats  #: Shape (T, 3).
+    receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
     #: Geodetic coordinates of the receiver, shape (T,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    satellite_ecef_m: Floats  #: Shape (T, K, 3).
-    #: Shape (T, K).
+    satellite_ecef_m: Floats  #: Positions of the satellites, shape (T, K, 3).
+    #: Direction from the receiver to each satellite, shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
 

@@ -44,7 +44,7 @@ class BaseErrors:
 
     ecef_m: Floats  #: Position of the station, shape (3,).
     time: Datetimes  #: Shape (B,).
-    #: Shape (S,).
+    #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings
     #: Corrected code less range and receiver clock of its constellation; NaN where not observed; shape (B, S).
@@ -149,7 +149,7 @@ class BaseStationSource:
         return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the other source and the station's errors; their sigma replaces that of the source."""
+        """Return the delays of the other source and the station's errors, with the sigma of the corrected ranges."""
         given = self.other.delays(time, channels, satellites, seen)
         base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
         differenced = np.isfinite(base.code_m)

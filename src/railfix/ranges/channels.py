@@ -96,14 +96,14 @@ class Channels:
     #: Columns of the K channels in the observations; channels of one clock are adjacent, a satellite's preferred signal
     #: is first; shape (K,).
     columns: Indices
-    #: Shape (K,).
+    #: Satellite and signal of each of the K channels, shape (K,).
     satellite: Strings
     signal: Strings
     groups: tuple[slice, ...]  #: Channels of each receiver clock.
     clocks: tuple[str, ...]  #: Letter of each receiver clock.
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
-    frequency_hz: Floats  #: Shape (K,).
-    every_frequency_hz: Floats  #: Shape (M,).
+    frequency_hz: Floats  #: Carrier frequency of the K channels, shape (K,).
+    every_frequency_hz: Floats  #: Carrier frequency of all channels of the log, shape (M,).
     left_out: Integers  #: Reason of the channels that settings leave out, 0 for the other channels; shape (M,).
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
     #: Columns of the second signals of each channel's satellite, in order of preference, -1 for none; shape (K, P). P
@@ -158,7 +158,7 @@ def select_channels(
     Raises
     ------
     ValueError
-        A letter of `systems` is not that of a constellation.
+        A letter of `systems` denotes no constellation.
     """
     if unknown := [letter for letter in systems if letter not in CLOCK_GROUP]:
         raise ValueError(

@@ -28,7 +28,7 @@ _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are 
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Largest fraction of such satellites that is attributed to faulty navigation records.
+_BELOW_SHARE: Final = 0.05  #: Largest fraction of tracked satellites below it attributed to faulty navigation records.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ def cn0_curve_from_log(
 ) -> Cn0Calibration:
     """Fit a curve to about a day of a receiver's log, whose antenna was under open sky.
 
-    `position_ecef_m`, shape (3,), is the position of the antenna to a few kilometres, by default that of the header.
+    `position_ecef_m`, shape (3,), is the antenna position to a few kilometres, by default the position in the header.
     Raises InputFileError if a file is missing or of another kind, or the log has no epochs or no C/N0; SettingsError if
     neither the header nor the caller gives a position; MismatchError if tracked satellites are below the horizon of the
     position, the navigation files have no orbit for the log, or there are too few samples for any curve.

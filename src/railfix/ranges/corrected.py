@@ -40,7 +40,7 @@ class AntennaRanges(NotebookTable):
     cn0_dbhz: Floats
     #: Approximate position of the antenna, from which the directions to the satellites are computed; shape (T, 3).
     near_ecef_m: Floats
-    #: Shape (T, K).
+    #: Direction from the antenna to each satellite, shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
     #: Code corrected for satellite clock, group delay and atmosphere, and standard deviations; shape (T, K).

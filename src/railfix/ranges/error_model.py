@@ -73,7 +73,7 @@ def _text(value: object) -> str:
     return f"{value:g} deg" if isinstance(value, float) else str(value)
 
 
-#: Sets of samples from which the statistics of a bin are computed, from its own to those of all bins.
+#: Sets of samples from which the statistics of a bin can be computed, from its own samples to the samples of all bins.
 POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
 
 
@@ -150,7 +150,7 @@ class ErrorModelSource(Settings):
     start: str = ""
     end: str = ""
     railfix_version: str = ""
-    files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
+    files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each file.
 
 
 LARGEST_PRIOR: Final = 0.05  #: Bounds of priors above this are from too few blocks for a finite protection level.
@@ -159,7 +159,7 @@ LARGEST_PRIOR: Final = 0.05  #: Bounds of priors above this are from too few blo
 class FaultRate(Settings):
     """Measured probability that a used range is faulty at a given time."""
 
-    #: A range is faulty beyond this multiple of its sigma in the protection level: 5, exceeded by noise with 6e-7.
+    #: A range is faulty beyond this multiple of its sigma in the protection level: 5, which noise exceeds with 6e-7.
     beyond_sigma: float = Field(gt=0)
     #: Number of used ranges, and of faulty ranges.
     ranges: int = Field(ge=0)
@@ -167,7 +167,7 @@ class FaultRate(Settings):
     #: Number of blocks of time of single satellites, which are independent, and of blocks with a faulty range.
     blocks: int = Field(ge=0)
     faulty_blocks: int = Field(ge=0)
-    prior: float = Field(ge=0, le=1)  #: faulty / ranges.
+    prior: float = Field(ge=0, le=1)  #: Fraction of used ranges that are faulty.
     #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks), for `local_prior`.
     upper: float = Field(ge=0, le=1)
     #: Number of blocks of time with two or more faulty satellites, divided by the number expected for independent
@@ -201,7 +201,7 @@ class ErrorModel:
     #: "local": multipath and receiver noise alone (a reference station removed the other errors).
     #: "satellite_and_atmosphere": satellite and atmospheric errors of the days recorded as well.
     covers: Literal["local", "satellite_and_atmosphere"]
-    #: Settings under which the model is valid; None if unknown, and then not compared with those of a run.
+    #: Settings under which the model is valid; None if unknown, so that they are not compared with a run's settings.
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
     #: Rate of local faults among the ranges to which the model was fitted; None if not measured.

@@ -248,7 +248,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Return the number of blocks of time with two or more faulty satellites relative to independent satellites."""
+    """Return the number of blocks of time with two or more faulty satellites over that of independent satellites."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

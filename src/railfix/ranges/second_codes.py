@@ -47,8 +47,8 @@ def second_codes(
     """Return the second code of each satellite, corrected like the first code; None where no channel has a second code.
 
     It is the first signal in order of preference that is observed, healthy and has a group delay. Satellite position
-    and clock are those of the first code, and the group delay is from the same record; where that record lacks a part
-    of it, another message of the satellite is used.
+    and clock are the same as for the first code, and the group delay is from the same record; where the record lacks a
+    part of the group delay, another message of the satellite is used.
     """
     second = channels.second
     if not second.size:

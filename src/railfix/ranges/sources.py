@@ -79,8 +79,8 @@ def choose_ionosphere(
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
     """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
 
-    The coefficients are those of GPS, else of QZSS, else `TYPICAL_KLOBUCHAR`; None if the ionosphere is "off". BeiDou's
-    coefficients are for a different model.
+    GPS coefficients are preferred to QZSS coefficients and these to `TYPICAL_KLOBUCHAR`; None if the ionosphere is
+    "off". BeiDou's coefficients are for a different model.
     """
     if ionosphere == "off":
         return None, 0.0, ()

@@ -39,7 +39,7 @@ class PhaseLimits(Settings):
     hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
     #: Correlation time of code errors: epochs closer together than this add no information on the ambiguities.
     #: The variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes
-    #: alone. The positions do not change. 0 for white noise, such as simulated noise.
+    #: alone. The positions do not change. The value for white noise, for example in simulations, is 0.
     correlation_s: float = Field(default=20.0, ge=0)
     #: Number of linearisations; each has its own state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)

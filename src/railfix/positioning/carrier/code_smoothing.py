@@ -230,9 +230,9 @@ class SmoothingLimits(Settings):
     #: Time constant: all codes of an arc have equal weight until the arc is this old; the weight of older codes then
     #: decays (DO-229D 2.1.4.1.5: 100 s, because of the ionosphere's drift).
     window_s: float = Field(default=100.0, gt=0)
-    #: "own": the mean change of code less phase is a clock, subtracted before and added after averaging. For
+    #: "own": the mean change of code less phase is a clock, subtracted before and added after averaging. It is for
     #: telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
-    #: against 50 m with "shared"); other receivers were no worse with it.
+    #: against 50 m with "shared"); results of other receivers were no worse with it.
     clocks: Literal["own", "shared"] = "own"
 
 

@@ -150,7 +150,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Return phases whose change disagrees with that of the other phases on the line, and the distance moved.
+    """Return phases whose change disagrees with the other phases and the line, and the distance moved.
 
     Parameters
     ----------

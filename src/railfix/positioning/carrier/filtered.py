@@ -185,7 +185,7 @@ def _ambiguities(
     """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
 
     They are computed from the normal equations of each epoch and all earlier epochs. The ambiguities of all arcs and
-    the memory after the last epoch are also returned. `held` is that of `inverse_of_arcs`.
+    the memory after the last epoch are also returned. With `held` the ambiguities have a zero mean (`inverse_of_arcs`).
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # An extra row and column collects channels without a phase.

@@ -170,7 +170,7 @@ def own_clock(lin: Linearised) -> bool:
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Subtract first values of the ambiguities (T, M), and with a separate phase clock the mean rest, from the phases.
+    """Subtract first values of the ambiguities (T, M) from the phases, and with a separate phase clock their mean rest.
 
     The phases are added to the right-hand side only afterwards, because values of 1e7 m would cause rounding errors of
     millimetres.

@@ -219,8 +219,8 @@ class SbasCorrections:
     ) -> Floats:
         """Return the factor on sigma UDRE from service regions (type 27) or covariances (type 28), shape (T, K).
 
-        `corrections` are of these epochs, `line_of_sight`, shape (T, K, 3), are unit vectors to the satellites in the
-        Earth-fixed frame, and the coordinates, shape (T,), are those of the receiver. The factor is 1 where the GEO
+        `corrections` are the corrections at these epochs, `line_of_sight`, shape (T, K, 3), are unit vectors to the
+        satellites in the Earth-fixed frame, and the receiver coordinates have shape (T,). The factor is 1 where the GEO
         sends neither type, and NaN where service messages are incomplete and incomplete data are rejected.
         """
         factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)
@@ -269,7 +269,7 @@ class SbasState:
         limits: SbasLimits | None = None,
         band: Band = "L1",
     ) -> SbasState:
-        """Return the state after the messages of a recorded log; ValueError: it has no message of the requested PRN."""
+        """Return the state after the messages of a recorded log; ValueError if it has none of the requested PRN."""
         limits = limits or SbasLimits()
         of_log: SbasCorrections | DfmcService = (
             DfmcService.from_log(messages, prn=prn)

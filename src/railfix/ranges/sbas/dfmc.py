@@ -192,7 +192,7 @@ class DfmcService:
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
         """Return the corrections of K satellites at T epochs.
 
-        With navigation data a correction is used only if a record has its issue of data; without, it is not checked.
+        A correction is used only if a navigation record has its issue of data, or if no navigation data are given.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -365,7 +365,7 @@ class SbasOrbits:
     """Orbits of SBAS satellites, n rows."""
 
     row: Integers  #: Row of the last message of each orbit, shape (n,).
-    prn: Integers  #: Shape (n,).
+    prn: Integers  #: PRN of each satellite, shape (n,).
     provider: Integers  #: Provider number of the service, 8 for SouthPAN; shape (n,).
     reference: Datetimes  #: Reference time of each orbit, shape (n,).
     orbits: Orbits

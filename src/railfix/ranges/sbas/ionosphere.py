@@ -309,7 +309,7 @@ def ionosphere(
     elevation_deg: Floats,
     azimuth_deg: Floats,
 ) -> IonosphereDelays:
-    """Return slant delays at epochs; the arguments are those of `SbasCorrections.ionosphere`."""
+    """Return slant delays at epochs; for the arguments see `SbasCorrections.ionosphere`."""
     latitude, longitude, obliquity = pierce_point(latitude_deg, longitude_deg, elevation_deg, azimuth_deg)
     shape = latitude.shape
     t = np.repeat(np.arange(len(time)), shape[1])

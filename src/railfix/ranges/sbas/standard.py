@@ -89,8 +89,8 @@ SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 NOT_MONITORED: Final = 14
 DO_NOT_USE: Final = 15
 STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for this time [s] (DO-229D, A.4.4.1).
-#: Messages older than this are not used, even if type 6 renews a fast correction: the longest time-out except that of
-#: service regions [s].
+#: Messages older than this are not used, even if type 6 renews a fast correction: the longest time-out, without service
+#: regions [s].
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
 #: Types that affect messages received later (stops and masks), and are therefore kept for twice that time.
 LEANT_ON: Final = (0, 1, 18)

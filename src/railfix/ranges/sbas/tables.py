@@ -183,9 +183,9 @@ class SatelliteTables:
         return Series.of(np.where(number > 0, number, -1), time, decoded)
 
     def _udre(self, messages: SbasMessages) -> Series:
-        """Return the UDREI of fast corrections, and those of type 6.
+        """Return the UDREI from fast corrections and from type 6.
 
-        Type 6 updates the UDREI of the corrections with its IODF; an alarm updates those of all corrections.
+        Type 6 updates the UDREI of the corrections with its IODF; an alarm updates the UDREI of all corrections.
         """
         fast, six = self.fast, decode(messages, 6)
         time = np.repeat(messages.time[six["row"]], SLOTS)
