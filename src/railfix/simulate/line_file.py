@@ -1,8 +1,8 @@
-"""Settings of the simulated line, and a track file as the line: a smooth curve through its points.
+"""Settings of the simulated line, and lines made from a track file, which are smooth curves through its points.
 
-Between the points it is a cubic spline in space (not-a-knot), whose arc length is the chainage. Cant changes linearly
-from point to point, on the side of the file's radius, of the spline's curvature where the file has none. A file with a
-curve of a radius below 30 m is an error.
+The curve is a cubic spline in space (not-a-knot), whose arc length is the chainage. Cant is linear between points; the
+outer side follows from the file's radii, or from the curvature of the spline if the file has no radii. A file with a
+radius below 30 m is rejected.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from railfix.simulate.settings import (
 )
 from railfix.track import Track, read_track
 
-#: Default length of the pattern of P1's test line [m], and of a generated line.
+#: Default lengths of the pattern of P1's test line, and of a generated line [m].
 PATTERN_LENGTH_M: Final = 756.0
 GENERATED_LENGTH_M: Final = 36_000.0
-LONGEST_LINE_M: Final = 1e7  #: Longest line, and longest element of one [m].
+LONGEST_LINE_M: Final = 1e7  #: Largest length of a line and of an element [m].
 
 
 class Element(ScenarioSettings):
     """Horizontal alignment element."""
 
-    #: A transition is a clothoid from the previous element to the next; cant rises with its curvature.
+    #: Kind of element; a transition is a clothoid from the previous to the next element, with a linear cant ramp.
     kind: Literal["straight", "transition", "curve"]
 
     length_m: float = Field(gt=0.0, le=LONGEST_LINE_M)
-    #: Radius of a curve, positive to the right; infinite for the others.
+    #: Radius of a curve, positive to the right; infinite for other elements.
     radius_m: float = Field(default=math.inf, allow_inf_nan=True)
-    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)  #: Cant of a curve: outer rail above inner rail.
+    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)  #: Cant of a curve, outer rail above inner rail.
 
     @model_validator(mode="after")
     def _curves_alone_bend(self) -> Element:
@@ -64,36 +64,35 @@ class Element(ScenarioSettings):
 
 
 class Gradient(ScenarioSettings):
-    """Gradient from a chainage on."""
+    """Gradient of the line from a chainage to the next change of gradient."""
 
     from_m: NotNegative  #: Chainage of the change of gradient, the middle of its vertical curve.
     permille: float = Field(ge=-100.0, le=100.0)  #: Positive where the line rises with chainage.
-    vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve that joins it to the previous gradient.
+    vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve from the previous gradient to this gradient.
 
 
 class Terrain(ScenarioSettings):
-    """Limits of the elements of a generated line from a chainage on; lengths and radii are uniform in their ranges."""
+    """Ranges of uniformly distributed properties of a generated line, from a chainage to that of the next terrain."""
 
-    from_m: NotNegative = 0.0
-    #: Range of the lengths of straights and curves, without transitions, and of the radii.
-    straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)
-    curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
-    radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)
-    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Steepest gradient.
+    from_m: NotNegative = 0.0  #: Chainage at which this terrain begins.
+    straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)  #: Range of the lengths of straights.
+    curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)  #: Range of the lengths of curves without transitions.
+    radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)  #: Range of the radii.
+    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Largest gradient.
     #: Range of the distance between two changes of gradient.
     gradient_m: Annotated[Between, at_least(200.0)] = (400.0, 1500.0)
 
 
 class GeneratedLine(ScenarioSettings):
-    """Commercial line generated from a seed."""
+    """Commercial line generated at random."""
 
-    seed: Seed = 1  #: Seed of the line alone, so that several runs share it.
-    #: The cant is the equilibrium cant at this speed, up to `largest_cant_m`, in steps of 5 mm.
+    seed: Seed = 1  #: Seed of the line, separate from the seed of the run, so that several runs can share a line.
+    #: Speed of the equilibrium cant, which curves have up to `largest_cant_m`, in steps of 5 mm.
     speed_mps: Positive = 110.0 / 3.6
 
     largest_cant_m: NotNegative = 0.105
-    vertical_radius_m: Positive = 4000.0
-    terrain: tuple[Terrain, ...] = (Terrain(),)  #: By rising `from_m`, the first from 0.
+    vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curves.
+    terrain: tuple[Terrain, ...] = (Terrain(),)  #: Terrains in order of `from_m`, the first from 0.
 
     @field_validator("terrain")
     @classmethod
@@ -107,14 +106,12 @@ class GeneratedLine(ScenarioSettings):
 class LineFile(ScenarioSettings):
     """Track file used as the line."""
 
-    path: str  #: As read by `railfix.track.read_track`; in a scenario file relative to that file.
-    #: Part of the file's chainage that is used.
-    from_m: NotNegative = 0.0
-    to_m: float = Field(default=math.inf, allow_inf_nan=True)
-    #: As the options of `read_track`; empty where the file states them itself.
-    crs: str = ""
-    height_datum: str = ""
-    geoid: str = ""
+    path: str  #: Path for `railfix.track.read_track`; in a scenario file relative to the folder of the scenario file.
+    from_m: NotNegative = 0.0  #: Chainage of the file at which the line begins.
+    to_m: float = Field(default=math.inf, allow_inf_nan=True)  #: Chainage of the file at which the line ends.
+    crs: str = ""  #: Option of `read_track`; empty if the file states it.
+    height_datum: str = ""  #: Option of `read_track`; empty if the file states it.
+    geoid: str = ""  #: Option of `read_track`; empty if not needed.
 
     _forward = field_validator("to_m")(beyond_start)
 
@@ -122,40 +119,38 @@ class LineFile(ScenarioSettings):
 class MapError(ScenarioSettings):
     """Offset of the map from the true line: a smooth Gaussian function of chainage."""
 
-    plan_sigma_m: NotNegative = 0.0  #: Standard deviation of each of the east and north offsets.
-    height_sigma_m: NotNegative = 0.0
+    plan_sigma_m: NotNegative = 0.0  #: Standard deviation of the east offset and of the north offset.
+    height_sigma_m: NotNegative = 0.0  #: Standard deviation of the vertical offset.
     correlation_m: Positive = 500.0  #: Distance along the line over which the correlation falls to exp(-1/2).
     seed: Seed = 1
 
 
 def _length_m(given: dict[str, Any]) -> float:
-    """Return the length of a line whose settings do not give it."""
+    """Return the default length of a line of the given settings; NaN for a track file."""
     total = math.fsum(item.length_m for item in given.get("elements", ()))
     by_kind = {"pattern": PATTERN_LENGTH_M, "generated": GENERATED_LENGTH_M, "elements": total}
     return by_kind.get(given.get("kind", "file"), math.nan)
 
 
 class LineSettings(ScenarioSettings):
-    """The line and the spacing of its map."""
+    """Line and spacing of the points of its map."""
 
     name: str = "simulated test line"
-    #: The pattern of P1's test line; `elements` and `gradients`; `generated`; or `file`.
+    #: Source of the line: the pattern of P1's test line, `elements` with `gradients`, `generated`, or `file`.
     kind: Literal["pattern", "elements", "generated", "file"] = "pattern"
-    #: First point; ellipsoidal height. Not used for a file.
-    latitude_deg: float = Field(default=35.05, gt=-80.0, lt=80.0)
-    longitude_deg: Finite = 135.45
-    height_m: Finite = 162.0
-    azimuth_deg: Finite = 63.0  #: Direction of the line at its first point. Not used for a file.
-    #: Kilometrage of the first point; it rises with chainage. A file has its own.
+    latitude_deg: float = Field(default=35.05, gt=-80.0, lt=80.0)  #: Latitude of the first point; not used for a file.
+    longitude_deg: Finite = 135.45  #: Longitude of the first point; not used for a file.
+    height_m: Finite = 162.0  #: Ellipsoidal height of the first point; not used for a file.
+    azimuth_deg: Finite = 63.0  #: Azimuth of the line at its first point; not used for a file.
+    #: Kilometrage of the first point; it rises with chainage. Not used for a file, which has its own kilometrage.
     kilometrage_start_m: Finite = 12_340.0
-    #: Largest spacing of the map's points; curves include their transitions. A file has its own points.
-    straight_spacing_m: Positive = 20.0
-    curve_spacing_m: Positive = 2.32
+    straight_spacing_m: Positive = 20.0  #: Largest spacing of map points on straights; not used for a file.
+    curve_spacing_m: Positive = 2.32  #: Largest spacing of map points in curves and transitions; not used for a file.
 
     elements: tuple[Element, ...] = ()
-    gradients: tuple[Gradient, ...] = ()  #: Level where absent.
-    #: The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated line ends here.
-    #: For elements the length is their sum, for a file its own length (NaN here).
+    gradients: tuple[Gradient, ...] = ()  #: Gradients by rising chainage; without any the line is level.
+    #: Length of the line. The pattern of 756 m is repeated, every second copy mirrored, and cut off at this length. The
+    #: length of elements is their sum; for a file it must be NaN.
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
 
     generated: GeneratedLine = GeneratedLine()
@@ -164,7 +159,7 @@ class LineSettings(ScenarioSettings):
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> LineSettings:
-        """Reject settings of another kind of line."""
+        """Reject settings that belong to another kind of line, and lengths that do not fit the kind."""
         total = math.fsum(item.length_m for item in self.elements)
         if (self.kind == "elements") != bool(self.elements) or (self.gradients and not self.elements):
             raise ValueError(f"elements (and gradients) go with kind 'elements', got {self.kind!r}")
@@ -183,26 +178,23 @@ class LineSettings(ScenarioSettings):
         return self
 
 
-#: Distance between the wheels' contact points of the generated lines [m], for the equilibrium cant.
+#: Distance between the contact points of a wheelset on generated lines [m], for the equilibrium cant.
 _CONTACT_M: Final = 1.137
-#: A generated line turns back when its direction differs from the first by this [rad],
+#: Change of direction from which the next curve of a generated line turns back [rad].
 _FAR_RAD: Final = np.radians(50.0)
-_HIGH_M: Final = 150.0  #: and when it has climbed or fallen by this [m].
-_CANT_STEP_M: Final = 0.005  #: Cant is rounded to steps [m]; transitions to whole metres.
+_HIGH_M: Final = 150.0  #: Height difference from which the next gradient of a generated line leads back [m].
+_CANT_STEP_M: Final = 0.005  #: Step to which cant is rounded [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Knots:
-    """Curvature, lean and gradient, linear between knots."""
+    """Curvature and cant at K knots, and gradient at G knots, linear between the knots."""
 
-    #: Chainage of the elements' ends from 0 [m]; in plan, right positive [1/m]; cant, positive where the vehicle leans
-    #: right [m]; shape (K,).
-    knot_m: Floats
-    curvature: Floats
-    lean_m: Floats
-    #: Chainage [m] and gradient [m/m, climb over plan length]; shape (G,).
-    grade_knot_m: Floats
-    grade: Floats
+    knot_m: Floats  #: Chainage of the ends of the elements, from 0, shape (K,).
+    curvature: Floats  #: Curvature in plan, positive to the right, shape (K,) [1/m].
+    lean_m: Floats  #: Cant, positive where the vehicle leans to the right, shape (K,).
+    grade_knot_m: Floats  #: Chainage of the knots of the gradient, shape (G,).
+    grade: Floats  #: Gradient, climb over plan length, shape (G,) [m/m].
 
 
 def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
@@ -226,7 +218,10 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
 
 
 def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, Floats]:
-    """Return gradients joined by vertical curves in which the gradient changes evenly."""
+    """Return the chainages and gradients of the ends of the vertical curves, between which the gradient is linear.
+
+    Raise SettingsError where a vertical curve overlaps another or an end of the line.
+    """
     places, values, reached, current = [0.0], [0.0], 0.0, 0.0
     for k, item in enumerate(gradients):
         value = 1e-3 * item.permille
@@ -247,7 +242,7 @@ def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, F
 
 
 def generate_knots(settings: LineSettings) -> Knots:
-    """Return the knots of a generated line, straights and curves in turn."""
+    """Return the knots of a generated line, in which straights and curves alternate."""
     rng = np.random.default_rng([settings.generated.seed, 11])
     return knots_of_elements(_plan(settings, rng), _profile(settings, rng))
 
@@ -266,7 +261,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
         straight, curve = (float(np.round(rng.uniform(*r))) for r in (here.straight_m, here.curve_m))
         to_right = rng.random() < 0.5 if abs(heading) < _FAR_RAD else heading < 0.0
         side = 1.0 if to_right else -1.0
-        # Equilibrium cant; transition of 400 times the cant and of 8 times cant and speed in km/h, m each.
+        # Equilibrium cant. The transition is at least 20 m, 400 cant, and 8 cant times the speed in km/h long.
         cant = min(limits.speed_mps**2 / (GRAVITY_MPS2 * radius) * _CONTACT_M, limits.largest_cant_m)
         cant = float(np.round(np.round(cant / _CANT_STEP_M) * _CANT_STEP_M, 3))
         speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(GRAVITY_MPS2 * radius * (cant + 0.06) / _CONTACT_M))
@@ -284,7 +279,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
 
 
 def _cut(elements: list[Element], length_m: float) -> list[Element]:
-    """Return the elements up to the length: a last curve that does not fit is replaced by a straight."""
+    """Return the elements up to a length; a straight replaces the last curve and its transitions if they do not fit."""
     while elements and sum(item.length_m for item in elements) > length_m:
         # Straight, transition, curve, transition: all four are replaced.
         del elements[-4:]
@@ -302,7 +297,7 @@ def _profile(settings: LineSettings, rng: np.random.Generator) -> list[Gradient]
         permille = float(np.round(rng.uniform(-here.permille, here.permille) * 2.0) / 2.0)
         if abs(height) > _HIGH_M:
             permille = -float(np.sign(height)) * abs(permille)
-        # Half of the vertical curve ahead and half of the vertical curve behind have to fit.
+        # The change of gradient is limited so that vertical curves do not overlap.
         fits = 0.9 * min(step, behind) / limits.vertical_radius_m * 1e3
         permille = float(np.clip(permille, before - fits, before + fits))
         if place + 2.0 * step > settings.length_m:
@@ -312,22 +307,25 @@ def _profile(settings: LineSettings, rng: np.random.Generator) -> list[Gradient]
     return changes
 
 
-_STEP_M: Final = 0.5  #: Spacing of the points by which the spline is turned into one of arc length [m].
-_TIGHTEST_M: Final = 30.0  #: Tightest plausible curve [m].
+_STEP_M: Final = 0.5  #: Spacing of the points at which the spline is converted to a function of arc length [m].
+_TIGHTEST_M: Final = 30.0  #: Smallest plausible radius of a curve [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileLine:
-    """The line of a track file."""
+    """Line through the V points of a track file."""
 
-    track: Track  #: The file's points that are used.
+    track: Track  #: Points of the file that are used.
     point_m: Floats  #: Chainage of the points on the curve, shape (V,).
-    curve: CubicHermiteSpline[np.float64]  #: Points of the line, ECEF [m], over chainage [m].
+    curve: CubicHermiteSpline[np.float64]  #: ECEF position [m] of the line as a function of chainage [m].
     knots: Knots
 
 
 def line_of_file(settings: LineFile) -> FileLine:
-    """Return the line through the points of a track file; InputFileError where it has too few, or too sharp a curve."""
+    """Return the line through the points of a track file.
+
+    Raise InputFileError where there are fewer than four points, or a radius is below `_TIGHTEST_M`.
+    """
     track = read_track(
         settings.path,
         crs=settings.crs or None,
@@ -352,7 +350,7 @@ def line_of_file(settings: LineFile) -> FileLine:
         raise InputFileError(
             settings.path,
             f"bends with a radius of {1.0 / abs(curvature[worst]):.1f} m at {at[worst]:.1f} m of it, expected at least "
-            f"{_TIGHTEST_M:g} m; take out points that jitter, or the digits are too few (map convert can thin it)",
+            f"{_TIGHTEST_M:g} m; remove noisy points, or give coordinates with more digits",
         )
     point = np.interp(track.chainage_m, at, arc)
     return FileLine(
@@ -364,7 +362,10 @@ def line_of_file(settings: LineFile) -> FileLine:
 
 
 def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, Floats]:
-    """Return parameters at about every half metre, including the knots, and the arc length there (Gauss, 3 points)."""
+    """Return parameters of the spline about every half metre, including the knots, and their arc lengths.
+
+    The arc length is integrated by three-point Gauss quadrature.
+    """
     pieces = np.maximum(np.ceil(np.diff(knots) / _STEP_M).astype(np.int64), 1)
     knot, number = places_in_groups(pieces)
     at = np.append(knots[knot] + number * (np.diff(knots) / pieces)[knot], knots[-1])
@@ -376,7 +377,10 @@ def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, 
 
 
 def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Floats, Floats]:
-    """Return the curvature in plan, right positive [1/m], and gradient [m/m]."""
+    """Return the curvature in plan, positive to the right [1/m], and the gradient [m/m].
+
+    `place`, `slope` and `bend` are ECEF position, first and second derivative of the spline, shape (n, 3).
+    """
     axes = axes_at(place)
     v, a = np.einsum("nij,nj->ni", axes, slope), np.einsum("nij,nj->ni", axes, bend)
     plan = np.hypot(v[:, 0], v[:, 1])
@@ -384,7 +388,7 @@ def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Fl
 
 
 def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: Floats) -> Knots:
-    """Return the curvature of the file where it has radii, else of the spline; lean of the file's cant."""
+    """Return the knots of a line from a file: curvature from its radii, else from the spline; cant from the file."""
     bend = (
         np.interp(arc, point, _fill_gaps(point, 1.0 / track.radius_m))
         if (~np.isnan(track.radius_m)).any()
@@ -396,6 +400,6 @@ def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: F
 
 
 def _fill_gaps(point: Floats, values: Floats) -> Floats:
-    """Return values with NaN filled by their neighbours."""
+    """Return values in which NaN is interpolated linearly over chainage, and at the ends replaced by the next value."""
     known = np.isfinite(values)
     return np.interp(point, point[known], values[known])

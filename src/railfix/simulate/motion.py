@@ -1,8 +1,8 @@
 """Chainage and speed of the train over time, and true positions of its antennas.
 
-A shuttle between two points, or a run curve: as fast as the line, its curves and the train permit, stopping at
-stations. Antennas are on a rigid body with both bogie centres on the continuous line, by Newton's method and Rodrigues'
-rotation, independently of `railfix.track.vehicle`.
+The motion is a shuttle between two points, or a run curve with stops at stations and the highest speed that line,
+curves and train permit. Antennas are on a rigid body with both bogie centres on the continuous line; they are computed
+by Newton's method and Rodrigues' rotation, independently of `railfix.track.vehicle`.
 """
 
 from __future__ import annotations
@@ -27,22 +27,24 @@ if TYPE_CHECKING:
     from railfix.simulate.scenario import Scenario
 
 
-_ROUNDS: Final = 20  #: Rounds in which the length of the average is lengthened until every change of acceleration fits.
+_ROUNDS: Final = 20  #: Maximum number of rounds in which the averaging time is increased until the jerk is in limits.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Pieces of constant jerk (without a limit of the jerk: of constant acceleration); the last one continues."""
+    """Motion in P pieces of constant jerk, or of constant acceleration if the jerk is not limited.
 
-    time_s: Floats  #: Start of each piece, rising from 0; shape (P,).
-    #: Values at the start of the piece, positive toward rising chainage; shape (P,).
-    chainage_m: Floats
-    speed_mps: Floats
-    acceleration_mps2: Floats
-    jerk_mps3: Floats | float = 0.0  #: Shape (P,) [m/s^3].
+    Speed, acceleration and jerk are positive toward rising chainage. The last piece has no end.
+    """
+
+    time_s: Floats  #: Start of each piece, rising from 0, shape (P,).
+    chainage_m: Floats  #: Chainage at the start of each piece, shape (P,).
+    speed_mps: Floats  #: Speed at the start of each piece, shape (P,).
+    acceleration_mps2: Floats  #: Acceleration at the start of each piece, shape (P,).
+    jerk_mps3: Floats | float = 0.0  #: Jerk of each piece, shape (P,) [m/s^3].
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the chainage [m] and speed [m/s] at times; before 0 the train is at rest."""
+        """Return the chainage [m] and speed [m/s] at times; before time 0 the values are those at 0."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.maximum(np.searchsorted(self.time_s, time, side="right") - 1, 0)
         since = np.maximum(time - self.time_s[piece], 0.0)
@@ -54,7 +56,7 @@ class Motion:
         return chainage + jerk * since**3 / 6.0, speed + jerk * since**2 / 2.0
 
     def acceleration_at(self, time_s: ArrayLike) -> Floats:
-        """Return the acceleration along the line [m/s^2] at times; before 0 none."""
+        """Return the acceleration along the line at times [m/s^2]; before time 0 it is 0."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.searchsorted(self.time_s, time, side="right") - 1
         at = np.maximum(piece, 0)
@@ -65,7 +67,10 @@ class Motion:
 
 
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
-    """Average a motion over a time T that limits its jerk: the speed is ``(s(t) - s(t - T)) / T``, late by T / 2."""
+    """Return a motion whose jerk is limited by averaging over a time T.
+
+    The speed becomes ``(s(t) - s(t - T)) / T``, which is delayed by T / 2 on average.
+    """
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3
     if duration == 0.0:
@@ -97,20 +102,20 @@ def _breakpoints(start_s: Floats, duration_s: float) -> Floats:
 
 
 def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> Floats:
-    """Return the acceleration at breakpoints less that a duration earlier, both just after them."""
+    """Return the acceleration just after breakpoints less the acceleration a duration earlier [m/s^2]."""
     after = time_s + 1e-9
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
 
-_STEP_M: Final = 2.0  #: Spacing of the positions at which a run curve evaluates the limits [m].
-_RAIL_HEAD_M: Final = 0.070  #: Distance of the wheels' contact points less the gauge [m].
+_STEP_M: Final = 2.0  #: Spacing of the positions at which a run curve evaluates the speed limits [m].
+_RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelset less the gauge [m].
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
-    """Return the motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or such are given.
+    """Return the motion of the middle of the vehicle: a shuttle, or a run curve if its settings are not the defaults.
 
-    Its duration is the scenario's unless given; 0: one way, to the last stop and its standstill. SettingsError: when
-    the train does not fit on the line.
+    The duration is that of the scenario unless given; with 0 the motion ends at the last stop of the first leg. Raise
+    SettingsError where the train does not fit on the line.
     """
     settings = scenario.run
     scenario.check_room(line.length_m)
@@ -126,12 +131,12 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Return the motion between two chainages, with a standstill at each, for at least a duration."""
+    """Return the motion to and fro between two chainages, with a standstill at each, for at least a duration."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
     cruise_s = max(0.0, (length - top**2 / (2.0 * up) - top**2 / (2.0 * down)) / top)
-    # One leg: accelerate, cruise, brake, stand; in the coordinates of its own direction.
+    # Phases of a leg in its own direction: acceleration, cruising, braking, standstill.
     steps = np.array([top / up, cruise_s, top / down, settings.stand_s])
     offsets = np.array([0.0, top**2 / (2.0 * up), length - top**2 / (2.0 * down), length])
     speeds, accelerations = np.array([0.0, top, top, 0.0]), np.array([up, 0.0, -down, 0.0])
@@ -149,9 +154,9 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
 
 
 def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, contact_m: float) -> Motion:
-    """Motion from stop to stop at the highest allowed speed, for at least a duration and to the last stop at least.
+    """Return the motion from stop to stop at the highest permitted speed, for at least a duration and to the last stop.
 
-    The distance of the wheels' contact points gives the speed in canted curves.
+    `contact_m` is the distance between the contact points of a wheelset, which determines the speed in canted curves.
     """
     margin = settings.end_margin_m
     ends = (
@@ -176,10 +181,11 @@ def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, cont
 
 
 def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, contact_m: float) -> Floats:
-    """Motion from standstill to standstill: rows of time from the start, chainage, speed, acceleration, shape (4, P).
+    """Return the motion from one standstill to the next, shape (4, P).
 
-    The square of the speed that can be reached from the limits behind is the least of their squares
-    plus ``2 a`` times the distance to each; from the limits ahead likewise.
+    The rows are time since the start, chainage, speed and acceleration. The square of the speed at a position is at
+    most the square of each speed limit plus ``2 a`` times the distance to this limit, with the acceleration for limits
+    behind and the deceleration for limits ahead.
     """
     cells = max(2, int(np.ceil(abs(last_m - first_m) / _STEP_M)))
     way = np.linspace(0.0, abs(last_m - first_m), cells + 1)
@@ -192,7 +198,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
     square = np.minimum(square, np.minimum.accumulate(square - up) + up)
     square = np.maximum(np.minimum(square, np.minimum.accumulate((square + down)[::-1])[::-1] - down), 0.0)
     square[[0, -1]] = 0.0
-    # Cells of one acceleration form one piece.
+    # Neighbouring cells of equal acceleration are combined into one piece.
     acceleration = np.diff(square) / (2.0 * np.diff(way))
     change = np.flatnonzero(np.abs(np.diff(acceleration)) > 1e-6) + 1
     corner = np.concatenate([[0], change, [cells]])
@@ -210,7 +216,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
 
 
 def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_m: float) -> Floats:
-    """Return the highest speed at positions [m/s]: cruising, limits of the line, and curves."""
+    """Return the highest permitted speed at chainages [m/s] by cruising speed, speed limits and cant deficiency."""
     limit = np.full(chainage_m.shape, settings.cruise_mps)
     for part in settings.limits:
         inside = (chainage_m >= part.from_m) & (chainage_m <= part.to_m)
@@ -218,19 +224,20 @@ def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_
     if settings.cant_deficiency_m is not None:
         bend = np.abs(line.curvature_at(chainage_m))
         cant = np.abs(line.lean_at(chainage_m)) + settings.cant_deficiency_m
-        # Equilibrium: v^2 curvature / g = cant / distance of the contact points.
+        # Equilibrium: v^2 curvature / g = cant / distance between the contact points.
         limit = np.minimum(limit, np.sqrt(GRAVITY_MPS2 * cant / (contact_m * np.maximum(bend, 1e-9))))
     return limit
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaTruth:
-    """True positions of one antenna at n positions of the vehicle's middle."""
+    """True positions of an antenna at n positions of the vehicle."""
 
-    ecef_m: Floats  #: Shape (n, 3).
-    #: Centreline point in the plane through the antenna perpendicular to the bogies' line; shape (n,).
+    ecef_m: Floats  #: Position of the antenna, shape (n, 3).
+    #: Chainage of the centreline point in the plane through the antenna perpendicular to the line between the bogies,
+    #: shape (n,).
     chainage_m: Floats
-    forward: Floats  #: Unit vector of the body's long axis, shape (n, 3).
+    forward: Floats  #: Unit vector of the longitudinal axis of the body, shape (n, 3).
 
 
 def antenna_truth(
@@ -241,11 +248,19 @@ def antenna_truth(
     sway_rad: Floats | float = 0.0,
     pitch_rad: Floats | None = None,
 ) -> AntennaTruth:
-    """True position of an antenna at n positions of the vehicle's middle, midway between the bogies' chainages.
+    """Return the true positions of an antenna at n positions of the vehicle.
 
-    `offset_m`: along, across to the right, above the rail tops. Sway is the lean to the right in addition to the cant,
-    pitch the rotation beyond the gradient, about the point between the bogies at the rail tops, positive where the
-    front rises; each of shape (n,) or one number [rad].
+    Parameters
+    ----------
+    offset_m : tuple of float [m]
+        Position of the antenna in the body: along, across to the right, above the rail tops.
+    middle_m : ndarray, shape (n,) [m]
+        Chainage midway between the chainages of the two bogie centres.
+    sway_rad : ndarray, shape (n,), or float [rad]
+        Lean to the right in addition to the cant.
+    pitch_rad : ndarray, shape (n,), optional [rad]
+        Rotation in addition to the gradient, about the point between the bogies at the rail tops, positive where the
+        front rises.
     """
     middle = np.asarray(middle_m, dtype=np.float64)
     half = np.full(middle.shape, vehicle.bogie_distance_m / 2.0)
@@ -270,7 +285,7 @@ def antenna_truth(
         cosine, sine = np.cos(pitch_rad)[:, None], np.sin(pitch_rad)[:, None]
         forward, upright = cosine * forward + sine * upright, cosine * upright - sine * forward
     arm = across * np.cross(forward, upright) + up * upright
-    # A lean to the right turns the body about its forward axis.
+    # A lean to the right is a rotation about the forward axis of the body.
     turned = np.cos(lean)[:, None] * arm + np.sin(lean)[:, None] * np.cross(forward, arm)
     place = origin + along * forward + turned
     abeam = middle + along
@@ -280,15 +295,14 @@ def antenna_truth(
     return AntennaTruth(ecef_m=place, chainage_m=abeam, forward=forward)
 
 
-FULL_SPEED_MPS: Final = 20.0  #: Speed at and above which the random motions of the body have their full size [m/s].
-#: Step of the response to accelerations [s], and damping ratio of the suspension.
-_STEP_S: Final = 0.01
-_DAMPING: Final = 0.3
-_MARGIN_S: Final = 2.0  #: Time before the start and after the end of the run over which the motion is given [s].
+FULL_SPEED_MPS: Final = 20.0  #: Speed from which the random motions of the body have their full amplitude [m/s].
+_STEP_S: Final = 0.01  #: Time step of the pitch response to accelerations [s].
+_DAMPING: Final = 0.3  #: Damping ratio of the suspension.
+_MARGIN_S: Final = 2.0  #: Margin before the start and after the end of the run for which pitch is computed [s].
 
 
 class BodyMotion:
-    """Roll and pitch of a scenario's vehicle over time; the seed of the scenario decides."""
+    """Roll and pitch of the vehicle of a scenario over time, drawn from the seed of the scenario."""
 
     def __init__(self, scenario: Scenario, motion: Motion) -> None:
         vehicle = self._vehicle = scenario.vehicle
@@ -300,11 +314,11 @@ class BodyMotion:
         self._pitch = RandomFunction.periodic(rng, sigma=float(pitch), period=vehicle.pitch_period_s)
 
     def roll_rad(self, time_s: Floats, speed_mps: Floats) -> Floats:
-        """Lean to the right [rad] at times and speeds; none while the train is at rest."""
+        """Return the lean to the right in addition to the cant at times and speeds [rad]; 0 at standstill."""
         return self._roll.at(time_s) * np.minimum(np.abs(speed_mps) / FULL_SPEED_MPS, 1.0)
 
     def pitch_rad(self, time_s: Floats, speed_mps: Floats) -> Floats | None:
-        """Pitch [rad] at times and speeds, positive where the front rises; None where the vehicle does not pitch."""
+        """Return the pitch at times and speeds [rad], positive where the front rises; None if no pitch is set."""
         vehicle = self._vehicle
         if vehicle.pitch_sigma_deg == 0.0 and vehicle.pitch_deg_per_mps2 == 0.0:
             return None
@@ -313,7 +327,7 @@ class BodyMotion:
 
     @cached_property
     def _response(self) -> CubicSpline[np.float64]:
-        """Pitch under the train's acceleration: a damped oscillator of the suspension's period."""
+        """Pitch by the acceleration of the train, the response of a damped oscillator with period `pitch_period_s`."""
         from scipy.signal import cont2discrete, lfilter
 
         last = max(self._duration_s, float(self._motion.time_s[-1])) + _MARGIN_S

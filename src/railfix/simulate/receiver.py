@@ -1,8 +1,4 @@
-"""A simulated receiver: channels, time-correlated noise, loss of lock, with the state between chunks.
-
-Klobuchar (IS-GPS-200, 20.3.3.5.2.5) and Saastamoinen with the standard atmosphere and 70 % relative
-humidity: a receiver that applies them corrects the simulated delays exactly, unless a scale changes them.
-"""
+"""Simulated receiver: channels, clocks, time-correlated noise and loss of lock, with the state between chunks."""
 
 from __future__ import annotations
 
@@ -24,7 +20,10 @@ from railfix.simulate.settings import InterSystemSettings, NoiseSettings, Tracki
 
 
 class CarriedNoise:
-    """Correlated noise of a receiver's channels, independent of the chunks; `key` is the seed of the receiver."""
+    """Time-correlated noise of the channels of a receiver, continued from chunk to chunk.
+
+    `key` is the seed of the receiver. The noise does not depend on the length of the chunks.
+    """
 
     def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
         self._settings = settings
@@ -32,20 +31,20 @@ class CarriedNoise:
         self._cn0 = _FirstOrder((*key, 1), channels, interval_s / settings.cn0_wander_time_s)
 
     def code(self, white: Floats) -> Floats:
-        """Return the code noise of standard deviation 1, shape (T, M), from white noise of that shape."""
+        """Return code noise of standard deviation 1, shape (T, M); `white` is its uncorrelated part, shape (T, M)."""
         share = self._settings.code_correlated_share
         if share == 0.0:
             return white
         return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
 
     def cn0_db(self, epochs: int) -> Floats | float:
-        """Return the variation of C/N0 [dB] over the next epochs, shape (T, M); 0 without any."""
+        """Return the variation of C/N0 over the next epochs, shape (T, M) [dB], or 0 if its sigma is 0."""
         sigma = self._settings.cn0_wander_sigma_db
         return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
 
 
 class _FirstOrder:
-    """Autoregressive series of order 1 and standard deviation 1: ``x[k] = rho x[k-1] + sqrt(1 - rho^2) w[k]``."""
+    """Autoregressive process of order 1 and standard deviation 1, ``x[k] = rho x[k-1] + sqrt(1 - rho^2) w[k]``."""
 
     def __init__(self, key: Sequence[int], channels: int, steps_a_time: float) -> None:
         self._rng = np.random.default_rng(list(key))
@@ -59,14 +58,17 @@ class _FirstOrder:
 
 
 class CodeSmoothing:
-    """Low-pass of code errors since lock (0 s: none): ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``."""
+    """Low-pass filter of code errors: ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``.
+
+    The filter restarts at each lock. With a time constant of 0 errors are not filtered.
+    """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
         self._keep = float(np.exp(-interval_s / time_s)) if time_s > 0.0 else 0.0
         self._state = np.full(channels, np.nan)
 
     def next(self, error_m: Floats, lost: Masks) -> Floats:
-        """Return the filtered errors of the next epochs, shape (T, M); unchanged where lost."""
+        """Return the filtered errors of the next epochs, shape (T, M); unchanged where the signal is lost."""
         if self._keep == 0.0:
             return error_m
         smoothed, keep = error_m.copy(), self._keep
@@ -85,21 +87,21 @@ class CodeSmoothing:
 
 @dataclass(frozen=True, kw_only=True)
 class LockState:
-    """Lock state of a receiver's channels."""
+    """Lock state of the channels of a receiver over T epochs."""
 
-    lost: Masks  #: Absent, shape (T, M).
-    slip_cycles: Floats | float  #: Whole cycles that the phase has moved since the start, shape (T, M).
-    loss_of_lock: Bytes  #: Bit 0 at the first epoch after a loss, shape (T, M).
+    lost: Masks  #: Whether the signal is not tracked, shape (T, M).
+    slip_cycles: Floats | float  #: Whole cycles by which the phase has slipped since the start, shape (T, M).
+    loss_of_lock: Bytes  #: Loss-of-lock indicator; bit 0 is set at the first epoch after a loss; shape (T, M).
 
 
 class TrackingNoise:
-    """Loss of lock and re-acquisition of a receiver's channels, carried from chunk to chunk."""
+    """Loss of lock and re-acquisition of the channels of a receiver, continued from chunk to chunk."""
 
     def __init__(self, settings: TrackingSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
         self._settings = settings
         self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
         self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
-        # Epochs since the signal could last not be tracked; at the start it is assumed to have been trackable.
+        # Epochs since the last epoch at which the signal was not trackable; before the start it is assumed trackable.
         self._since = np.full(channels, self._wait + 1, dtype=np.int64)
         self._seen = np.zeros(channels, dtype=np.bool_)
         self._present = np.zeros(channels, dtype=np.bool_)
@@ -107,14 +109,14 @@ class TrackingNoise:
         self._weak = np.zeros(channels, dtype=np.bool_)
 
     def too_weak(self, cn0_dbhz: Floats) -> Masks:
-        """Return signals that have fallen below the threshold and not yet risen to the C/N0 of re-acquisition."""
+        """Return whether signals are below the threshold, or have not reached the re-acquisition C/N0 since, (T, M)."""
         threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
         if threshold is None:
             return np.zeros(cn0_dbhz.shape, dtype=np.bool_)
         weak = cn0_dbhz < threshold
         if again is None:
             return np.asarray(weak)
-        # The later of both events decides; without either, the state before the first epoch holds.
+        # The later of both events determines the state; without an event the state before the first epoch remains.
         epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
         fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
         risen = np.maximum.accumulate(
@@ -125,7 +127,7 @@ class TrackingNoise:
         return np.asarray(state)
 
     def follow(self, bad: Masks) -> LockState:
-        """Return the lock state over the next epochs of channels that cannot be tracked where `bad`, shape (T, M)."""
+        """Return the lock state over the next epochs; `bad` marks signals that are not trackable, shape (T, M)."""
         epoch = np.arange(1, len(bad) + 1, dtype=np.int64)[:, None]
         last_bad = np.maximum.accumulate(np.where(bad, epoch, -self._since), axis=0)
         since = epoch - last_bad
@@ -142,7 +144,10 @@ class TrackingNoise:
 
 
 def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
-    """Return phase offsets by losses of lock, pseudo-random whole cycles within 2e6 (splitmix64); 0 without a loss."""
+    """Return the phase offsets after a number of losses of lock [cycles]; 0 without a loss.
+
+    The offsets are pseudo-random whole numbers from -2e6 to 2e6 (splitmix64).
+    """
     mixed = salt + losses * np.uint64(0x9E3779B97F4A7C15)
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -151,21 +156,21 @@ def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
     return np.where(losses == 0, 0.0, cycles)
 
 
-#: Signals of each constellation, the first signal first.
+#: First and second signal of each constellation.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
-#: Two of each satellite with `ReceiverSettings.second` "L5".
+#: First and second signal of each constellation with `ReceiverSettings.second` "L5".
 _WITH_L5: Final = {"G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q"), "C": ("1P", "5P")}
 #: Streams of random numbers: white noise, correlated noise, cycle slips, satellites' power.
 _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
 def list_signals(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
-    """Return the signals that a receiver observes of a constellation."""
+    """Return the signals of a constellation that a receiver observes, as RINEX band and attribute such as "1C"."""
     return (_WITH_L5 if settings.has_l5 else SIGNALS)[letter][: settings.signals_per_satellite]
 
 
 class Receiver:
-    """One receiver's channels (satellite, in alphabetical order, and signal), and its state between chunks."""
+    """M channels of a receiver, each a satellite and signal in alphabetical order, and their state between chunks."""
 
     def __init__(
         self,
@@ -183,7 +188,7 @@ class Receiver:
         self.column = np.searchsorted(satellites, self.names)
         frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in channels])
         self.wavelength_m = SPEED_OF_LIGHT / frequency
-        #: Ionospheric delay relative to that on L1.
+        #: Ratio of the ionospheric delay on the signal's frequency to the delay on L1.
         self.scale = (FREQUENCY_L1 / frequency) ** 2
         self.second = np.array([g != list_signals(n[0], scenario.receiver)[0] for n, g in channels])
         self.group_delay_error_m = common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
@@ -191,7 +196,7 @@ class Receiver:
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if antenna == "rear" else 0.0) for o in offsets])
         self.offset_drift_mps = np.array([o.drift_mps for o in offsets])
         sigma = scenario.receiver.cn0_satellite_sigma_db
-        #: Difference of each satellite's C/N0 from the mean, the same for both receivers.
+        #: Constant C/N0 difference of each satellite, equal for all receivers.
         self.cn0_offset_db = sigma * np.array(
             [np.random.default_rng([scenario.seed, _POWER, *satellite_key(n)]).standard_normal() for n in self.names]
         )
@@ -213,17 +218,17 @@ class Receiver:
         return self._rng.standard_normal((epochs, len(self.names), 4))
 
 
-_WALK = 5  #: Stream of random numbers of the walks.
+_WALK = 5  #: Stream of random numbers: walks of the receiver clocks.
 
 
 class ReceiverClocks:
-    """Clocks of all receivers of a scenario over time."""
+    """Clock biases and drifts of all receivers of a scenario over time."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
 
     def _line(self, receiver: str) -> tuple[float, float]:
-        """Return bias at the start [s] and drift [s/s] of a receiver."""
+        """Return the clock bias at the start [s] and the constant drift [s/s] of a receiver."""
         settings = self._scenario.receiver
         bias, drift = settings.clock_bias_s, settings.clock_drift
         if receiver not in ANTENNAS:
@@ -233,7 +238,7 @@ class ReceiverClocks:
         return -0.61 * bias, 0.83 * drift
 
     def bias_s(self, receiver: str, tag_s: Floats) -> Floats:
-        """Return the tag minus GPS time at tags counted from the start, shape (T,) [s]."""
+        """Return the clock bias (time tag minus GPS time) at tags counted from the start, shape (T,) [s]."""
         bias, drift = self._line(receiver)
         value = bias + drift * tag_s
         walk = self._walk(receiver)
@@ -243,13 +248,13 @@ class ReceiverClocks:
         return value - np.rint(value * 1e3) * 1e-3 if steps else value
 
     def rate_mps(self, receiver: str, tag_s: Floats) -> Floats:
-        """Return the rate at tags, steps left out, shape (T,) [m/s]."""
+        """Return the clock drift at tags counted from the start, without millisecond steps, shape (T,) [m/s]."""
         even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self._line(receiver)[1])
         walk = self._walk(receiver)
         return even if walk is None else even + walk.rate(tag_s)[:, 0]
 
     def _walk(self, receiver: str) -> ClockWalk | None:
-        """Return the random walk of a receiver's clock, the same for both antennas where their clock is common."""
+        """Return the random walk of the clock of a receiver, or None; antennas with a common clock share one walk."""
         common = self._scenario.receiver.clocks == "common" and receiver in ANTENNAS
         return self._walks[ANTENNAS[0] if common else receiver]
 

@@ -1,4 +1,4 @@
-"""A simulated run as files: observations, navigation, track map, vehicle, sensors and ground truth."""
+"""Files of a simulated run: observations, navigation, track map, vehicle, sensors and ground truth."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
-#: Groups of settings for which the README lists only non-default settings.
+#: Prefixes of settings of which the README lists only non-default values.
 _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
 
 
 def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
-    """Text of a run's README, for the files that `railfix.simulate.write_run` gives and the command that made them."""
+    """Return the text of the README of a run.
+
+    `files` are the paths by name that `write_run` returns, `command` is the command that made them, or blank.
+    """
     scenario = simulation.scenario
     made = f"Made by `{command}`.\n" if command else "Made by `railfix.simulate.write_run`.\n"
     satellites = {name for name, _ in simulation.channels}
@@ -47,9 +50,9 @@ It is not a recording.
 {rows}
 
 {scenario.epochs} epochs at {scenario.rate_hz:g} Hz from {scenario.start} GPS time, {len(satellites)} satellites.
-The ranges hold the light time, the Earth's rotation, satellite and receiver clocks, group delays, Klobuchar's
-ionosphere, Saastamoinen's troposphere (standard atmosphere, 70 % humidity) and white noise; the delays are those
-that a receiver corrects, unless a scale below says otherwise.
+The pseudoranges include light time, Earth rotation, satellite and receiver clocks, group delays, Klobuchar's
+ionospheric delay, Saastamoinen's tropospheric delay (standard atmosphere, 70 % humidity) and white noise. A receiver
+that applies the same models corrects the delays exactly, unless a scale in the table below is not 1.
 
 {_list_effects(scenario)}
 
@@ -61,19 +64,19 @@ that a receiver corrects, unless a scale below says otherwise.
 
 def _list_inventions(scenario: Scenario) -> str:
     if scenario.line.kind != "file" and not scenario.sky.nav:
-        return "Everything in this folder is invented: no such line, train or satellite exists."
+        return "Everything in this folder is simulated: no such line, train or satellite exists."
     line = "the line is that of a track file" if scenario.line.kind == "file" else "no such line exists"
     sky = "the satellites are those of a navigation file" if scenario.sky.nav else "no such satellites exist"
-    return f"The train and all measurements in this folder are invented; {line}, {sky}."
+    return f"The train and all measurements in this folder are simulated; {line}, {sky}."
 
 
 def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
     error = simulation.scenario.line.map_error
-    off = ", with an error (line.map_error)" if error.plan_sigma_m or error.height_sigma_m else ""
+    off = ", with map errors (line.map_error)" if error.plan_sigma_m or error.height_sigma_m else ""
     what = {
         "front": "RINEX 3.04 observations of the front roof antenna",
         "rear": "observations of the rear antenna",
-        "nav": "RINEX 3.04 broadcast records",
+        "nav": "RINEX broadcast records",
         "track": f"track map, {len(simulation.line.track())} points; ellipsoidal heights{off}",
         "vehicle": "bogie distance, gauge, antennas",
         "truth": "ground truth: chainage of the centreline point abeam each antenna, its position (ECEF), speed, "
@@ -82,7 +85,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
             station.name: "observations of a reference station; its position is in the header"
             for station in simulation.scenario.stations
         },
-        "sbas": "SBAS messages as RTKLIB logs them: time of week of the complete reception, PRN, type, message",
+        "sbas": "SBAS messages in RTKLIB's format: week, time of week of complete reception, PRN, type, message",
         "sections": "ground truth: sections of the line",
         "scenario": "all settings, a scenario file for `railfix simulate`",
         "readme": "this file",
@@ -92,7 +95,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
 
 
 def _list_effects(scenario: Scenario) -> str:
-    """Return one sentence per group of errors: its size, or that it is off."""
+    """Return the sentences of the README on errors, multipath, sensors and SBAS that are or are not simulated."""
     usual = Scenario().errors
     names = list(type(usual).model_fields)
     errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]
@@ -103,7 +106,7 @@ def _list_effects(scenario: Scenario) -> str:
         "No multipath and no blockage."
         if scenario.environment.empty and not scenario.multipath
         else "Multipath and blockage by structures along the line (see the sections).",
-        "No sensors besides the receivers." if scenario.sensors is None else "Sensors besides the receivers.",
+        "No on-board sensors except the receivers." if scenario.sensors is None else "On-board sensors.",
     ]
     if scenario.sbas is not None:
         what = (
@@ -111,7 +114,7 @@ def _list_effects(scenario: Scenario) -> str:
         )
         parts.append(f"SBAS messages that correct {what}.")
     if scenario.vehicle.sway_sigma_deg:
-        parts.append("The body sways.")
+        parts.append("The body of the vehicle sways.")
     ranging = None if scenario.sensors is None else scenario.sensors.ranging
     if ranging is not None:
         right, above = (unit - antenna for unit, antenna in zip(
@@ -124,12 +127,12 @@ def _list_effects(scenario: Scenario) -> str:
     if balises is not None and balises.along_m:
         parts.append(f"The balises' reader, for `railfix run`: `--set sensors.balise.ahead_m={balises.along_m:g}`.")
     if scenario.multipath:
-        parts.append("Disturbances from Python, which no setting below describes.")
+        parts.append("Disturbances given from Python, which are not in the settings below.")
     return " ".join(parts)
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:
-    """Return settings by their names; of the longer groups only non-default settings."""
+    """Return the settings of a scenario by dotted name; of the groups `_SHORT` only non-default settings."""
     usual = Scenario(sensors=None).describe()
     table = {}
     for name, value in scenario.describe().items():
@@ -139,7 +142,7 @@ def _settings(scenario: Scenario) -> dict[str, Any]:
     return table
 
 
-#: Decimals of metres, metres per second and metres per second squared in the truth.
+#: Number of decimals of all quantities in the ground truth.
 TRUTH_DECIMALS: Final = 4
 _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",)
 
@@ -147,10 +150,10 @@ _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",
 def truth_table(simulation: Simulation) -> pl.DataFrame:
     """Return the ground truth of the antennas at the epochs of their receivers, one row per epoch and antenna.
 
-    `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point abeam the antenna, on the track map's chainage),
-    `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage), `acceleration_mps2` (along the
-    line, positive toward rising chainage), `environment` (kind of section, "open" outside all). The position refers to
-    the true instant, which is the tag less the receiver clock's bias.
+    The columns are `time_gpst` (time tag), `antenna`, `chainage_m` (centreline point abeam the antenna, in the chainage
+    of the track map), `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage),
+    `acceleration_mps2` (along the line, positive toward rising chainage) and `environment` (kind of section, "open"
+    outside all sections). The values refer to the true instant, which is the time tag less the receiver clock bias.
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)
@@ -178,7 +181,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
 
 
 def section_table(simulation: Simulation) -> pl.DataFrame:
-    """Return sections of the line from end to end: `from_m`, `to_m` (on the track map's chainage), `environment`."""
+    """Return the sections that cover the line: `from_m`, `to_m` (chainage of the track map) and `environment`."""
     line = simulation.line
     ends = [m for part in simulation.environment.sections for m in (part.from_m, part.to_m)]
     edges = np.unique(np.clip([0.0, *ends, line.length_m], 0.0, line.length_m))
@@ -198,26 +201,27 @@ def write_run(
     overwrite: Overwrite = "refuse",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run and write its files, all together at the end; return their paths by name.
+    """Simulate a run and write its files, which appear together when all are written; return their paths by name.
 
     ============================ ===================================================
-    front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
-    station.crx.gz, ...          observations of reference stations, where the scenario has them
-    nav.rnx.gz                   broadcast records (nav.rnx)
+    front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx if plain)
+    station.crx.gz, ...          observations of reference stations, if the scenario has any
+    nav.rnx.gz                   broadcast records (nav.rnx if plain)
     track.csv                    track map
     vehicle.toml                 vehicle
-    truth.csv.gz                 `truth_table` (truth.csv)
+    truth.csv.gz                 `truth_table` (truth.csv if plain)
     sections.csv                 `section_table`
-    messages.sbs                 SBAS messages, where the scenario has them
-    tachometer.parquet, ...      sensors, where the scenario has any (`sensor_tables`)
-    scenario.toml                the scenario, as `load_scenario` reads it
+    messages.sbs                 SBAS messages, if the scenario has SBAS
+    tachometer.parquet, ...      `sensor_tables`, if the scenario has sensors
+    scenario.toml                scenario, which `load_scenario` reads
     README.md                    contents and settings of the run
     ============================ ===================================================
 
-    With `packing` "plain" nothing is compressed, and sensors are CSV. `command` made the run, for the README.
-    `progress` is called with the antenna and the number of epochs written since the last call. The names of the paths
-    are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, those of the sensors,
-    ``scenario``, ``readme``.
+    With `packing` "plain" no file is compressed, and the tables of sensors are CSV files. `command` is the command that
+    the README names. `progress` is called with the receiver and the number of epochs written since the last call. The
+    names of the paths are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the
+    names of reference stations and sensor tables, ``scenario`` and ``readme``. Raise SettingsError where the scenario
+    is invalid, OutputError where a file cannot be written.
     """
     check_type(scenario, Scenario, "scenario")
     simulation = Simulation(scenario)
@@ -286,7 +290,7 @@ def _parquet(table: pl.DataFrame) -> bytes:
 
 
 def vehicle_table(vehicle: VehicleSettings) -> dict[str, Any]:
-    """Return the vehicle as in a vehicle file, see `railfix.track.vehicle.read_vehicle`."""
+    """Return the content of the vehicle file, see `railfix.track.vehicle.read_vehicle`."""
     antennas = {
         name: dict(zip(("along_m", "across_m", "up_m"), getattr(vehicle, name), strict=True)) for name in ANTENNAS
     }

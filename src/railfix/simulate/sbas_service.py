@@ -1,4 +1,4 @@
-"""Stream of SBAS messages, one per second, whose corrections cancel the simulated errors (RTCA DO-229D, A.4.4)."""
+"""SBAS messages whose corrections cancel the simulated errors, one per second (RTCA DO-229D, A.4.4)."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 Field = tuple[int, int]
-#: Slot, IODE, position [m] and clock [2^-31 s] of a long-term correction without velocity.
+#: Mask slot, IODE, position [m] and clock [2^-31 s] of a long-term correction without velocity.
 LongTerm = tuple[int, int, tuple[float, float, float], float]
 
 #: Resolution of corrections and delays [m].
 STEP_M: Final = 0.125
-NO_DELAY: Final = 15
-#: Fields of type 10 in their order, with their lengths.
+NO_DELAY: Final = 15  #: GIVEI of a grid point that is not monitored.
+#: Fields of type 10 in their order, with their lengths in bits.
 DEGRADATION: Final = {
     "brrc": 10, "cltc_lsb": 10, "cltc_v1": 10, "iltc_v1": 9, "cltc_v0": 10, "iltc_v0": 9, "cgeo_lsb": 10,
     "cgeo_v": 10, "igeo": 9, "cer": 6, "ciono_step": 10, "iiono": 9, "ciono_ramp": 10, "rss_udre": 1,
@@ -38,12 +38,18 @@ DEGRADATION: Final = {
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
-    """Message of a type and its parity (32,); fields (value, length) from bit 14 on. ValueError: one does not fit."""
+    """Return a message of type `kind` with its parity, as bytes of shape (32,).
+
+    The fields (value, length in bits) begin at bit 14. Raise ValueError where a value does not fit its length.
+    """
     return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
 
 def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
-    """Message from its first bits as text and its fields, with parity, shape (32,); ValueError: one does not fit."""
+    """Return a message with its parity, shape (32,), from its first bits as text and its fields (value, length).
+
+    Raise ValueError where a value does not fit its length, or the message is too long.
+    """
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
             raise ValueError(f"type {kind}: {value} does not fit {length} bits")
@@ -55,40 +61,40 @@ def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
 
 
 def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
-    """Type 1: satellites by their numbers of the PRN mask."""
+    """Return a type 1 message, the PRN mask, of the satellites with the given numbers in the mask."""
     return message(1, second, *((int(i in numbers), 1) for i in range(1, 211)), (iodp, 2))
 
 
 def fast(
     second: int, prc: Sequence[float], udrei: Sequence[int], *, kind: int = 2, iodf: int = 0, iodp: int = 0
 ) -> Bytes:
-    """Types 0 and 2 to 5; corrections in metres, remaining slots are not monitored."""
+    """Return a message of type 0 or 2 to 5, fast corrections [m] with UDREI; remaining slots are not monitored."""
     values = [round(v / STEP_M) for v in prc] + [0] * (13 - len(prc))
     grades = list(udrei) + [NOT_MONITORED] * (13 - len(udrei))
     return message(kind, second, (iodf, 2), (iodp, 2), *((v, 12) for v in values), *((g, 4) for g in grades))
 
 
 def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0, 0)) -> Bytes:
-    """Type 6: UDREI of all slots."""
+    """Return a type 6 message, integrity information, with the UDREI of all slots; remaining slots not monitored."""
     grades = list(udrei) + [NOT_MONITORED] * (51 - len(udrei))
     return message(6, second, *((i, 2) for i in iodf), *((g, 4) for g in grades))
 
 
 def factors(second: int, indicator: Sequence[int], *, latency: int = 0) -> Bytes:
-    """Type 7: degradation indicator of all slots."""
+    """Return a type 7 message, fast-correction degradation, with the degradation indicators of all slots."""
     values = list(indicator) + [0] * (51 - len(indicator))
     return message(7, second, (latency, 4), (0, 4), *((v, 4) for v in values))
 
 
 def parameters(second: int, **values: int) -> Bytes:
-    """Type 10 with raw numbers by name, those of `DEGRADATION`; 0 where not given."""
+    """Return a type 10 message, degradation parameters, with raw values by name (`DEGRADATION`), by default 0."""
     if unknown := values.keys() - DEGRADATION.keys():
         raise ValueError(f"type 10 has no field {min(unknown)}")
     return message(10, second, *((values.get(name, 0), length) for name, length in DEGRADATION.items()))
 
 
 def half(satellites: Sequence[LongTerm], iodp: int) -> list[Field]:
-    """Return the half of type 25 without velocity: (slot from 1, IODE, position [m], clock [2^-31 s]) of up to two."""
+    """Return the fields of half a type 25 message without velocity, for up to two satellites."""
     fields: list[Field] = [(0, 1)]
     for i in range(2):
         slot, iode, position, clock = satellites[i] if i < len(satellites) else (0, 0, (0.0, 0.0, 0.0), 0.0)
@@ -97,7 +103,7 @@ def half(satellites: Sequence[LongTerm], iodp: int) -> list[Field]:
 
 
 def long_term(second: int, satellites: Sequence[LongTerm], iodp: int = 0) -> Bytes:
-    """Type 25 of velocity code 0, up to four satellites."""
+    """Return a type 25 message, long-term corrections with velocity code 0, for up to four satellites."""
     return message(25, second, *half(satellites[:2], iodp), *half(satellites[2:], iodp))
 
 
@@ -110,7 +116,7 @@ def mixed(
     block: int = 0,
     iodf: int = 0,
 ) -> Bytes:
-    """Type 24: six fast corrections and half a type 25."""
+    """Return a type 24 message, six fast corrections [m] with UDREI and half a type 25 message."""
     values = [round(v / STEP_M) for v in prc] + [0] * (6 - len(prc))
     grades = list(udrei) + [NOT_MONITORED] * (6 - len(udrei))
     head = [*((v, 12) for v in values), *((g, 4) for g in grades), (0, 2), (block, 2), (iodf, 2), (0, 4)]
@@ -118,38 +124,41 @@ def mixed(
 
 
 def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, bands: int = 1) -> Bytes:
-    """Type 18; bits from 0."""
+    """Return a type 18 message, the ionospheric grid mask, for bits of a band counted from 0."""
     return message(18, second, (bands, 4), (band, 4), (iodi, 2), *((int(i in bits), 1) for i in range(201)))
 
 
 def grid_delay(
     second: int, band: int, block: int, delay: Sequence[float], givei: Sequence[int], iodi: int = 0
 ) -> Bytes:
-    """Type 26; delays in metres, 63.875 means do not use; remaining points are not monitored."""
+    """Return a type 26 message, vertical grid delays [m] with GIVEI; remaining points are not monitored.
+
+    A delay of 63.875 m means do not use.
+    """
     raw = [round(v / STEP_M) for v in delay] + [0] * (15 - len(delay))
     grades = list(givei) + [NO_DELAY] * (15 - len(givei))
     pairs = [field for v, g in zip(raw, grades, strict=True) for field in ((v, 9), (g, 4))]
     return message(26, second, (band, 4), (block, 4), *pairs, (iodi, 2))
 
 
-#: Slots of one message of types 2 to 5; satellites of one of type 25; points of one of type 26.
+#: Numbers of slots of a message of types 2 to 5, satellites of type 25, and grid points of type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-_MIXED: Final = 6  #: Slots of type 24, which replaces the last fast message where no more remain.
-#: Largest correction, orbit correction and delay that the fields hold [m].
+_MIXED: Final = 6  #: Number of slots of type 24, which replaces the last fast message if at most this many remain.
+#: Largest fast correction, orbit correction and grid delay that the fields can represent [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
-FAST_PERIOD_S: Final = 6  #: Seconds from one fast correction of a satellite to the next.
+FAST_PERIOD_S: Final = 6  #: Interval between two fast corrections of a satellite [s].
 CLOCK, _ORBIT, _DELAY = 50, 51, 52  #: Streams of random numbers: fast corrections, orbits, delays.
 
 
 class Service:
-    """Corrections of a simulated run at any second, and the messages that carry them."""
+    """SBAS corrections of a simulated run at any second, and the messages with these corrections."""
 
     def __init__(self, simulation: Simulation, settings: SbasSettings) -> None:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # All satellites of the mask, not only those in view of the train; each satellite's errors are its own, so they
-        # are the same.
+        # The mask has all satellites, not only those in view of the train. The errors are those of the train's signals,
+        # because the errors of a satellite do not depend on the other satellites.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
@@ -159,21 +168,21 @@ class Service:
 
     @staticmethod
     def slot(name: str) -> int:
-        """Return the number of a satellite in the mask, 0 where it is not corrected."""
+        """Return the number of a satellite in the mask, 0 for a satellite without corrections (all except GPS)."""
         return int(name[1:]) if name[0] == "G" else 0
 
     def _instant(self, second: float) -> Floats:
-        """Time of the corrections sent at a second; before the start of the run the errors at the start are used."""
+        """Return the time of validity of the corrections sent at a second [s]; before the start of the run it is 0."""
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:
-        """Return the fast corrections of `satellites` [m]: their clocks, and the group delay of their code."""
+        """Return the fast corrections of `satellites` [m], which are clock errors less group-delay errors of L1 C/A."""
         clock = self._errors.clock_error_m(self._instant(second))[0]
         noise = self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(self.satellites))
         return np.asarray(np.clip(clock - self._group_delay_m + noise, -_LARGEST_FAST_M, _LARGEST_FAST_M))
 
     def indicators(self, second: float) -> list[int]:
-        """Return UDREI (L5: DFREI) of `satellites`: as set, do not use during a fault."""
+        """Return the UDREI (L5: DFREI) of `satellites`: the value of the settings, or do not use during a fault."""
         settings = self._settings
         usual = settings.udrei if settings.band == "L1" else settings.dfrei
         at = self._instant(second - settings.alert_s + settings.latency_s)
@@ -181,7 +190,7 @@ class Service:
         return [DO_NOT_USE if abs(f) > settings.alert_m else usual for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:
-        """Return the long-term corrections of `satellites`: positions, to the issue of data in force."""
+        """Return the long-term corrections of the positions of `satellites`, for the issue of data in force."""
         at = self._instant(second)
         error = self._errors.orbit_error_m(at)[0]
         error = error + self._settings.orbit_sigma_m * self._rng[_ORBIT].standard_normal(error.shape)
@@ -198,7 +207,7 @@ class Service:
         ]
 
     def _grid_points(self) -> dict[int, list[tuple[int, float, float]]]:
-        """Return the bit, latitude and longitude of the grid points near the line, by band."""
+        """Return the bit, latitude and longitude [deg] of the grid points near the line, by band."""
         latitude, longitude = self._simulation.origin_deg
         bands: dict[int, list[tuple[int, float, float]]] = {}
         for band in range(BANDS):
@@ -213,7 +222,7 @@ class Service:
         return bands
 
     def delays_m(self, second: float, points: list[tuple[int, float, float]]) -> list[float]:
-        """Return the vertical delays of grid points [m], model and error of the simulated ionosphere."""
+        """Return the vertical delays of grid points [m], the sum of model and error of the simulated ionosphere."""
         at = self._instant(second)
         latitude, longitude = (np.array([point[k] for point in points]) for k in (1, 2))
         time = self._start + timedelta(at)
@@ -227,7 +236,7 @@ class Service:
         return [float(delay) for delay in np.clip(total, 0.0, _LARGEST_DELAY_M)]
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 2 to 5 and 24, each a function of the second and of the issue (IODF)."""
+        """Return the messages of types 2 to 5 and 24 as functions of the second and of the issue (IODF)."""
         return [partial(self._fast, block=block) for block in range(-(-len(self.satellites) // _FAST))]
 
     def _fast(self, second: int, issue: int, block: int) -> Bytes:
@@ -239,7 +248,7 @@ class Service:
         return fast(second, values, grades, kind=2 + block, iodf=issue)
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Return all other messages in the order in which they are sent in turn, each a function of the second."""
+        """Return all other messages, in the order in which they are sent, as functions of the second."""
         numbers = {int(name[1:]) for name in self.satellites}
         count = len(self.satellites)
         messages: list[Callable[[int], Bytes]] = [

@@ -1,4 +1,4 @@
-"""Streams of simulated SBAS messages, one per second, and their file; messages of dual-frequency SBAS (L5)."""
+"""Stream of simulated SBAS messages, one per second, and its file; messages of dual-frequency SBAS on L5."""
 
 from __future__ import annotations
 
@@ -28,12 +28,15 @@ if TYPE_CHECKING:
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
-    """Message of a type and its parity (32,); fields (value, length) from bit 10 on. ValueError: one does not fit."""
+    """Return an L5 message of type `kind` with its parity, as bytes of shape (32,).
+
+    The fields (value, length in bits) begin at bit 10. Raise ValueError where a value does not fit its length.
+    """
     return pack_message(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
 
 
 def mask(second: int, slots: Collection[int], iodm: int = 0) -> Bytes:
-    """Type 31: satellites by their slots."""
+    """Return a type 31 message, the satellite mask, for satellites given by their slots."""
     return message(31, second, *((int(slot in slots), 1) for slot in range(1, 215)), (iodm, 2))
 
 
@@ -48,7 +51,11 @@ def correction(
     covariance: tuple[int, Floats] = (5, np.eye(4)),
     dfrei: int = 3,
 ) -> Bytes:
-    """Type 32: position and clock [m], rates [m/s], covariance: exponent, and factor in units of 2^(exponent - 5)."""
+    """Return a type 32 message, the correction of one satellite.
+
+    `moved` are the corrections of position and clock [m], `rates` their rates [m/s]. `covariance` has the scale
+    exponent and the upper triangular factor in units of 2^(exponent - 5).
+    """
     exponent, factor = covariance
     values = [(round(v / 0.0625), 11) for v in moved[:3]] + [(round(moved[3] / 0.03125), 12)]
     values += [(round(v * 2**11), 8) for v in rates[:3]] + [(round(rates[3] * 2**12), 9)]
@@ -61,14 +68,18 @@ def correction(
 
 
 def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm: int = 0) -> Bytes:
-    """Type 34: for each satellite of the mask 0 nothing new, 1 the next of `dfrei`, 2 one more, 3 do not use."""
+    """Return a type 34 message, changes of the DFREI of the satellites in the mask.
+
+    `change` is, for each satellite, 0 for no change, 1 for the next value of `dfrei`, 2 for an increase by one, and 3
+    for do not use.
+    """
     every = [*change, *([0] * (AUGMENTED - len(change)))]
     grades = [*dfrei, *([0] * (7 - len(dfrei)))]
     return message(34, second, *((c, 2) for c in every), *((g, 4) for g in grades), (0, 2), (iodm, 2))
 
 
 def integrity(second: int, dfrei: Sequence[int], *, kind: int = 35, iodm: int = 0) -> Bytes:
-    """Types 35 and 36: indicators of the first 53 satellites of the mask, and of the others."""
+    """Return a message of type 35 or 36, the DFREI of the first 53 satellites in the mask, or of the others."""
     count = 53 if kind == 35 else 39
     fields = [(grade, 4) for grade in [*dfrei, *([15] * (count - len(dfrei)))]]
     return message(kind, second, *fields, (0, 2 if kind == 35 else 58), (iodm, 2))
@@ -82,7 +93,11 @@ def parameters(
     degradation: tuple[float, float, float] = (30.0, 0.0, 0.0),
     scale: int = 0,
 ) -> Bytes:
-    """Type 37: one degradation (interval [s], step [m], rate [m/s]) of all constellations, one code of the scale."""
+    """Return a type 37 message, degradation parameters that are equal for all constellations.
+
+    `valid_s` is the validity of corrections, `degradation` their interval [s], step [m] and rate [m/s], and `scale` the
+    code of the DFREI scale.
+    """
     interval, step, rate = degradation
     each = [(round(interval / 6.0) - 5, 5), (round(step / 0.01), 8), (round(rate / 0.0002), 8)]
     valid = (round(valid_s / 6.0) - 5, 6)
@@ -91,22 +106,25 @@ def parameters(
     )
 
 
-#: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
+#: Covariance that is sent: 1.03 to 1.06 times the sigma of the DFREI along a line of sight.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
-_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field can represent [m].
-_GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next ones [m/s].
+_LARGEST_M: Final = 63.9  #: Largest clock correction that the field can represent [m].
+_GROWTH_MPS: Final = 0.002  #: Degradation rate of the corrections [m/s].
 
 
 class SimulatedDfmc(Service):
-    """Corrections on L5 of a simulated run: GPS L1 C/A with L5, Galileo E1 with E5a, BeiDou B1C with B2a."""
+    """Dual-frequency corrections of a simulated run: GPS L1 C/A and L5, Galileo E1 and E5a, BeiDou B1C and B2a."""
 
     @staticmethod
     def slot(name: str) -> int:
-        """Return the slot of a satellite, 0 without one."""
+        """Return the slot of a satellite in the mask, 0 for a satellite without a slot."""
         return SLOT_OF.get(name, 0)
 
     def clocks_m(self, second: float) -> Floats:
-        """Corrections of clocks [m] for ionosphere-free codes: GPS without delays, Galileo F/NAV, BeiDou B-CNAV1."""
+        """Return the clock corrections for ionosphere-free codes [m].
+
+        They refer to GPS codes without group-delay correction, and to the clocks of Galileo F/NAV and BeiDou B-CNAV1.
+        """
         names, at = self.satellites, self._instant(second)
         first, other = (
             [list_signals(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1)
@@ -123,7 +141,7 @@ class SimulatedDfmc(Service):
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Types 35 and 36, each a function of the second and of an issue that they do not have."""
+        """Return the messages of types 35 and 36 as functions of the second and of an issue, which they do not use."""
 
         def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
             return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)
@@ -132,7 +150,7 @@ class SimulatedDfmc(Service):
         return [of_kind(35, slice(0, FIRST)), *later]
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Types 31, 37 and 32 of all satellites in turn, each a function of the second."""
+        """Return the messages of types 31 and 37, and of type 32 for each satellite, as functions of the second."""
         slots = [self.slot(name) for name in self.satellites]
         messages: list[Callable[[int], Bytes]] = [
             lambda second: mask(second, slots),
@@ -150,23 +168,24 @@ class SimulatedDfmc(Service):
         )  # fmt: skip
 
 
-LOST: Final = 53  #: Stream of random numbers of lost messages.
+LOST: Final = 53  #: Stream of random numbers: lost messages.
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
-    """Return messages from `lead_s` before the run to its end, one per second.
+    """Return the SBAS messages of a run, one per second, from `lead_s` before its start to its end.
 
-    Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
-    long-term corrections, grid, degradation and integrity. All corrections cancel the errors that `Scenario.errors`
-    adds to clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
-    On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
+    On L1 the fast corrections of all satellites (types 2 to 5, 24) are sent every 6 s, and between them, in turn, the
+    masks, long-term corrections, grid delays, degradation and integrity. The corrections cancel the errors that
+    `Scenario.errors` adds to clocks, group delays, orbits and ionosphere of GPS, within the resolution of the messages
+    (0.125 m). On L5 integrity (types 35, 36) is sent every 6 s, and between them mask, degradation and the corrections
+    of GPS, Galileo and BeiDou. Messages are lost with the probability `lost_chance`.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario
     fast, slow = service.fast_messages(), service.slow_messages()
     first = -int(np.ceil(settings.lead_s))
     sent, bits, turn = [], [], 0
-    # The preamble depends on the second of the day, like the frame of six seconds.
+    # The six-second frame is aligned with the second of the day.
     day = int(seconds(scenario.start - scenario.start.astype("datetime64[D]")))
     for second in range(first, int(np.ceil(scenario.duration_s))):
         place = (day + second) % FAST_PERIOD_S
@@ -179,7 +198,7 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
         bits.append(message)
     kept = np.random.default_rng([scenario.seed, LOST]).uniform(size=len(sent)) >= settings.lost_chance
     table = np.array(bits, dtype=np.uint8).reshape(-1, 32)[kept]
-    # A message has been received completely a second after its first bit.
+    # A message is complete one second after its first bit.
     time = scenario.start + timedelta(np.array(sent, dtype=np.float64)[kept] + 1.0)
     count = len(table)
     return SbasMessages(
@@ -196,8 +215,8 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
 
 
 def write_sbas(messages: SbasMessages, path: FilePath) -> None:
-    """Write messages as RTKLIB's .sbs, which `railfix run --sbas` reads; OutputError when it cannot be written."""
-    lines, digits = [], 58 if messages.band == "L1" else 63  # RTKLIB cuts the parity
+    """Write messages in RTKLIB's .sbs format, which `railfix run --sbas` reads; OutputError if that fails."""
+    lines, digits = [], 58 if messages.band == "L1" else 63  # RTKLIB's format for L1 has no parity
     for time, prn, kind, bits in zip(messages.time, messages.prn, messages.type, messages.bits, strict=True):
         week, tow = to_week(time)
         lines.append(f"{int(week)} {float(tow):.0f} {prn} {kind:2d} : {bits.tobytes().hex().upper()[:digits]}\n")

@@ -28,22 +28,22 @@ from railfix.simulate.settings import (
     beyond_start,
 )
 
-ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle, in the order in which they are written.
-#: Names of other files of a run.
+ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle, in the order in which their files are written.
+#: Names of files of a run, which a reference station must not have.
 _FILES: Final = (*ANTENNAS, "nav", "track", "vehicle", "truth", "sections", "scenario", "readme", "sbas")
-LONGEST_S: Final = 8.64e6  #: Longest run, a hundred days; longer series are split into several runs [s].
+LONGEST_S: Final = 8.64e6  #: Largest duration of a run, 100 days [s].
 
 
 class Station(ScenarioSettings):
-    """Where the train stops."""
+    """Station at which the train stops."""
 
-    at_m: NotNegative  #: Chainage of the vehicle's middle.
+    at_m: NotNegative  #: Chainage at which the middle of the vehicle stops.
     dwell_s: NotNegative = 30.0
     name: str = ""
 
 
 class SpeedLimit(ScenarioSettings):
-    """Highest speed of the vehicle's middle on a part of the line."""
+    """Speed limit of the middle of the vehicle on a part of the line."""
 
     from_m: Finite
     to_m: Finite
@@ -53,27 +53,25 @@ class SpeedLimit(ScenarioSettings):
 
 
 class RunSettings(ScenarioSettings):
-    """Motion of the train: it waits, then runs from stop to stop and back, until the end of the run."""
+    """Motion of the train, which waits, then runs from stop to stop and back until the end of the run."""
 
-    #: Accelerations are constant. Where a leg is too short the cruising speed is not reached.
-    cruise_mps: Positive = 40.0 / 3.6
+    cruise_mps: Positive = 40.0 / 3.6  #: Cruising speed, which is not reached on short legs.
     acceleration_mps2: Positive = 0.7
     deceleration_mps2: Positive = 0.8
-    #: Standing times at the start of the run, and at each end without a station.
-    first_stand_s: NotNegative = 15.0
-    stand_s: NotNegative = 10.0
-    #: Distance from the vehicle's middle to the ends of the line where the train turns.
+    first_stand_s: NotNegative = 15.0  #: Duration of the standstill at the start of the run.
+    stand_s: NotNegative = 10.0  #: Duration of the standstill at an end of the line without a station.
+    #: Distance between the end of the line and the middle of the vehicle where the train reverses.
     end_margin_m: NotNegative = 20.0
-    #: Stops by rising chainage, the first and the last included; without any the train runs from end to end.
+    #: Stops by rising chainage, including the first and the last; without stations the train runs from end to end.
     stations: tuple[Station, ...] = ()
 
     limits: tuple[SpeedLimit, ...] = ()
-    #: Curves are run at the speed whose equilibrium cant is the curve's cant plus this; None: no limit by curves.
+    #: Largest cant deficiency, which limits the speed in curves; None for no limit in curves.
     cant_deficiency_m: Positive | None = None
-    jerk_mps3: Positive | None = None  #: Largest jerk; None: unlimited jerk.
-    #: Direction of the first leg. The vehicle's front points to rising chainage in either direction of running.
+    jerk_mps3: Positive | None = None  #: Largest jerk; None for unlimited jerk.
+    #: Direction of the first leg. The front of the vehicle points to rising chainage in either direction of travel.
     direction: Literal["rising", "falling"] = "rising"
-    at_end: Literal["return", "stand"] = "return"  #: After the last stop.
+    at_end: Literal["return", "stand"] = "return"  #: Behaviour after the last stop: reverse, or stay at standstill.
 
     @field_validator("stations")
     @classmethod
@@ -85,10 +83,10 @@ class RunSettings(ScenarioSettings):
 
 
 class VehicleSettings(ScenarioSettings):
-    """The vehicle, in metres; antennas as (along, across to the right, above the rail tops).
+    """Vehicle; antennas are given as (along, across to the right, above the rail tops) in metres.
 
     The origin is midway between the bogie centres at the height of the rail tops; the front points in the direction of
-    rising chainage. Cant is measured between the wheels' contact points, 70 mm wider than the gauge.
+    rising chainage. Cant is measured between the contact points of a wheelset, whose distance is the gauge plus 70 mm.
     """
 
     name: str = "simulated test car"
@@ -96,35 +94,34 @@ class VehicleSettings(ScenarioSettings):
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
-    length_m: Positive = 23.2  #: Distance over the ends, which are equally far from the middle between the bogies.
-    #: Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that. Not in the
-    #: vehicle's file, as it is unknown in practice.
+    length_m: Positive = 23.2  #: Overall length; the ends are equally far from the middle between the bogies.
+    #: Standard deviation of the random roll at 20 m/s and more; at lower speeds it is proportional to the speed. The
+    #: vehicle file does not have it, because it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
-    sway_period_s: Positive = 1.5
-    #: Random pitch of the body on its suspension at 20 m/s and more, in proportion to the speed below that.
+    sway_period_s: Positive = 1.5  #: Mean period of the roll.
+    #: Standard deviation of the random pitch at 20 m/s and more; at lower speeds it is proportional to the speed.
     pitch_sigma_deg: NotNegative = 0.0
-    pitch_period_s: Positive = 1.0
-    #: Pitch under a constant acceleration, positive where the front rises when the train accelerates toward rising
-    #: chainage; it follows the acceleration as a damped oscillator of `pitch_period_s`.
+    pitch_period_s: Positive = 1.0  #: Mean period of the random pitch, and period of the suspension.
+    #: Pitch under constant acceleration, positive if the front rises when the train accelerates toward rising chainage.
+    #: The pitch is the response of a damped oscillator with the period `pitch_period_s`.
     pitch_deg_per_mps2: Finite = 0.0
 
 
 class SkySettings(ScenarioSettings):
     """Satellites and atmosphere."""
 
-    #: Letters out of G (30 satellites in 6 planes), J (3 inclined, 1 over the equator), E (24 in 3 planes), C (24 in 3
-    #: planes and 3 inclined geosynchronous; no GEO); or the constellations of the file.
+    #: Letters of the constellations: G (30 satellites in 6 planes), J (3 inclined geosynchronous, 1 geostationary), E
+    #: (24 in 3 planes), C (24 in 3 planes, 3 inclined geosynchronous); with `nav`, constellations used from the file.
     systems: str = "GJE"
-    #: A RINEX navigation file instead of the simulated satellites; in a scenario file relative to that file.
+    #: RINEX navigation file, used instead of simulated satellites; in a scenario file relative to the file's folder.
     nav: str | None = None
     cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
-    #: Satellites whose newer records are unhealthy, while the record before the run is healthy.
+    #: Satellites whose records are unhealthy, except for the record before the run.
     unhealthy: tuple[str, ...] = ("G02",)
-    #: Largest number of satellites tracked, the highest ones of each epoch.
+    #: Largest number of tracked satellites, those with the highest elevation at each epoch; None for no limit.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
-    #: Delays in the ranges as multiples of the models'; 1 leaves no error after correction.
-    ionosphere_scale: NotNegative = 1.0
-    troposphere_scale: NotNegative = 1.0
+    ionosphere_scale: NotNegative = 1.0  #: Ionospheric delay as a multiple of the model; 1 leaves no residual error.
+    troposphere_scale: NotNegative = 1.0  #: Tropospheric delay as a multiple of the model; 1 leaves no residual error.
 
     @field_validator("systems")
     @classmethod
@@ -147,69 +144,63 @@ class ReceiverSettings(ScenarioSettings):
     sin(elevation)`` with the C/N0 that is written.
     """
 
-    signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables per satellite, 2 gives eight.
-    #: Second signals: L2C, E5b, B3I; or L5, E5a and B2a, with B1C instead of B1I and B-CNAV1 instead of D1.
+    signals_per_satellite: Literal[1, 2] = 1  #: Number of signals, each with code, phase, Doppler and C/N0.
+    #: Second signals. L2: L2C, E5b and B3I; L5: L5, E5a and B2a, with B1C and B-CNAV1 instead of B1I and D1.
     second: Literal["L2", "L5"] = "L2"
-    #: 0 switches that noise off.
-    code_sigma_m: NotNegative = 0.5
-    phase_sigma_m: NotNegative = 0.002
-    doppler_sigma_hz: NotNegative = 0.05
-    cn0_sigma_dbhz: NotNegative = 0.7
-    #: Time constant with which the code follows its multipath error while locked, as with carrier smoothing.
+    code_sigma_m: NotNegative = 0.5  #: Standard deviation of the code noise at 45 dB-Hz in the zenith.
+    phase_sigma_m: NotNegative = 0.002  #: Standard deviation of the carrier-phase noise.
+    doppler_sigma_hz: NotNegative = 0.05  #: Standard deviation of the Doppler noise.
+    cn0_sigma_dbhz: NotNegative = 0.7  #: Standard deviation of the C/N0 noise.
+    #: Time constant of the low-pass filter of the code's multipath error while locked, as with carrier smoothing.
     code_smoothing_s: NotNegative = 0.0
-    #: C/N0 of an unobstructed signal at the horizon, and its rise in proportion to the sine of the elevation.
-    cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ
-    cn0_rise_db: Finite = CN0_RISE_DB
-    cn0_satellite_sigma_db: NotNegative = 0.0  #: Constant difference of each satellite's C/N0.
-    clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers run on one clock by hardware.
-    #: Clock of the front receiver at the start [s], and [s/s]; a separate rear clock has other values of this size.
+    cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ  #: C/N0 of an unobstructed signal at the horizon.
+    cn0_rise_db: Finite = CN0_RISE_DB  #: Increase of C/N0 to the zenith, proportional to the sine of the elevation.
+    cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
+    clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers share one hardware clock.
+    #: Clock bias of the front receiver at the start; separate clocks of other receivers are fixed multiples of it.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
-    clock_drift: Finite = 2.0e-7
-    #: "millisecond" steps a clock that is off by over half a millisecond back by a whole millisecond.
+    clock_drift: Finite = 2.0e-7  #: Clock drift of the front receiver [s/s], with multiples as for the bias.
+    #: "millisecond": a clock bias above half a millisecond is reduced by a whole millisecond.
     clock_steps: Literal["none", "millisecond"] = "none"
 
     @property
     def has_l5(self) -> bool:
-        """Whether two signals of a satellite are L1 and L5, or their equivalents."""
+        """Whether the receivers observe two signals per satellite, L1 and L5 or their equivalents."""
         return self.signals_per_satellite == 2 and self.second == "L5"
 
 
 class ReferenceStation(ScenarioSettings):
     """Receiver near the line under an open sky, with its own clock and noise."""
 
-    #: Name of its log; small letters, digits and hyphens.
+    #: Name of the station and of its log: lower-case letters, digits and hyphens.
     name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")
-    #: Position: along the line, to the right of the track's axis, above the rails.
     chainage_m: Finite = 0.0
-    lateral_m: Finite = 50.0
-    height_m: Finite = 10.0
-    faults: tuple[SatelliteFault, ...] = ()  #: Faults of this receiver alone, by satellite.
+    lateral_m: Finite = 50.0  #: Distance to the right of the track axis.
+    height_m: Finite = 10.0  #: Height above the rails.
+    faults: tuple[SatelliteFault, ...] = ()  #: Range errors of this receiver only, by satellite.
 
 
 class Scenario(ScenarioSettings):
-    """One run."""
+    """Settings of one simulated run."""
 
-    seed: Seed = 20_240_305  #: The same scenario gives the same numbers.
+    seed: Seed = 20_240_305  #: Seed of all random numbers except those of the line and the structures along it.
     start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")  #: First time tag, GPS time.
-    #: Duration and rate; their product is the number of epochs. The interval must be a multiple of 100 ns.
     duration_s: float = Field(default=200.0, gt=0.0, le=LONGEST_S)
-    rate_hz: float = Field(default=10.0, gt=0.0, le=1000.0)
-    #: Settings of the parts.
+    rate_hz: float = Field(default=10.0, gt=0.0, le=1000.0)  #: Epochs per second; 1 / rate is a multiple of 100 ns.
     line: LineSettings = LineSettings()
     run: RunSettings = RunSettings()
     vehicle: VehicleSettings = VehicleSettings()
     sky: SkySettings = SkySettings()
     receiver: ReceiverSettings = ReceiverSettings()
-    #: Errors of satellites, atmosphere and receivers beyond the noise of `receiver`; none by default.
+    #: Satellite, atmospheric and receiver errors in addition to the noise of `receiver`; none by default.
     errors: ErrorSettings = ErrorSettings()
     environment: EnvironmentSettings = EnvironmentSettings()  #: Structures along the line; none by default.
-    #: Seed of the structures along the line, so that runs of other seeds pass the same structures.
+    #: Seed of the structures along the line, so that runs with different seeds pass the same structures.
     place_seed: Seed = 1
-    sensors: SensorSettings | None = None  #: Sensors on board besides the receivers.
-    #: Reference stations whose observations are written in addition to the train's.
-    stations: tuple[ReferenceStation, ...] = ()
-    sbas: SbasSettings | None = None  #: SBAS that corrects the simulated errors, and that the train receives.
-    #: Further disturbances of the signals, from Python only; not in `describe` nor in scenario files.
+    sensors: SensorSettings | None = None  #: On-board sensors in addition to the receivers; None for no sensors.
+    stations: tuple[ReferenceStation, ...] = ()  #: Reference stations whose observations are also written.
+    sbas: SbasSettings | None = None  #: SBAS whose messages correct the simulated errors; None for no SBAS.
+    #: Further disturbances of the signals, given only from Python; neither in `describe` nor in scenario files.
     multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
 
     @field_validator("stations")
@@ -237,12 +228,12 @@ class Scenario(ScenarioSettings):
         return self
 
     def check_room(self, length_m: float) -> None:
-        """Raise SettingsError where the vehicle or a station would be beyond an end of a line of this length."""
+        """Raise SettingsError where the vehicle or a station is beyond an end of a line of the given length [m]."""
         if problem := self._room_problem(length_m):
             raise SettingsError(problem)
 
     def _room_problem(self, length_m: float) -> str:
-        """Return the sentence on why the train does not stay within a line of this length; empty where it does."""
+        """Return the reason why the train does not fit on a line of the given length [m]; empty if it fits."""
         margin, stations = self.run.end_margin_m, self.run.stations
         reach = max(abs(v) for v in (self.vehicle.front[0], self.vehicle.rear[0], self.vehicle.bogie_distance_m / 2.0))
         if length_m <= 2.0 * margin or margin < reach + 1.0:
@@ -260,12 +251,12 @@ class Scenario(ScenarioSettings):
 
     @property
     def epochs(self) -> int:
-        """Number of epochs."""
+        """Number of epochs, duration times rate."""
         return round(self.duration_s * self.rate_hz)
 
     @property
     def interval_s(self) -> float:
-        """Time between two epochs [s]."""
+        """Interval between two epochs [s]."""
         return float(self.interval / np.timedelta64(1, "s"))
 
     @property
@@ -275,11 +266,11 @@ class Scenario(ScenarioSettings):
 
     @property
     def interval(self) -> np.timedelta64:
-        """Time between two epochs."""
+        """Interval between two epochs."""
         return np.timedelta64(round(1e7 / self.rate_hz) * 100, "ns")
 
     def describe(self) -> dict[str, Any]:
-        """Return all settings as plain values, by their dotted names; elements of a list by their number, from 1."""
+        """Return all settings by dotted name; elements of a list have their number, from 1, in the name."""
         return _flatten("", self.model_dump() | {"start": str(self.start)})
 
 

@@ -1,7 +1,7 @@
-"""Scenario files: TOML of one run, the settings of `Scenario` by their names, or a recipe of several runs.
+"""Scenario files in TOML: the settings of `Scenario` for one run, or a recipe of several runs.
 
-``duration_s = "run"`` lasts until the end of the last stop. A recipe names a base, another file in its folder
-or a shipped one, and for each run the differences::
+With ``duration_s = "run"`` the run ends at the end of the last stop. A recipe names a base, which is another file in
+its folder or a shipped scenario, and the settings of each run that differ from the base::
 
     description = "two runs"
     base = "p1-commercial"
@@ -17,8 +17,8 @@ or a shipped one, and for each run the differences::
     [parts.back]
     run.direction = "falling"
 
-A run's own settings override those of its parts, later parts override earlier ones, and all override the base. Paths in
-a file (``sky.nav``, ``line.file.path``) are relative to it.
+The settings of a run override those of its parts, later parts override earlier parts, and all override the base. Paths
+in a file (``sky.nav``, ``line.file.path``) are relative to the folder of the file.
 """
 
 from __future__ import annotations
@@ -39,26 +39,25 @@ from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
 
-#: Word for a duration given by the run curve.
+#: Value of ``duration_s`` for a duration that the run curve determines.
 WHOLE_RUN: Final = "run"
 _FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Contents of a scenario file: the settings of one run or of several."""
+    """Content of a scenario file: the settings of one or several runs."""
 
     path: Path
     description: str
-    names: tuple[str, ...]  #: Names of the runs; one empty name where the file is a single run.
-    tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, paths in them absolute.
+    names: tuple[str, ...]  #: Names of the runs; one empty name if the file is not a recipe.
+    tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, with absolute paths.
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
-        """Return the scenario of a run (from 0); `changes` has settings that replace those of the file, in the same
-        tables.
+        """Return the scenario of a run, counted from 0; the settings `changes` override those of the file.
 
-        SettingsError: when a setting is misspelt, of the wrong kind, or out of range. InputFileError: when the track
-        file of a line whose run gives the duration cannot be read.
+        Raise SettingsError where a setting is misspelt, of the wrong type, or out of range; InputFileError where the
+        duration depends on a track file that cannot be read.
         """
         table = _over(self.tables[number], changes or {})
         to_the_end = table.get("duration_s") == WHOLE_RUN
@@ -77,7 +76,7 @@ class Recipe:
 
 
 def whole_run_s(scenario: Scenario) -> float:
-    """Return the time to the end of the stop at the end of the first leg, in whole seconds."""
+    """Return the time to the end of the standstill after the first leg, rounded up to whole seconds [s]."""
     motion = build_motion(build_alignment(scenario.line), scenario, duration_s=0.0)
     run = scenario.run
     last = run.stations[-1 if run.direction == "rising" else 0].dwell_s if run.stations else run.stand_s
@@ -90,7 +89,10 @@ def list_scenarios() -> dict[str, Path]:
 
 
 def find_scenario(name: FilePath) -> Path:
-    """Return a scenario file by its path, or by the name of a shipped one; InputFileError when it is neither."""
+    """Return the path of a scenario file, given by its path or as the name of a shipped scenario.
+
+    Raise InputFileError where the name is neither.
+    """
     shipped, path = list_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
         return path
@@ -100,10 +102,10 @@ def find_scenario(name: FilePath) -> Path:
 
 
 def load_recipe(name: FilePath) -> Recipe:
-    """Return the contents of a scenario file (a path, or the name of a shipped scenario), one or several runs.
+    """Read a scenario file of one or several runs, given by its path or as the name of a shipped scenario.
 
-    InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
-    twice, other keys); settings of a run are checked by `Recipe.scenario`.
+    Raise InputFileError where the file is missing, unreadable, or not TOML; SettingsError where a recipe is invalid
+    (repeated names, unknown keys). The settings of a run are checked by `Recipe.scenario`.
     """
     check_path(name, what="a path or the name of a shipped scenario")
     path = find_scenario(name)
@@ -130,7 +132,7 @@ def load_recipe(name: FilePath) -> Recipe:
     for name_of in names:
         if not isinstance(name_of, str) or not re.fullmatch(r"[\w.-]*\w", name_of) or names.count(name_of) > 1:
             raise SettingsError(
-                f"{path}: each of [[runs]] has its own name, letters, digits, - and _ (its folder), got {name_of!r}"
+                f"{path}: each of [[runs]] needs a unique name (letters, digits, -, _) for its folder, got {name_of!r}"
             )
     tables = tuple(_run_table(base, run, table.get("parts", {}), path) for run in runs)
     return Recipe(path=path, description=description, names=tuple(names), tables=tables)
@@ -139,7 +141,7 @@ def load_recipe(name: FilePath) -> Recipe:
 def _run_table(
     base: Mapping[str, Any], run: Mapping[str, Any], parts: Mapping[str, Any], path: Path
 ) -> Mapping[str, Any]:
-    """Settings of one of [[runs]]: the base, overridden by the parts that the run names, and by the run's own."""
+    """Return the settings of one of [[runs]]: the base, overridden by the parts that it names, then by its settings."""
     for name in run.get("parts", []):
         if not isinstance(parts.get(name), dict):
             raise SettingsError(f"{path}: parts has no table {name!r}; it has {', '.join(parts) or 'none'}")
@@ -148,10 +150,10 @@ def _run_table(
 
 
 def load_scenario(name: FilePath) -> Scenario:
-    """Return the scenario of a file that holds one run: a path, or the name of a shipped scenario.
+    """Read the scenario of a file with one run, given by its path or as the name of a shipped scenario.
 
-    InputFileError: the file is missing, unreadable, or no TOML. SettingsError: a setting is misspelt, of the wrong
-    kind, or out of range; or the file lists many runs.
+    Raise InputFileError where the file is missing, unreadable, or not TOML; SettingsError where a setting is misspelt,
+    of the wrong type, or out of range, or the file has several runs.
     """
     recipe = load_recipe(name)
     if recipe.names[0]:
@@ -160,9 +162,9 @@ def load_scenario(name: FilePath) -> Scenario:
 
 
 def scenario_table(scenario: Scenario) -> dict[str, Any]:
-    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings_files.write_toml`.
+    """Return all settings of a scenario as the content of a scenario file.
 
-    None is the word "none"; `multipath` is not in it.
+    None is represented by the word "none"; `multipath` is left out.
     """
     return dict(_without_none(scenario.model_dump()))
 
@@ -176,7 +178,7 @@ def _without_none(value: Any) -> Any:
 
 
 def _absolute(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return the same settings with absolute paths."""
+    """Return settings in which paths relative to the folder of `path` are replaced by absolute paths."""
     changes: dict[str, Any] = {}
     sky, line = table.get("sky"), table.get("line")
     if isinstance(sky, dict) and isinstance(sky.get("nav"), str) and sky["nav"] != "none":
@@ -187,7 +189,7 @@ def _absolute(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a base overridden by others, table by table."""
+    """Return the settings `base` overridden by `values`; tables in both are merged."""
     both = {**base, **values}
     for name in set(base) & set(values):
         if isinstance(base[name], Mapping) and isinstance(values[name], Mapping):

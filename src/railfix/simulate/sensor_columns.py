@@ -1,4 +1,4 @@
-"""Tables of all sensors of a run, including balises and their list, from the antennas' motion."""
+"""Tables of all on-board sensors of a run, including the list of balises and the positions of ranging units."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 _BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46  #: Streams of random numbers: error of a reading, missed, wrong identity.
-_STEP_S = 0.1  #: Spacing of the instants between which a passing is interpolated [s].
+_STEP_S = 0.1  #: Spacing of the instants between which the passing of a balise is interpolated [s].
 
 
 def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Balise, ...]:
-    """Return the balises that are named, and those every `spacing_m`, in order of chainage."""
+    """Return the balises of the settings, and the balises at a spacing of `spacing_m`, in order of chainage."""
     length = float(simulation.line.point_chainage_m()[-1])
     spaced = np.arange(settings.spacing_m, length, settings.spacing_m) if settings.spacing_m else np.empty(0)
     drawn = [Balise(name=f"B{k + 1:03d}", chainage_m=at) for k, at in enumerate(spaced.tolist())]
@@ -41,7 +41,10 @@ def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.Da
 
 
 def balise_tables(simulation: Simulation, settings: BaliseSettings) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return the readings and the ground truth of all passings; see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the readings, and the ground truth of all passings, see `railfix.simulate.sensor_columns.COLUMNS`.
+
+    Errors, missed readings and wrong identities are drawn once per balise, so every passing of a balise has the same.
+    """
     scenario, balises = simulation.scenario, balises_along(simulation, settings)
     time = np.arange(0.0, scenario.duration_s + 1e-9, _STEP_S)
     reader = simulation.body_truth((settings.along_m, 0.0, 0.0), time)[0].chainage_m
@@ -102,7 +105,7 @@ def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame
 
 
 def dropouts(settings: RadarSettings, seed: int, duration_s: float) -> list[tuple[float, float]]:
-    """Start and end of each interval without a measurement [s], given ones first, then drawn ones."""
+    """Return start and end of each interval without a measurement [s], first the given, then the drawn intervals."""
     found = [(d.start_s, d.end_s) for d in settings.dropouts]
     if settings.dropouts_per_hour > 0.0:
         rng = np.random.default_rng([seed, _DROPOUTS])
@@ -116,12 +119,12 @@ def dropouts(settings: RadarSettings, seed: int, duration_s: float) -> list[tupl
     return found
 
 
-#: Streams of random numbers: noise, error by position, echoes, lost answers.
+#: Streams of random numbers: noise, multipath error, echoes, lost answers.
 _RANGING_NOISE, _POSITION, _ECHO, _LOST = 40, 41, 42, 43
 
 
 def unit_ecef_m(line: Alignment, unit: GroundUnit) -> Floats:
-    """Position of a ground unit, shape (3,) ECEF [m]."""
+    """Return the position of a ground unit, shape (3,) ECEF [m]."""
     return np.asarray(line.point_beside(np.array([unit.chainage_m]), unit.lateral_m, unit.height_m)[0])
 
 
@@ -158,7 +161,11 @@ def ranging_table(simulation: Simulation, settings: RangingSettings) -> pl.DataF
 
 
 def _range_errors_m(settings: RangingSettings, seed: int, number: int, ahead_m: Floats) -> Floats:
-    """Add noise, and multipath by cells of `multipath_cell_m`, some (`echo_chance`) with an echo alone."""
+    """Return the errors of ranges at distances `ahead_m` along the line from a unit, shape (n,) [m].
+
+    An error is the sum of white noise, a multipath error that is constant in cells of `multipath_cell_m`, and, in a
+    fraction `echo_chance` of the cells, the excess path of an echo that is measured instead of the direct path.
+    """
     reach = int(np.ceil(settings.reach_m / settings.multipath_cell_m)) + 1
     cell = np.clip(np.floor(ahead_m / settings.multipath_cell_m).astype(np.intp), -reach, reach) + reach
     position = np.random.default_rng([seed, _POSITION, number]).standard_normal(2 * reach + 1)
@@ -173,55 +180,60 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
     "tachometer": {
         "time_gpst": "instant of a pulse, GPS time",
         "pulse": "number of the pulse, from 1",
-        "direction": "1 when the vehicle moves forward (rising chainage), -1 back",
+        "direction": "1 where the vehicle moves forward (rising chainage), -1 where it moves backward",
     },
     "wheel_slips": {
-        "time_gpst": "ground truth: when the wheel begins to slip or slide, GPS time",
-        "end_gpst": "ground truth: when the wheel rolls without slip again, GPS time",
-        "ratio": "ground truth: most of (wheel speed - train speed) / train speed, in the middle; negative slides",
+        "time_gpst": "ground truth: start of the slip or slide, GPS time",
+        "end_gpst": "ground truth: end of the slip or slide, GPS time",
+        "ratio": "ground truth: largest (wheel speed - train speed) / train speed, in the middle of the interval; "
+        "negative for a slide",
     },
     "inertial": {
         "time_gpst": "instant of the sample, GPS time",
-        "force_forward_mps2": "specific force along the body's long axis [m/s^2], forward positive",
-        "force_right_mps2": "specific force across the body [m/s^2], to the right positive",
-        "force_down_mps2": "specific force square to the body's floor [m/s^2], down positive: about -9.8 at rest",
-        "roll_rate_radps": "angular rate about forward [rad/s], positive when the body leans more to the right",
-        "pitch_rate_radps": "angular rate about right [rad/s], positive when the nose rises",
-        "yaw_rate_radps": "angular rate about down [rad/s], positive when the nose turns to the right",
+        "force_forward_mps2": "specific force along the longitudinal axis of the body [m/s^2], positive forward",
+        "force_right_mps2": "specific force along the lateral axis of the body [m/s^2], positive to the right",
+        "force_down_mps2": "specific force along the vertical axis of the body [m/s^2], positive down; about -9.8 at "
+        "rest",
+        "roll_rate_radps": "angular rate about the forward axis [rad/s], positive when the body rolls to the right",
+        "pitch_rate_radps": "angular rate about the right axis [rad/s], positive when the front rises",
+        "yaw_rate_radps": "angular rate about the down axis [rad/s], positive when the front turns to the right",
     },
     "radar": {
         "time_gpst": "instant of the sample, GPS time",
-        "speed_mps": "speed [m/s], forward positive; NaN where nothing was measured",
+        "speed_mps": "speed [m/s], positive forward; NaN where nothing was measured",
     },
     "ranging": {
         "time_gpst": "instant of the measurement, GPS time",
-        "unit": "ground unit",
+        "unit": "name of the ground unit",
         "range_m": "measured distance between the vehicle's unit and the ground unit [m]",
     },
     "ranging_units": {
-        "unit": "ground unit",
+        "unit": "name of the ground unit",
         "chainage_m": "surveyed chainage [m]",
-        "lateral_m": "to the right of the track's axis [m]",
+        "lateral_m": "distance to the right of the track axis [m]",
         "x_m": "surveyed position, ECEF [m]",
         "y_m": "surveyed position, ECEF [m]",
         "z_m": "surveyed position, ECEF [m]",
     },
-    "balises": {"time_gpst": "instant at which the reader was over a balise, GPS time", "balise": "identity read"},
-    "balise_list": {"balise": "identity", "chainage_m": "surveyed chainage [m]"},
+    "balises": {
+        "time_gpst": "measured instant at which the reader was over a balise, GPS time",
+        "balise": "identity that was read",
+    },
+    "balise_list": {"balise": "identity of the balise", "chainage_m": "surveyed chainage [m]"},
     "balise_truth": {
         "time_gpst": "ground truth: instant at which the reader was over a balise, GPS time",
-        "balise": "ground truth: the balise there",
-        "read": "identity that was read; empty where none was",
+        "balise": "ground truth: identity of the balise",
+        "read": "identity that was read; empty where the balise was not read",
     },
 }
 
 
 def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
-    """Return the tables of the sensors that `Scenario.sensors` names; none where it is None.
+    """Return the tables of the sensors in `Scenario.sensors` by name; empty where it is None.
 
-    ``tachometer`` and ``wheel_slips`` (ground truth of its wheel), ``inertial``, ``radar``, ``ranging``
-    and ``ranging_units``, ``balises``, ``balise_list`` and ``balise_truth`` (ground truth); the columns are those of
-    `COLUMNS`, all rows in order of `time_gpst`.
+    The tables are ``tachometer`` and ``wheel_slips`` (ground truth), ``inertial``, ``radar``, ``ranging`` and
+    ``ranging_units``, ``balises``, ``balise_list`` and ``balise_truth`` (ground truth), with the columns `COLUMNS`;
+    tables with times are in order of `time_gpst`.
     """
     settings = simulation.scenario.sensors
     tables: dict[str, pl.DataFrame] = {}

@@ -1,4 +1,4 @@
-"""Settings of the simulator's errors and sensors, none by default, and common types of settings."""
+"""Settings of the simulated errors, sensors and SBAS, and common types of settings; no errors by default."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]  #: A probability or a fraction.
-#: Three components, forward, right and down.
+#: Three components along the axes of the body.
 Three = tuple[Finite, Finite, Finite]
 Seed = Annotated[int, Field(ge=0)]
 SYSTEMS = "GJEC"  #: Letters of the constellations that are simulated.
@@ -39,14 +39,14 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 def beyond_start(to_m: float, info: ValidationInfo) -> float:
-    """Validate the end of a part of the line, whose start is `from_m`."""
+    """Return the end of a part of the line; ValueError where it is not beyond the start `from_m`."""
     if to_m <= info.data.get("from_m", -np.inf):
         raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
     return to_m
 
 
 def at_least(least: float) -> AfterValidator:
-    """Return the validator of a range of lengths that must begin at this length [m]."""
+    """Return a validator of a range of lengths whose smaller end must be at least `least` [m]."""
 
     def check(pair: tuple[float, float]) -> tuple[float, float]:
         if pair[0] < least:
@@ -56,13 +56,13 @@ def at_least(least: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-#: Least and greatest value of a uniform distribution.
+#: Smallest and largest value of a uniform distribution.
 Between = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_rising)]
 AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 
 def _gps_time(value: Any) -> np.datetime64:
-    """Return the GPS time of a TOML time, a text or a datetime64."""
+    """Return the GPS time of a TOML time, a text or a datetime64; ValueError for other values."""
     with suppress(ValueError):
         if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
             return time
@@ -70,7 +70,7 @@ def _gps_time(value: Any) -> np.datetime64:
 
 
 def _toml_time(time: np.datetime64) -> datetime | str:
-    """Return a TOML time where microseconds are enough, else text."""
+    """Return a time as a TOML time if its resolution of microseconds suffices, else as text."""
     rounded = datetime.fromisoformat(str(time.astype("datetime64[us]")))
     return rounded if np.datetime64(rounded) == time else str(time)
 
@@ -80,7 +80,7 @@ GpsTime = Annotated[np.datetime64, PlainValidator(_gps_time), PlainSerializer(_t
 
 
 class ScenarioSettings(Settings):
-    """Base of the simulator's settings: the word "none" represents None, which TOML lacks."""
+    """Base of the settings of the simulator, in which the word "none" represents None, because TOML has no None."""
 
     @model_validator(mode="before")
     @classmethod
@@ -92,11 +92,10 @@ class ScenarioSettings(Settings):
 
 
 class Interval(ScenarioSettings):
-    """Part of a run."""
+    """Time interval within a run."""
 
-    #: Seconds after the start of the run; an end of None is the end of the run.
-    start_s: Finite
-    end_s: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    start_s: Finite  #: Time after the start of the run.
+    end_s: Annotated[float, Field(allow_inf_nan=False)] | None = None  #: Time after the start; None for the end.
 
     @model_validator(mode="after")
     def _forward(self) -> Interval:
@@ -109,121 +108,123 @@ System = Annotated[str, Field(pattern=f"^[{SYSTEMS}]$")]  #: Letter of a constel
 
 
 class SatelliteErrorSettings(ScenarioSettings):
-    """Errors of the broadcast message, independent for each satellite of a constellation."""
+    """Standard deviations and correlation times of broadcast errors, independent for each satellite."""
 
-    #: Gauss-Markov error of the clock, in metres of range.
-    clock_sigma_m: NotNegative = 0.0
-    clock_time_s: Positive = 3600.0
-    #: Gauss-Markov errors of the position, true minus broadcast.
+    clock_sigma_m: NotNegative = 0.0  #: Standard deviation of the Gauss-Markov clock error, in metres of range.
+    clock_time_s: Positive = 3600.0  #: Correlation time of the clock error.
+    #: Standard deviation of the Gauss-Markov radial orbit error, true minus broadcast.
     radial_sigma_m: NotNegative = 0.0
-    along_sigma_m: NotNegative = 0.0
-    cross_sigma_m: NotNegative = 0.0
-    orbit_time_s: Positive = 7200.0  #: Correlation time of these errors.
-    group_delay_sigma_m: NotNegative = 0.0  #: Group delay, constant for each satellite and signal, in the code alone.
+    along_sigma_m: NotNegative = 0.0  #: Standard deviation of the along-track orbit error.
+    cross_sigma_m: NotNegative = 0.0  #: Standard deviation of the cross-track orbit error.
+    orbit_time_s: Positive = 7200.0  #: Correlation time of the orbit errors.
+    #: Standard deviation of the group-delay error, constant for each satellite and signal, which affects only codes.
+    group_delay_sigma_m: NotNegative = 0.0
 
 
 class IonosphereErrorSettings(ScenarioSettings):
-    """Ionospheric delay on L1 beyond the model (times `SkySettings.ionosphere_scale`)."""
+    """Ionospheric delay on L1 in addition to the model times `SkySettings.ionosphere_scale`."""
 
-    #: Gauss-Markov vertical delay over the first point of the line.
+    #: Standard deviation of the Gauss-Markov vertical delay at the first point of the line.
     vertical_sigma_m: NotNegative = 0.0
-    vertical_time_s: Positive = 1800.0
-    #: Growth of the vertical delay from there with the distance of the pierce point.
+    vertical_time_s: Positive = 1800.0  #: Correlation time of the vertical delay.
+    #: Gradient of the vertical delay with the distance of the pierce point from the first point of the line.
     gradient_mm_per_km: NotNegative = 0.0
-    gradient_azimuth_deg: Finite = 0.0  #: Direction in which it grows.
+    gradient_azimuth_deg: Finite = 0.0  #: Azimuth in which the delay increases.
 
 
 class TroposphereErrorSettings(ScenarioSettings):
-    """Tropospheric delay beyond the model (times `SkySettings.troposphere_scale`)."""
+    """Tropospheric delay in addition to the model times `SkySettings.troposphere_scale`."""
 
-    #: Gauss-Markov zenith delay.
-    zenith_sigma_m: NotNegative = 0.0
-    zenith_time_s: Positive = 7200.0
+    zenith_sigma_m: NotNegative = 0.0  #: Standard deviation of the Gauss-Markov zenith delay.
+    zenith_time_s: Positive = 7200.0  #: Correlation time of the zenith delay.
 
 
 class SatelliteFault(Interval):
-    """Satellite whose ranges are faulty for a time, without a warning in its message."""
+    """Range error of a satellite in a time interval, without a warning in its navigation message."""
 
-    satellite: str = Field(pattern=f"^[{SYSTEMS}][0-9]{{2}}$")  #: "G07".
-    step_m: Finite = 0.0  #: Added to code and phase from the start on.
-    ramp_mps: Finite = 0.0  #: Growth of the error from the start on.
+    satellite: str = Field(pattern=f"^[{SYSTEMS}][0-9]{{2}}$")  #: Name of the satellite, such as "G07".
+    step_m: Finite = 0.0  #: Error of code and phase at the start of the interval.
+    ramp_mps: Finite = 0.0  #: Rate at which the error grows after the start.
 
 
 class ClockWalkSettings(ScenarioSettings):
-    """Random walks of a receiver's clock about its constant drift, in metres of range."""
+    """Random walks of a receiver clock in addition to its constant drift, in metres of range."""
 
-    walk_m_per_sqrt_s: NotNegative = 0.0  #: Random walk of the bias: standard deviation after one second.
-    frequency_walk_mps_per_sqrt_s: NotNegative = 0.0  #: Random walk of the drift: standard deviation after one second.
+    walk_m_per_sqrt_s: NotNegative = 0.0  #: Standard deviation of the random walk of the bias after one second.
+    #: Standard deviation of the random walk of the drift after one second.
+    frequency_walk_mps_per_sqrt_s: NotNegative = 0.0
 
 
 class InterSystemSettings(ScenarioSettings):
     """Inter-system bias of the receivers for one constellation, in code, phase and Doppler."""
 
-    offset_m: Finite = 0.0  #: At the start of the run.
-    drift_mps: Finite = 0.0
-    #: Bias of the rear receiver less the front receiver's, for common and separate clocks.
+    offset_m: Finite = 0.0  #: Inter-system bias at the start of the run.
+    drift_mps: Finite = 0.0  #: Drift of the inter-system bias.
+    #: Bias of the rear receiver less that of the front receiver, with common and with separate clocks.
     rear_difference_m: Finite = 0.0
 
 
 class NoiseSettings(ScenarioSettings):
-    """Time-correlated receiver noise; the sigmas are set in `ReceiverSettings`."""
+    """Time-correlated receiver noise; the standard deviations are in `ReceiverSettings`."""
 
-    code_correlated_share: Share = 0.0  #: Fraction of the code noise's variance, in [0, 1], that is correlated in time.
-    #: Its correlation time: a code loop of noise bandwidth B has 1 / (4 B), 1 s at 0.25 Hz.
+    code_correlated_share: Share = 0.0  #: Fraction of the code-noise variance that is correlated in time.
+    #: Correlation time of the code noise: 1 / (4 B) for a code loop of noise bandwidth B, 1 s at 0.25 Hz.
     code_correlation_time_s: Positive = 1.0
-    #: Gauss-Markov variation of C/N0, independent for each channel.
+    #: Standard deviation of the Gauss-Markov variation of C/N0, independent for each channel.
     cn0_wander_sigma_db: NotNegative = 0.0
-    cn0_wander_time_s: Positive = 10.0
-    #: Observables whose noise grows as C/N0 falls: the code alone, or phase and Doppler by the same law (10 times as
-    #: noisy for 20 dB less; their sigmas are those at 45 dB-Hz).
+    cn0_wander_time_s: Positive = 10.0  #: Correlation time of this variation.
+    #: Observables whose noise depends on C/N0: only codes, or also phase and Doppler, by the same law (10 times the
+    #: noise at 20 dB less; the sigmas of `ReceiverSettings` are those at 45 dB-Hz).
     weak_signals: Literal["code", "all"] = "code"
 
 
 class TrackingSettings(ScenarioSettings):
     """Loss of lock and re-acquisition."""
 
-    threshold_dbhz: NotNegative | None = None  #: A signal weaker than this is lost; None: no signal is too weak.
-    #: A signal lost below the threshold is tracked again from this C/N0 on; None: from the threshold on.
+    threshold_dbhz: NotNegative | None = None  #: C/N0 below which a signal is lost; None for no such limit.
+    #: C/N0 from which a signal lost by its C/N0 is trackable again; None for `threshold_dbhz`.
     reacquisition_dbhz: NotNegative | None = None
-    reacquisition_s: NotNegative = 0.0  #: A lost signal is absent for this time after it could be tracked again.
-    #: "after_loss": the phase returns with another number of whole cycles, and its first epoch has bit 0 of the
-    #: loss-of-lock indicator set.
+    reacquisition_s: NotNegative = 0.0  #: Time for which a lost signal remains absent after it is trackable again.
+    #: "after_loss": after a loss the phase has another number of whole cycles, and bit 0 of the loss-of-lock indicator
+    #: is set at its first epoch.
     slips: Literal["none", "after_loss"] = "none"
 
 
 class ErrorSettings(ScenarioSettings):
-    """All errors of satellites, atmosphere and receivers; none by default."""
+    """Satellite, atmospheric and receiver errors; none by default."""
 
-    #: By the letter of the constellation.
+    #: Broadcast errors by the letter of the constellation.
     satellites: dict[System, SatelliteErrorSettings] = Field(default_factory=dict)
 
     ionosphere: IonosphereErrorSettings = IonosphereErrorSettings()
     troposphere: TroposphereErrorSettings = TroposphereErrorSettings()
     faults: tuple[SatelliteFault, ...] = ()
-    #: Clock of both receivers; one random walk where `ReceiverSettings.clocks` is "common".
+    #: Random walks of the receiver clocks; the antennas share one walk if `ReceiverSettings.clocks` is "common".
     clock: ClockWalkSettings = ClockWalkSettings()
-    intersystem: dict[System, InterSystemSettings] = Field(default_factory=dict)  #: By the letter of the constellation.
+    #: Inter-system biases by the letter of the constellation.
+    intersystem: dict[System, InterSystemSettings] = Field(default_factory=dict)
     noise: NoiseSettings = NoiseSettings()
     tracking: TrackingSettings = TrackingSettings()
 
 
 class SlipInterval(Interval):
-    """Slip or slide of the tachometer's wheel."""
+    """Slip or slide of the tachometer wheel."""
 
     end_s: Finite
-    #: Largest (wheel speed - train speed) / train speed, in the middle of the interval, from and to 0 by half a sine:
-    #: positive slips (spins), negative slides, -1 locks the wheel.
+    #: (Wheel speed - train speed) / train speed in the middle of the interval, positive for a slip, negative for a
+    #: slide, -1 for a locked wheel. Over the interval the value is half a sine wave.
     ratio: float = Field(ge=-1.0, allow_inf_nan=False)
 
 
 class DrawnSlips(ScenarioSettings):
     """Slips and slides drawn at random."""
 
-    #: Probability of a slip in each acceleration, of a slide in each braking of the run.
-    slip_chance: Share = 0.0
-    slide_chance: Share = 0.0
-    ratio: Share = 0.3  #: Largest ratio, see `SlipInterval`; uniform between a fifth of it and all.
-    #: Longest duration; drawn uniformly between a fifth of it and all of it, at most the duration of the acceleration.
+    slip_chance: Share = 0.0  #: Probability of a slip in each acceleration phase of the run.
+    slide_chance: Share = 0.0  #: Probability of a slide in each braking phase of the run.
+    #: Largest magnitude of the ratio of `SlipInterval`; ratios are uniform between a fifth of it and the full value.
+    ratio: Share = 0.3
+    #: Largest duration; durations are uniform between a fifth of it and the full value, at most the duration of the
+    #: phase.
     duration_s: Positive = 3.0
 
 
@@ -231,17 +232,16 @@ class TachometerSettings(ScenarioSettings):
     """Tachometer on one wheel."""
 
     pulses_per_turn: int = Field(default=60, gt=0)
-    wheel_diameter_m: Positive = 0.86  #: Nominal.
-    diameter_error_m: Finite = 0.0  #: True minus nominal.
-    resolution_s: NotNegative = 0.0  #: Noise of the pulses' times; 0: a nanosecond.
-    jitter_s: NotNegative = 0.0  #: Standard deviation of a pulse's time.
-    lowest_mps: NotNegative = 0.0  #: No pulses come below this speed of the wheel.
-    #: Standard deviation of each tooth's position as a fraction of the spacing of the teeth; the same every turn.
+    wheel_diameter_m: Positive = 0.86  #: Nominal wheel diameter.
+    diameter_error_m: Finite = 0.0  #: True minus nominal wheel diameter.
+    resolution_s: NotNegative = 0.0  #: Resolution of the pulse times; 0 for one nanosecond.
+    jitter_s: NotNegative = 0.0  #: Standard deviation of the white noise of the pulse times.
+    lowest_mps: NotNegative = 0.0  #: Speed of the wheel below which there are no pulses.
+    #: Standard deviation of the position errors of the teeth, as a fraction of their spacing; equal in every turn.
     tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
-    #: Probability that a pulse is not detected, and that it is followed by a second one before the next tooth.
-    lost_chance: Share = 0.0
-    doubled_chance: Share = 0.0
-    slips: tuple[SlipInterval, ...] = ()  #: In order, without overlap.
+    lost_chance: Share = 0.0  #: Probability that a pulse is not detected.
+    doubled_chance: Share = 0.0  #: Probability that a pulse is followed by a second pulse before the next tooth.
+    slips: tuple[SlipInterval, ...] = ()  #: Given slips and slides, in order, without overlap.
     drawn_slips: DrawnSlips = DrawnSlips()
 
     @field_validator("slips")
@@ -260,76 +260,69 @@ class TachometerSettings(ScenarioSettings):
 
 
 class InertialSettings(ScenarioSettings):
-    """Three accelerometers and three gyroscopes fixed to the body: forward, right, down."""
+    """Three accelerometers and three gyroscopes fixed to the body, with the axes forward, right and down."""
 
-    rate_hz: Positive = 100.0
-    #: Position in the body, as the antennas'.
-    along_m: Finite = 0.0
-    across_m: Finite = 0.0
-    up_m: Finite = 1.0
-    #: Constant.
-    accel_bias_mps2: Three = (0.0, 0.0, 0.0)
-    gyro_bias_radps: Three = (0.0, 0.0, 0.0)
-    #: Gauss-Markov part of each bias.
+    rate_hz: Positive = 100.0  #: Sampling rate.
+    along_m: Finite = 0.0  #: Position in the body along the forward axis, as for the antennas.
+    across_m: Finite = 0.0  #: Position in the body to the right.
+    up_m: Finite = 1.0  #: Height above the rail tops.
+    accel_bias_mps2: Three = (0.0, 0.0, 0.0)  #: Constant biases of the accelerometers.
+    gyro_bias_radps: Three = (0.0, 0.0, 0.0)  #: Constant biases of the gyroscopes.
+    #: Standard deviation of the Gauss-Markov part of each accelerometer bias.
     accel_drift_sigma_mps2: NotNegative = 0.0
-    accel_drift_time_s: Positive = 1000.0
-
+    accel_drift_time_s: Positive = 1000.0  #: Correlation time of the accelerometer biases.
+    #: Standard deviation of the Gauss-Markov part of each gyroscope bias.
     gyro_drift_sigma_radps: NotNegative = 0.0
-    gyro_drift_time_s: Positive = 1000.0
-    gyro_drift_walk_radps_per_sqrt_s: NotNegative = 0.0  #: Random walk of each gyroscope's bias, from 0 at the start.
-    #: White noise, as the random walk of its integral.
-    velocity_walk_mps_per_sqrt_s: NotNegative = 0.0
-    angle_walk_rad_per_sqrt_s: NotNegative = 0.0
-    #: Scale errors: measured over true, less 1.
-    accel_scale: Three = (0.0, 0.0, 0.0)
-    gyro_scale: Three = (0.0, 0.0, 0.0)
-    misalignment_rad: Three = (0.0, 0.0, 0.0)  #: Small rotations of the unit about forward, right and down.
-    #: Quantisation step; 0: none.
-    accel_resolution_mps2: NotNegative = 0.0
-    gyro_resolution_radps: NotNegative = 0.0
-    #: Vibration of the body at 20 m/s and more, of each axis, in proportion to the speed below that.
+    gyro_drift_time_s: Positive = 1000.0  #: Correlation time of the gyroscope biases.
+    gyro_drift_walk_radps_per_sqrt_s: NotNegative = 0.0  #: Random walk of each gyroscope bias, from 0 at the start.
+    velocity_walk_mps_per_sqrt_s: NotNegative = 0.0  #: White noise of the accelerometers, as velocity random walk.
+    angle_walk_rad_per_sqrt_s: NotNegative = 0.0  #: White noise of the gyroscopes, as angle random walk.
+    accel_scale: Three = (0.0, 0.0, 0.0)  #: Scale-factor errors of the accelerometers, measured / true - 1.
+    gyro_scale: Three = (0.0, 0.0, 0.0)  #: Scale-factor errors of the gyroscopes, measured / true - 1.
+    misalignment_rad: Three = (0.0, 0.0, 0.0)  #: Rotation of the unit relative to the body, as a rotation vector.
+    accel_resolution_mps2: NotNegative = 0.0  #: Quantisation step of the accelerometers; 0 for no quantisation.
+    gyro_resolution_radps: NotNegative = 0.0  #: Quantisation step of the gyroscopes; 0 for no quantisation.
+    #: Standard deviation of the vibration of each accelerometer axis at 20 m/s and more; at lower speeds it is
+    #: proportional to the speed.
     vibration_sigma_mps2: NotNegative = 0.0
-    vibration_sigma_radps: NotNegative = 0.0
-    #: Mean frequency of the vibration; the relative bandwidth is 15 percent. Frequencies above half of `rate_hz` are
+    vibration_sigma_radps: NotNegative = 0.0  #: Standard deviation of the vibration of each gyroscope axis.
+    #: Mean frequency of the vibration, with a relative bandwidth of 15 %. Frequencies above half of `rate_hz` are
     #: aliased.
     vibration_hz: Positive = 12.0
 
 
 class Dropout(Interval):
-    """Interval in which the radar measures nothing (snow on its antenna, P2 3.2)."""
+    """Interval without radar measurements, as with snow on the antenna (P2 3.2)."""
 
     end_s: Finite
 
 
 class RadarSettings(ScenarioSettings):
-    """Doppler radar that looks at the track (P2 3.1)."""
+    """Doppler radar directed at the track (P2 3.1)."""
 
     rate_hz: Positive = 10.0
     bias_mps: Finite = 0.0
-    scale: Finite = 0.0  #: Measured over true, less 1: an error of the mounting angle.
-    noise_sigma_mps: NotNegative = 0.0  #: White.
-    #: Gauss-Markov part of the scale, as caused by pitching of the body.
+    scale: Finite = 0.0  #: Scale-factor error, measured / true - 1, as caused by an error of the mounting angle.
+    noise_sigma_mps: NotNegative = 0.0  #: Standard deviation of the white noise.
+    #: Standard deviation of the Gauss-Markov part of the scale-factor error, as caused by pitching of the body.
     sway_ratio_sigma: NotNegative = 0.0
-    sway_time_s: Positive = 0.5
-    #: Range of speeds that are measured.
-    lowest_mps: NotNegative = 0.0
-    highest_mps: Positive = 200.0 / 3.6
+    sway_time_s: Positive = 0.5  #: Correlation time of this part.
+    lowest_mps: NotNegative = 0.0  #: Lowest speed that is measured.
+    highest_mps: Positive = 200.0 / 3.6  #: Highest speed that is measured.
 
-    dropouts: tuple[Dropout, ...] = ()
-    #: Drawn dropouts: mean number, mean duration (both exponential).
-    dropouts_per_hour: NotNegative = 0.0
-    dropout_duration_s: Positive = 5.0
+    dropouts: tuple[Dropout, ...] = ()  #: Given dropouts.
+    dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts, with exponentially distributed intervals.
+    dropout_duration_s: Positive = 5.0  #: Mean of their exponentially distributed durations.
 
 
 class GroundUnit(ScenarioSettings):
     """Ranging unit near the track."""
 
     name: str = Field(min_length=1)
-    #: Position: along the line, to the right of the track's axis, above the rails.
     chainage_m: Finite
-    lateral_m: Finite = 3.0
-    height_m: Finite = 3.0
-    delay_bias_m: Finite = 0.0  #: Error of the constant answering delay, as range.
+    lateral_m: Finite = 3.0  #: Distance to the right of the track axis.
+    height_m: Finite = 3.0  #: Height above the rails.
+    delay_bias_m: Finite = 0.0  #: Range error by the error of the constant response delay.
 
 
 class RangingSettings(ScenarioSettings):
@@ -338,18 +331,16 @@ class RangingSettings(ScenarioSettings):
     units: tuple[GroundUnit, ...] = ()
     interval_s: Positive = 0.2
     reach_m: Positive = 100.0  #: Largest range that is measured.
-    #: Position of the vehicle's unit, as the antennas'.
-    along_m: Finite = 9.0
-    across_m: Finite = 0.0
-    up_m: Finite = 3.0
-    noise_sigma_m: NotNegative = 0.0  #: White in time.
-    #: Error that depends on the position alone, independent from cell to cell of this length along the line.
+    along_m: Finite = 9.0  #: Position of the vehicle's unit along the forward axis, as for the antennas.
+    across_m: Finite = 0.0  #: Position of the vehicle's unit to the right.
+    up_m: Finite = 3.0  #: Height of the vehicle's unit above the rail tops.
+    noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the white noise.
+    #: Standard deviation of the multipath error, which is constant and independent in each cell along the line.
     multipath_sigma_m: NotNegative = 0.0
-    multipath_cell_m: Positive = 0.25
-    #: Fraction of the cells in which an echo hides the direct path, and the mean of its exponential excess.
-    echo_chance: Share = 0.0
-    echo_delay_m: NotNegative = 0.8
-    lost_chance: Share = 0.0  #: Probability that an answer is lost.
+    multipath_cell_m: Positive = 0.25  #: Length of a cell.
+    echo_chance: Share = 0.0  #: Fraction of the cells in which an echo is measured instead of the direct path.
+    echo_delay_m: NotNegative = 0.8  #: Mean of the exponentially distributed excess path of an echo.
+    lost_chance: Share = 0.0  #: Probability that a response is lost.
 
     @field_validator("units")
     @classmethod
@@ -363,7 +354,7 @@ class RangingSettings(ScenarioSettings):
 class Balise(ScenarioSettings):
     """Balise in the track."""
 
-    name: str = Field(min_length=1)  #: Identity.
+    name: str = Field(min_length=1)  #: Identity of the balise.
     chainage_m: Finite
 
 
@@ -371,19 +362,18 @@ class BaliseSettings(ScenarioSettings):
     """Balises and their reader on the vehicle."""
 
     balises: tuple[Balise, ...] = ()
-    #: Further balises at this spacing from the beginning of the line on, named B001 and so on; 0 for none.
+    #: Spacing of further balises from the beginning of the line, named B001, B002 and so on; 0 for none.
     spacing_m: NotNegative = 0.0
-    along_m: Finite = 0.0  #: Position of the reader along the body, like the antennas'.
-    noise_sigma_m: NotNegative = 0.0  #: Error of a reading along the line.
-    missed: tuple[str, ...] = ()  #: Balises that are not read.
-    wrong: dict[str, str] = Field(default_factory=dict)  #: Balises that are read with another identity.
-    #: Probability of a reading with the identity of another balise.
-    missed_chance: Share = 0.0
-    wrong_chance: Share = 0.0
+    along_m: Finite = 0.0  #: Position of the reader in the body along the forward axis, as for the antennas.
+    noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the error of a reading along the line.
+    missed: tuple[str, ...] = ()  #: Names of balises that are not read.
+    wrong: dict[str, str] = Field(default_factory=dict)  #: Wrong identity that is read, by the name of the balise.
+    missed_chance: Share = 0.0  #: Probability that a balise is never read.
+    wrong_chance: Share = 0.0  #: Probability that a balise is always read with the identity of another balise.
 
 
 class SensorSettings(ScenarioSettings):
-    """Sensors of the vehicle; None: no sensor of that kind."""
+    """On-board sensors; None for no sensor of a kind."""
 
     tachometer: TachometerSettings | None = TachometerSettings()
     inertial: InertialSettings | None = InertialSettings()
@@ -393,24 +383,21 @@ class SensorSettings(ScenarioSettings):
 
 
 class SbasSettings(ScenarioSettings):
-    """SBAS that corrects GPS and the ionosphere, or on L5 ionosphere-free codes of GPS and Galileo."""
+    """SBAS that corrects GPS and the ionosphere on L1, or ionosphere-free codes of GPS, Galileo and BeiDou on L5."""
 
-    band: Literal["L1", "L5"] = "L1"  #: L5 needs receivers with ``signals_per_satellite = 2, second = "L5"``.
+    band: Literal["L1", "L5"] = "L1"  #: L5 requires receivers with ``signals_per_satellite = 2, second = "L5"``.
     prn: Annotated[int, Field(ge=120, le=158)] = 137
-    latency_s: NotNegative = 4.0  #: Corrections are computed for this time before the first bit of their message.
-    #: Indicators of the accuracy of all satellites and grid points, as sent.
-    udrei: Annotated[int, Field(ge=0, le=13)] = 5
-    givei: Annotated[int, Field(ge=0, le=14)] = 9
-    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: The indicator on L5.
-    #: Errors of the service's own estimates: white, of each fast correction, each axis, each grid delay.
-    clock_sigma_m: NotNegative = 0.0
-    orbit_sigma_m: NotNegative = 0.0
-    delay_sigma_m: NotNegative = 0.0
-    #: Grid points within this distance from the line's first point, in latitude and longitude, are in the mask.
+    latency_s: NotNegative = 4.0  #: Time from the validity of a correction to the first bit of its message.
+    udrei: Annotated[int, Field(ge=0, le=13)] = 5  #: UDREI that is sent for all satellites on L1.
+    givei: Annotated[int, Field(ge=0, le=14)] = 9  #: GIVEI that is sent for all grid points.
+    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: DFREI that is sent for all satellites on L5.
+    clock_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each clock correction.
+    orbit_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each axis of an orbit correction.
+    delay_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each grid delay.
+    #: Largest difference in latitude and in longitude between a grid point in the mask and the start of the line.
     grid_radius_deg: Positive = 25.0
-    #: A fault larger than this sets the satellite to "do not use" after this time.
-    alert_m: Positive = 10.0
-    alert_s: NotNegative = 6.0
+    alert_m: Positive = 10.0  #: Range error by a fault above which a satellite is set to "do not use".
+    alert_s: NotNegative = 6.0  #: Delay of this alert.
     lost_chance: Share = 0.0  #: Probability that a message is not received.
-    #: Time by which the messages precede the run, so that all corrections are available at its start.
+    #: Time by which the messages begin before the run, so that all corrections are available at its start.
     lead_s: NotNegative = 300.0

@@ -1,4 +1,9 @@
-"""Observations of the two receivers: ranges, clocks, delays, errors, noise."""
+"""Simulated observations of all receivers, composed of ranges, clocks, delays, errors and noise.
+
+Ionospheric delays are those of Klobuchar's model (IS-GPS-200, 20.3.3.5.2.5), tropospheric delays those of
+Saastamoinen's model with the standard atmosphere and 70 % relative humidity. A receiver that applies these models
+corrects the delays exactly, unless a scale or an error of the scenario changes them.
+"""
 
 from __future__ import annotations
 
@@ -26,29 +31,32 @@ from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_tr
 from railfix.simulate.receiver import Receiver, ReceiverClocks, list_signals
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
-CN0_STEP_DBHZ: Final = 0.25  #: Receivers report C/N0 in steps [dB-Hz].
-CHUNK_EPOCHS: Final = 2000  #: Epochs of one chunk.
+CN0_STEP_DBHZ: Final = 0.25  #: Resolution of the reported C/N0 [dB-Hz].
+CHUNK_EPOCHS: Final = 2000  #: Number of epochs of a chunk.
 _LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are searched [s].
-_RATE_S: Final = 0.005  #: Half the interval of the difference that gives range rates [s].
-#: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise is constant [dB-Hz].
+_RATE_S: Final = 0.005  #: Half the interval of the differences from which range rates are computed [s].
+#: C/N0 to which the sigmas of `ReceiverSettings` refer, and C/N0 above which the noise is constant [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
 _BEST_DBHZ: Final = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
-    """Ground truth and observations of one antenna for some epochs."""
+    """Ground truth and observations of one receiver for T epochs and M channels."""
 
     observations: Observations
-    geometry: SightGeometry  #: True positions of antenna and satellites.
-    clock_m: Floats  #: Receiver clock times the speed of light, shape (T,).
-    code_sigma_m: Floats  #: Standard deviation of the noise in the codes, shape (T, M).
-    clean_code_m: Floats  #: The codes without noise and without disturbances, shape (T, M).
-    error_m: Floats  #: Part of `clean_code_m` from `Scenario.errors` that no model corrects; shape (T, M).
+    geometry: SightGeometry  #: True positions of the antenna, and directions to the satellites.
+    clock_m: Floats  #: Receiver clock bias times the speed of light, shape (T,).
+    code_sigma_m: Floats  #: Standard deviation of the code noise, shape (T, M).
+    clean_code_m: Floats  #: Codes without noise and without disturbances, shape (T, M).
+    error_m: Floats  #: Part of `clean_code_m` by `Scenario.errors`, which no model corrects, shape (T, M).
 
 
 class Simulation:
-    """Simulation of a scenario: line, motion, satellites, and observations in chunks."""
+    """Simulation of a scenario: line, motion, satellites, and observations in chunks.
+
+    The constructor raises the errors of `build_alignment`, `build_motion` and `simulate_navigation`.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -67,18 +75,18 @@ class Simulation:
         self.clocks = ReceiverClocks(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Datetimes:
-        """Return the time tags of epochs `first` to before `last`, GPS time."""
+        """Return the time tags (GPS time) of the epochs from `first` up to but not including `last`, by default all."""
         last = self.scenario.epochs if last is None else last
         return np.asarray(self.scenario.start + np.arange(first, last) * self.scenario.interval)
 
     @cached_property
     def satellites(self) -> tuple[str, ...]:
-        """Satellites of `channels`, in the order of their names."""
+        """Names of the S satellites of `channels`, sorted."""
         return tuple(sorted({name for name, _ in self.channels}))
 
     @cached_property
     def satellite_table(self) -> SatelliteTable:
-        """States of `satellites` over the run."""
+        """Positions and clocks of `satellites` over the run."""
         return SatelliteTable(self.navigation.kepler, self.satellites, self.scenario.start, self.time()[-1])
 
     @cached_property
@@ -87,7 +95,7 @@ class Simulation:
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
-        """Return satellite and atmospheric errors; errors of a satellite are independent of the others."""
+        """Return the satellite and atmospheric errors of satellites; those of one do not depend on the others."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,
@@ -106,27 +114,27 @@ class Simulation:
         return float(latitude[0]), float(longitude[0])
 
     def truth(self, antenna: str, seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
-        """True position of an antenna at seconds after the start, and its speed along the line [m/s]."""
+        """Return the true positions of an antenna or station at times after the start [s], and the speeds [m/s]."""
         if antenna not in ANTENNAS:
             return self._station_truth(antenna, len(seconds_s)), np.zeros(len(seconds_s))
         return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
 
     def _station_truth(self, name: str, count: int) -> AntennaTruth:
-        """Position of a reference station, repeated for a number of instants."""
+        """Return the position of a reference station, repeated for a number of instants."""
         station = next(item for item in self.scenario.stations if item.name == name)
         at = np.full(count, station.chainage_m)
         place = self.line.point_beside(at, station.lateral_m, station.height_m)
         return AntennaTruth(ecef_m=place, chainage_m=at, forward=self.line.tangent_at(at))
 
     def body_truth(self, offset_m: tuple[float, float, float], seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
-        """True position of a point of the body at seconds after the start, and the speed."""
+        """Return the true positions of a point of the body at times after the start [s], and the speeds [m/s]."""
         middle, speed = self.motion.at(seconds_s)
         roll, pitch = self.body.roll_rad(seconds_s, speed), self.body.pitch_rad(seconds_s, speed)
         return antenna_truth(self.line, self.scenario.vehicle, offset_m, middle, roll, pitch), speed
 
     @cached_property
     def channels(self) -> tuple[tuple[str, str], ...]:
-        """Satellite and signal of each channel: satellites above the cutoff at any time of the run."""
+        """Satellite and signal of each channel, for the satellites above the cutoff at some time of the run."""
         scenario = self.scenario
         looks = np.append(np.arange(0.0, scenario.duration_s, _LOOK_S), scenario.duration_s)
         tags = scenario.start + timedelta(looks)
@@ -140,7 +148,10 @@ class Simulation:
         return tuple((name, signal) for name in names for signal in list_signals(name[0], scenario.receiver))
 
     def header(self, antenna: str) -> ObservationHeader:
-        """Header of a receiver's log; the approximate position is rounded to 100 m, a station's is exact."""
+        """Return the header of the log of a receiver.
+
+        The approximate position of an antenna is rounded to 100 m, that of a reference station to 0.1 mm.
+        """
         place = self.truth(antenna, np.zeros(1))[0].ecef_m[0]
         return ObservationHeader(
             version=3.04,
@@ -154,7 +165,7 @@ class Simulation:
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:
-        """Yield the truth and observations of one antenna, piece by piece; results do not depend on the pieces."""
+        """Yield ground truth and observations of a receiver in chunks; the values do not depend on `chunk_epochs`."""
         receiver = Receiver(
             self.scenario,
             antenna,
@@ -167,20 +178,20 @@ class Simulation:
             yield _piece(self, receiver, self.time(first, min(first + chunk_epochs, self.scenario.epochs)))
 
     def observations(self, antenna: str) -> Iterator[Observations]:
-        """Return the observations of one antenna, piece by piece."""
+        """Return an iterator over the observations of a receiver in chunks."""
         return (piece.observations for piece in self.pieces(antenna))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Instant:
-    """Clean quantities (T, S): `path_m` is distance with troposphere less satellite clock, `ionosphere_m` on L1."""
+    """Directions and delays of the signals of S satellites at T epochs, shapes (T, S), without receiver clock."""
 
     elevation_deg: Floats
     azimuth_deg: Floats
-    path_m: Floats
-    ionosphere_m: Floats
-    path_error_m: Floats
-    ionosphere_error_m: Floats
+    path_m: Floats  #: Range plus tropospheric delay and `path_error_m`, less satellite clock.
+    ionosphere_m: Floats  #: Ionospheric delay on L1, including `ionosphere_error_m`.
+    path_error_m: Floats  #: Error by orbit, clock and troposphere.
+    ionosphere_error_m: Floats  #: Error of the ionospheric delay on L1.
 
 
 def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
@@ -190,7 +201,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
     sky = found.satellite_ecef_m
     elevation, azimuth = elevation_azimuth(sky, antenna_ecef_m)
     latitude, longitude, height = geodetic_from_ecef(antenna_ecef_m)
-    # Far below the horizon no signal is tracked; the formulas only have to remain finite there.
+    # Below the horizon no signal is tracked, but the delays must be finite.
     raised = np.maximum(elevation, 1.0)
     troposphere = saastamoinen_delay_m(latitude, height, raised)
     ionosphere = klobuchar_delay_m(
@@ -216,7 +227,10 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 
 
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
-    """Return geometry by satellite, the instant of the epochs, and rates of path and ionosphere over 10 ms [m/s]."""
+    """Return the geometry by satellite, the delays at the epochs, and the rates of path and ionosphere [m/s].
+
+    The rates are differences over 10 ms.
+    """
     late = simulation.clocks.bias_s(antenna, tags := seconds(time - simulation.scenario.start))
     truth, speed = simulation.truth(antenna, tags - late)
     now = _instant(simulation, time, late, truth.ecef_m)
@@ -242,7 +256,7 @@ def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[Si
 
 
 def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece:
-    """Return the next epochs of a receiver."""
+    """Return the ground truth and observations of a receiver at the next epochs."""
     scenario, settings = simulation.scenario, simulation.scenario.receiver
     by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, receiver.antenna, time)
     column, scale, wavelength = receiver.column, receiver.scale, receiver.wavelength_m
@@ -256,7 +270,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
     clock = SPEED_OF_LIGHT * simulation.clocks.bias_s(receiver.antenna, tags)
-    # Errors of code and phase alike, and their rate.
+    # Errors that are equal in code and phase, and their rate.
     fault, fault_rate = _faults(simulation, receiver, tags)
     extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
     extra_rate = fault_rate + receiver.offset_drift_mps
@@ -308,7 +322,10 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
 def _disturb(
     simulation: Simulation, receiver: Receiver, geometry: SightGeometry, cn0_dbhz: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the surroundings' effects on code [m], phase [m] and Doppler [Hz], and the resulting C/N0, each (T, M)."""
+    """Return the disturbances of code [m], phase [m] and Doppler [Hz], and the disturbed C/N0, shape (T, M) each.
+
+    Reference stations have no disturbances.
+    """
     code, phase, doppler = np.zeros((3, *cn0_dbhz.shape))
     for source in simulation.disturbances if receiver.antenna in ANTENNAS else ():
         more = source(geometry)
@@ -318,7 +335,7 @@ def _disturb(
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
-    """Return range errors by satellite and station receiver faults [m], and their rates [m/s], shapes (T, M)."""
+    """Return range errors by satellite faults and faults of a station's receiver [m], and their rates [m/s], (T, M)."""
     names = receiver.names.tolist()
     fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:
@@ -329,7 +346,7 @@ def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[
 
 
 def _is_tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:
-    """Return satellites that a receiver tracks, shape (T, S)."""
+    """Return whether satellites are above the cutoff and among the highest `satellites_at_most`, shape (T, S)."""
     tracked = elevation_deg >= scenario.sky.cutoff_deg
     most = scenario.sky.satellites_at_most
     if most is not None and most < elevation_deg.shape[1]:

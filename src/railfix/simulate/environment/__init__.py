@@ -1,7 +1,7 @@
-"""Multipath and blockage by structures along the line: masts, beams, buildings, slopes, roofs, tunnels.
+"""Multipath and blockage by structures along the line, such as masts, beams, buildings, slopes, roofs and tunnels.
 
-`EnvironmentSettings` describes the structures; `Environment` draws them from a seed and is a source
-of disturbances for `Scenario.multipath`. docs/simulator.md has the physics.
+`EnvironmentSettings` describes the structures. `Environment` draws them from a seed and computes the disturbances of
+the signals. The physical models are described in docs/simulator.md.
 """
 
 from railfix.simulate.environment.model import Environment

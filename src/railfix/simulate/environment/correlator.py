@@ -1,8 +1,9 @@
-"""Code, phase and C/N0 of an early-late receiver with several signal paths; diffraction, antenna pattern.
+"""Code, phase and C/N0 of an early-late receiver with several signal paths; diffraction and reflection amplitudes.
 
-The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))`` with the sums of all paths in the early, late
-and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14), with the triangle of
-unlimited bandwidth. Where the triangle is straight that zero is a quotient, so a few iterations find it.
+The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths
+in the early, late and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14). The
+autocorrelation is the triangle of unlimited bandwidth. Within its straight parts the zero is a quotient, so that a few
+iterations suffice.
 """
 
 from __future__ import annotations
@@ -19,22 +20,21 @@ from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSet
 
 Singles = NDArray[np.float32]
 
-#: Iterations: three suffice for errors of a few hundredths of a chip; a wide spacing requires more.
+#: Number of iterations; three suffice for errors of a few hundredths of a chip, a wide spacing requires more.
 _ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12
-_NARROW_CHIPS: Final = 0.2  #: Up to this spacing the correlator is narrow [chips].
+_NARROW_CHIPS: Final = 0.2  #: Largest early-late spacing of a narrow correlator [chips].
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedCode:
-    """Tracked signals, shapes (N,)."""
+    """Tracked code, phase and amplitude of N signals relative to the unobstructed direct signal, shapes (N,)."""
 
-    #: Delay beyond the unobstructed direct signal.
-    code_m: Floats
-    phase_m: Floats
-    rate_mps: Floats  #: Correlation time of the phase, at constant amplitudes of the paths.
-    gain_db: Floats  #: Amplitude of the prompt correlator relative to the unobstructed direct signal.
-    main: Indices  #: Path to which the loops lock.
+    code_m: Floats  #: Delay of the code.
+    phase_m: Floats  #: Delay of the carrier phase.
+    rate_mps: Floats  #: Rate of change of `phase_m`, at constant amplitudes of the paths.
+    gain_db: Floats  #: Amplitude of the prompt correlator.
+    main: Indices  #: Index of the path to which the loops lock.
 
 
 def track_paths(
@@ -45,8 +45,12 @@ def track_paths(
     chip_m: Floats,
     receiver: CorrelatorSettings,
 ) -> TrackedCode:
-    """Track the sum of P paths for N signals, `field` (P, N) relative to the direct one: loops lock to the strongest,
-    the code error stays within half the spacing, fading is attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``.
+    """Compute code, phase and amplitude of N signals, each a sum of P paths.
+
+    `field` are the complex amplitudes of the paths relative to the unobstructed direct signal, `extra_m` their extra
+    delays and `rate_mps` the rates of the delays, shape (P, N). The loops lock to the strongest path, and the code
+    error relative to this path is at most half the early-late spacing. Paths whose phase relative to it changes with a
+    frequency f are attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``.
     """
     column = np.arange(field.shape[1])
     strength = np.sqrt(field.real**2 + field.imag**2)
@@ -54,8 +58,8 @@ def track_paths(
     first, first_rate, anchor = extra_m[main, column], rate_mps[main, column], field[main, column]
     size = np.maximum(strength[main, column], 1e-9)
     delay, rate = extra_m - first, rate_mps - first_rate
-    # Relative to the main path: c = (a + jb) exp(-j 2 pi delay / wavelength).
-    # From here single precision: 1e-7 of a chip or of a wave.
+    # Amplitudes relative to the main path: c = (a + jb) exp(-j 2 pi delay / wavelength).
+    # Single precision suffices from here: 1e-7 of a chip or of a wavelength.
     turn = np.asarray(np.remainder(delay / wavelength_m, 1.0) * (2.0 * np.pi), dtype=np.float32)
     cosine, sine = np.cos(turn), np.sin(turn)
     a = np.asarray((field.real * anchor.real + field.imag * anchor.imag) / size**2, dtype=np.float32)
@@ -82,7 +86,7 @@ def track_paths(
 
 
 def _carrier(real: Singles, imaginary: Singles, rate_mps: Floats, anchor: Complexes) -> tuple[Floats, Floats]:
-    """Return the phase of the sum of paths [rad], and its rate beyond the main path's [m/s], at constant amplitudes."""
+    """Return the phase of the sum of paths [rad], and its rate relative to that of the main path [m/s]."""
     carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
     angle = np.arctan2(
         quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
@@ -98,7 +102,7 @@ def _triangle(x: Singles) -> Singles:
 
 
 def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spacing: float) -> Singles:
-    """Return the zero of the discriminator, in chips from the main path (which is 1 and `late` by 0)."""
+    """Return the zero of the discriminator in chips from the main path, whose amplitude is 1 and delay `late` 0."""
     half = 0.5 * spacing
     error = np.zeros(real.shape[1], dtype=np.float32)
     own = (1.0 - follow) * (real**2 + imaginary**2)
@@ -107,10 +111,10 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
         away = np.abs(x)
         triangle = _triangle(x)
         carrier, quadrature = (real * triangle).sum(axis=0), (imaginary * triangle).sum(axis=0)
-        # Part of each path in phase with the sum: its own square is constant, the rest oscillates.
+        # Part of each path in phase with the sum: the square of the path is constant, its other products oscillate.
         in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
         near = away < half
-        # Early less late of a path at x: -2 x when near, otherwise a plateau that falls to 0 past a chip.
+        # Early minus late of a path at x is -2 x near the zero, then a plateau, which falls to 0 beyond a chip.
         far = np.copysign(np.clip(1.0 + half - away, 0.0, spacing), -x)
         push = np.where(near, 2.0 * late, far) * in_phase
         slope = 2.0 * (near * in_phase).sum(axis=0)
@@ -118,18 +122,22 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
     return error
 
 
-CLEAR_V: Final = -0.78  #: Below this the loss of an edge is 0 by the formula of ITU-R P.526-15, 4.1.
+CLEAR_V: Final = -0.78  #: Fresnel parameter below which the loss of a knife edge is 0 (ITU-R P.526-15, 4.1).
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Fresnel parameter per clearance [1/m] of an edge at this distance, source at infinity (P.526-15, 4.1)."""
+    """Return the ratio of Fresnel parameter to clearance [1/m] for an edge at a distance and a source at infinity.
+
+    The formula is that of ITU-R P.526-15, 4.1.
+    """
     return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
 
 
 def edge_amplitude(v: Floats) -> Floats:
-    """Return the amplitude behind a knife edge of Fresnel parameter v, positive in the shadow (P.526-15, 4.1).
+    """Return the amplitude behind a knife edge for Fresnel parameters v, which are positive in the shadow.
 
-    ``J(v) = 6.9 + 20 log10(sqrt((v - 0.1)^2 + 1) + v - 0.1)`` dB above v = -0.78, else none.
+    The loss is ``J(v) = 6.9 + 20 log10(sqrt((v - 0.1)^2 + 1) + v - 0.1)`` dB for v > -0.78, otherwise 0 (ITU-R
+    P.526-15, 4.1).
     """
     w = v - 0.1
     loss = 10.0 ** (-6.9 / 20.0) / (np.sqrt(w * w + 1.0) + w)
@@ -137,23 +145,28 @@ def edge_amplitude(v: Floats) -> Floats:
 
 
 def strip_field(v: Floats, width_v: Floats) -> Complexes:
-    """Return the field a strip removes (Kirchhoff, Babinet): ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over it."""
+    """Return the field that an opaque strip removes from the direct signal (Kirchhoff diffraction, Babinet).
+
+    The field is ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip, whose middle is at the Fresnel parameter
+    `v` and whose width is `width_v`.
+    """
     sine_1, cosine_1 = fresnel(v - 0.5 * width_v)
     sine_2, cosine_2 = fresnel(v + 0.5 * width_v)
     return np.asarray(0.5 * (1.0 + 1.0j) * ((cosine_2 - cosine_1) - 1.0j * (sine_2 - sine_1)))
 
 
 def roughness_loss(roughness_m: Floats, cosine: Floats, wavelength_m: Floats) -> Floats:
-    """Amplitude factor of specular reflection off a rough wall: exp(-g^2/2), g = 4 pi sigma cos(incidence)/lambda.
+    """Return the amplitude factor of specular reflection by a rough wall.
 
-    Ament (1953), Proc. IRE 41, 142; the criterion of Rayleigh is g of about 1.6.
+    The factor is exp(-g^2/2) with g = 4 pi sigma cos(incidence) / lambda (Ament 1953, Proc. IRE 41, 142). Rayleigh's
+    criterion is g of about 1.6.
     """
     g = 4.0 * np.pi * roughness_m * cosine / wavelength_m
     return np.exp(-0.5 * g * g)
 
 
 def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Floats]:
-    """Right-handed and left-handed amplitudes of a right-handed circular wave reflected by a smooth dielectric wall.
+    """Return the right-handed and left-handed amplitudes of a right-handed wave reflected by a smooth dielectric wall.
 
     ``G_perp = (c - r) / (c + r)``, ``G_par = (e c - r) / (e c + r)`` with c the cosine of incidence from the wall's
     normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); ``|G_par + G_perp| / 2`` right-handed,
@@ -166,14 +179,18 @@ def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Fl
 
 
 def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaSettings) -> Floats:
-    """Amplitude of a wall's reflection over the direct signal's; the left-handed part has the antenna's cross-polar
-    loss, linear in the sine of the elevation [dB].
+    """Return the ratio of the received amplitudes of a wall reflection and of the direct signal.
+
+    The left-handed part is attenuated by `cross_polar_gain`.
     """
     right, left = circular_reflection(cosine, antenna.wall_permittivity)
     return np.sqrt(right**2 + (left * cross_polar_gain(sine_elevation, antenna)) ** 2)
 
 
 def cross_polar_gain(sine_elevation: Floats | float, antenna: AntennaSettings) -> Floats:
-    """Return the ratio of received amplitudes of left-handed to right-handed signals."""
+    """Return the ratio of the received amplitudes of left-handed and right-handed signals.
+
+    Its value in dB is linear in the sine of the elevation.
+    """
     horizon_db, zenith_db = antenna.cross_polar_horizon_db, antenna.cross_polar_zenith_db
     return np.asarray(10.0 ** (-(horizon_db + sine_elevation * (zenith_db - horizon_db)) / 20.0))

@@ -1,4 +1,4 @@
-"""Multipath and blockage along a line, a function of the geometry alone; masts, beams and wires diffract."""
+"""Multipath and blockage along a line as a function of the geometry; diffraction by masts, beams and wires."""
 
 from __future__ import annotations
 
@@ -45,28 +45,28 @@ from railfix.simulate.environment.walls import (
     street_reflections,
 )
 
-_LEAST_WEIGHT: Final = 0.005  #: Conductors are left out below this weight.
+_LEAST_WEIGHT: Final = 0.005  #: Weight below which the obstruction by a conductor is neglected.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conductor:
-    """One straight conductor for each of N rays."""
+    """Straight conductor for each of N rays, in axes (p, q) perpendicular to the conductor, from the antenna."""
 
-    #: Its axis in the plane perpendicular to it, from the antenna; shape (N,) [m].
-    p: Floats
-    q: Floats
-    #: Direction to the satellite in that plane, and along the conductor; shape (N,).
-    ray_p: Floats
-    ray_q: Floats
-    ray_axis: Floats
-    #: Ends along the axis, from the antenna.
-    low_m: Floats | float
-    high_m: Floats | float
-
+    p: Floats  #: Coordinate p of the conductor, shape (N,) [m].
+    q: Floats  #: Coordinate q of the conductor, shape (N,) [m].
+    ray_p: Floats  #: Component p of the unit vector to the satellite, shape (N,).
+    ray_q: Floats  #: Component q of the unit vector to the satellite, shape (N,).
+    ray_axis: Floats  #: Component of the unit vector to the satellite along the conductor, shape (N,).
+    low_m: Floats | float  #: Lower end of the conductor along its axis, from the antenna.
+    high_m: Floats | float  #: Upper end of the conductor along its axis, from the antenna.
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:
-        """Field removed from the direct signal by the conductor, by obstructed fraction and cosine, shape (N,)."""
+        """Return the field that the conductor removes from the direct signal, shape (N,).
+
+        The field of an infinite strip is weighted by the obstructing fraction of the conductor and by the cosine of the
+        angle between ray and conductor in the plane (p, q).
+        """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
         toward = (self.p * self.ray_p + self.q * self.ray_q) / plane
@@ -80,11 +80,12 @@ class Conductor:
         return field
 
     def scatter(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return amplitude, extra path [m], and direction (p, q) of the signal scattered to the antenna from behind.
+        """Return amplitude, extra path [m] and direction (p, q) of the signal scattered to the antenna.
 
-        A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
-        bistatic angle b; extra path rho c (1 - cos(phi)), c the part of the ray perpendicular to the conductor and
-        phi its angle to it. Half of the scattered power has the antenna's polarisation.
+        Only conductors on the side opposite the satellite scatter. The amplitude is that of a metal cylinder in
+        geometrical optics, sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and bistatic angle b; half of the
+        scattered power has the antenna's polarisation. The extra path is rho c (1 - cos(phi)), where c is the component
+        of the ray perpendicular to the conductor and phi the angle between this component and the conductor.
         """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
@@ -98,7 +99,7 @@ class Conductor:
         return amplitude * behind, away * plane * (1.0 - cosine), plane * self.p / away, plane * self.q / away
 
     def _share(self, at_m: Floats, scale: Floats) -> Floats:
-        """Return the fraction of the conductor that obstructs: 1 between its ends, 0 beyond."""
+        """Return the fraction by which the conductor obstructs: 1 between its ends, with a transition to 0 beyond."""
         inside = np.minimum(at_m - self.low_m, self.high_m - at_m) * scale
         return 1.0 - edge_amplitude(inside)
 
@@ -141,12 +142,12 @@ class Electrification:
         )
 
     def _stands(self, sign: Floats) -> Floats:
-        """1 on sides with masts, else 0."""
+        """Return 1 on sides with masts, otherwise 0; `sign` is 1 on the right, -1 on the left."""
         side = {"both": sign, "right": 1.0, "left": -1.0}[self.settings.sides]
         return np.where(sign == side, 1.0, 0.0)
 
     def transmit(self, rays: Rays) -> Complexes:
-        """Direct field behind masts, beam and wires: 1 where nothing obstructs, shape (N,)."""
+        """Return the direct field behind masts, beams and wires, shape (N,); 1 where nothing obstructs."""
         s = self.settings
         sign = np.where(rays.y > 0.0, 1.0, -1.0)
         lateral = np.maximum(np.abs(rays.y), 1e-3)
@@ -174,7 +175,10 @@ class Electrification:
         )
 
     def scatter(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
-        """Amplitude, extra path and its growth [m/m] of the signals scattered by mast and beam, each of shape (N,)."""
+        """Return the signals that the nearest mast and beam scatter to the antenna.
+
+        Each has amplitude, extra path [m] and growth of the extra path with the chainage [m/m], of shape (N,).
+        """
         sign = np.where(rays.y > 0.0, -1.0, 1.0)
         conductors = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
         if self.settings.beam_every:
@@ -189,21 +193,21 @@ class Electrification:
         return rows
 
 
-#: Chip length over C/A's, by constellation and band; all other signals have C/A's (BPSK(1), BOC(1,1)).
+#: Chip length relative to that of C/A, by constellation and band; 1 for all other signals (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle.
-_NO_FIELD: Final = 0.01  #: Weaker fields are neglected.
-PLATFORM_M: Final = 1.1  #: Height of a station's platforms over the rails [m].
-_HARMONICS: Final = 4  #: Harmonics of the gain ripple over azimuth.
-_BLOCK: Final = 8192  #: Signals computed at once, so that their arrays stay in the processor's cache.
+_NO_FIELD: Final = 0.01  #: Amplitude below which reflections are neglected.
+PLATFORM_M: Final = 1.1  #: Height of platforms above the rails [m].
+_HARMONICS: Final = 4  #: Number of harmonics of the gain ripple over azimuth.
+_BLOCK: Final = 8192  #: Number of signals computed in one step, so that their arrays fit into the processor's cache.
 _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation for which signals are computed [deg].
 
 
 class Environment:
     """Multipath and blockage along a line.
 
-    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its increase to the zenith. The same seed
-    gives the same structures and, where they are drawn, the same sections.
+    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its increase to the zenith. Structures
+    and, with `EnvironmentSettings.shares`, sections are drawn from the seed.
     """
 
     def __init__(
@@ -237,7 +241,7 @@ class Environment:
         return self.structures.kinds[section]
 
     def __call__(self, geometry: SightGeometry) -> Disturbance:
-        """Return the disturbance of every channel and epoch, shapes (T, M)."""
+        """Return the disturbance of T epochs and M channels, shapes (T, M); the code is NaN where a signal is lost."""
         shape = geometry.elevation_deg.shape
         code, phase, doppler, cn0 = np.zeros((4, *shape))
         if self.settings.empty:
@@ -269,7 +273,10 @@ class Environment:
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
     def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> tuple[Complexes, Floats, Floats]:
-        """Return fields relative to the direct signal, extra paths [m] and their growth [m/m], shapes (P, N)."""
+        """Return complex amplitudes, extra paths [m] and their growth [m/m] of all P paths of N signals, shapes (P, N).
+
+        Amplitudes are relative to the unobstructed direct signal; growth is with the chainage of the antenna.
+        """
         field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
@@ -287,7 +294,7 @@ class Environment:
         return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
-        """Return reflections by side streets, by both sides in sequence, and by vehicles on parallel tracks."""
+        """Return the reflections by side streets, by both sides of the line in sequence, and by other vehicles."""
         settings, antenna = self.settings, self.settings.antenna
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
         if (streets := settings.side_streets) is not None:
@@ -300,13 +307,16 @@ class Environment:
             rows.append(second_reflection(self.structures.walls, rays, antenna))
         for neighbour in settings.neighbours:
             amplitude, extra, growth = neighbour_reflection(neighbour, rays, clock_s)
-            # Metal: all of it is left-handed but at grazing incidence.
+            # Reflection by metal is left-handed except at grazing incidence.
             gain = 1.0 if antenna is None else float(cross_polar_gain(0.0, antenna))
             rows.append((-amplitude * gain, extra, growth))
         return rows
 
     def _direct(self, rays: Rays, clock_s: Floats) -> tuple[Complexes, Floats]:
-        """Direct field and excess of the diffracted path; of several walls the most obstructing one counts."""
+        """Return the direct field and the excess path of diffraction [m], shapes (N,).
+
+        Only the most obstructing of several walls and vehicles is used.
+        """
         v = np.full(len(rays.x), FREE_V)
         for row in self.structures.walls:
             v = np.maximum(v, shadow(row, rays))
@@ -320,7 +330,7 @@ class Environment:
         field = amplitude.astype(np.complex128)
         if self._conductors is not None:
             field *= self._conductors.transmit(rays)
-        # h^2 / (2 D) of a clearance h at distance D.
+        # The excess path is h^2 / (2 D) for a depth h in the shadow of an edge at distance D.
         return field, 0.25 * rays.wavelength_m * np.clip(v, 0.0, 30.0) ** 2
 
     def _ground(self, rays: Rays) -> Floats:
@@ -329,8 +339,10 @@ class Environment:
         return np.asarray(strength * roughness_loss(rough, rays.z, rays.wavelength_m))
 
     def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Return amplitude, extra path and growth of the reflection in row r; the incident ray passes the rows of the
-        satellite's side, the reflected one the nearer rows of the reflecting side.
+        """Return amplitude, extra path [m] and growth [m/m] of the reflection by row `r` of walls, shapes (N,).
+
+        The incident ray may be obstructed by all rows on the side of the satellite, the reflected ray by the nearer
+        rows on the side of the reflection.
         """
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()
@@ -353,14 +365,14 @@ class Environment:
 
 
 class _GainRipple:
-    """Gain of the antennas over azimuth, of standard deviation 1 at the horizon."""
+    """Gain ripple of the antennas over azimuth, with standard deviation 1 at the horizon."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, 7106])
         self._phase = dict(zip(ANTENNAS, rng.uniform(0.0, 2.0 * np.pi, (len(ANTENNAS), _HARMONICS)), strict=True))
 
     def at(self, rays: Rays, antenna: str) -> Floats:
-        """Return the gain over the mean [standard deviations at the horizon], shape (N,)."""
+        """Return the gain relative to the mean in standard deviations at the horizon, shape (N,)."""
         azimuth = np.arctan2(rays.y, rays.x)
         level = np.sqrt(np.maximum(1.0 - rays.z**2, 0.0))
         order = np.arange(1, _HARMONICS + 1)[:, None]

@@ -10,8 +10,8 @@ In a scenario file::
     to_m = 900.0
     kind = "urban"
 
-or, instead of the sections, ``[environment.shares]`` with the fraction of the line that each kind has; sections are
-then drawn at random over the length of the line.
+Instead of sections, ``[environment.shares]`` gives the fraction of the line for each kind of section; the sections are
+then drawn at random.
 """
 
 from __future__ import annotations
@@ -44,41 +44,36 @@ KINDS: Final[tuple[str, ...]] = get_args(Kind)  #: Kinds of section.
 
 
 class ElectrificationSettings(ScenarioSettings):
-    """Masts, beams across the tracks, and the wires over the track."""
+    """Masts, beams across the tracks, and wires above the track."""
 
-    #: Masts are at chainages first_m + k spacing_m.
-    spacing_m: Positive = 50.0
-    first_m: Finite = 10.0
+    spacing_m: Positive = 50.0  #: Spacing of the masts.
+    first_m: Finite = 10.0  #: Chainage of one mast; the others are at multiples of the spacing from it.
 
-    sides: Sides = "both"
-    #: Mast's axis from the track's axis, its width, its top over the rails.
-    lateral_m: Positive = 3.0
-    width_m: Positive = 0.35
-    height_m: Positive = 9.0
-    beam_every: int = Field(default=1, ge=0)  #: A beam at every n-th mast, from mast line to mast line; 0 for none.
-    #: Middle of the beam over the rails, and its depth as seen from below.
-    beam_height_m: Positive = 7.5
-    beam_depth_m: Positive = 0.4
-    #: Contact wire and messenger wire over the track's axis, always there.
-    wire_height_m: Positive = 5.1
-    wire_width_m: Positive = 0.012
-    messenger_height_m: Positive = 6.0
+    sides: Sides = "both"  #: Sides of the line with masts.
+    lateral_m: Positive = 3.0  #: Distance of the axis of a mast from the track axis.
+    width_m: Positive = 0.35  #: Width of a mast.
+    height_m: Positive = 9.0  #: Height of the top of a mast above the rails.
+    beam_every: int = Field(default=1, ge=0)  #: A beam across the tracks at every n-th mast; 0 for no beams.
+    beam_height_m: Positive = 7.5  #: Height of the middle of a beam above the rails.
+    beam_depth_m: Positive = 0.4  #: Depth of a beam.
+    wire_height_m: Positive = 5.1  #: Height of the contact wire above the rails, over the track axis.
+    wire_width_m: Positive = 0.012  #: Width of the contact wire and of the messenger wire.
+    messenger_height_m: Positive = 6.0  #: Height of the messenger wire above the rails.
 
 
 class RowSettings(ScenarioSettings):
-    """A row of vertical walls along the line, uniform between the limits: buildings, slopes, mountains."""
+    """Row of vertical walls along the line (buildings, slopes, mountains), with uniformly distributed properties."""
 
     sides: Sides = "both"
-    distance_m: Between = (10.0, 30.0)  #: From the track's axis to the wall.
-    height_m: Between = (6.0, 15.0)  #: Top over the rails.
-    #: Along the line, and to the next.
-    length_m: Between = (10.0, 30.0)
-    gap_m: Between = (2.0, 10.0)
-    share: Share = 1.0  #: Fraction of the plots with buildings.
-    #: Amplitude reflection coefficient, the antenna's polarisation included (0 nothing, 1 all).
+    distance_m: Between = (10.0, 30.0)  #: Distance of the wall from the track axis.
+    height_m: Between = (6.0, 15.0)  #: Height of the top above the rails.
+    length_m: Between = (10.0, 30.0)  #: Length along the line.
+    gap_m: Between = (2.0, 10.0)  #: Gap to the next wall.
+    share: Share = 1.0  #: Fraction of the plots that have a wall.
+    #: Amplitude reflection coefficient, from 0 to 1; without `AntennaSettings` it includes the effect of polarisation.
     reflection: Between = (0.2, 0.7)
     roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
-    yaw_deg: AngleBetween = (-4.0, 4.0)  #: Yaw of the wall relative to the line's direction.
+    yaw_deg: AngleBetween = (-4.0, 4.0)  #: Yaw of the wall relative to the direction of the line.
 
     @field_validator("distance_m", "length_m", "reflection", "yaw_deg")
     @classmethod
@@ -92,17 +87,15 @@ class RowSettings(ScenarioSettings):
 
 
 class RoofSettings(ScenarioSettings):
-    """Level roofs along the line: over platforms, or across the tracks (bridges, concourses)."""
+    """Level roofs along the line, over platforms or across the tracks (bridges, concourses)."""
 
     sides: Sides = "both"
-    #: Distances of the edges from the track's axis; an inner edge at 0 covers the track.
-    inner_m: NotNegative = 1.8
-    outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)
-    height_m: Positive = 6.0  #: Over the rails.
-    #: Along the line, and to the next; uniform.
-    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)
-    gap_m: Between = (10.0, 40.0)
-    loss_db: NotNegative = 25.0  #: Loss through the roof.
+    inner_m: NotNegative = 1.8  #: Distance of the inner edge from the track axis; 0 for a roof that covers the track.
+    outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)  #: Distance of the outer edge.
+    height_m: Positive = 6.0  #: Height above the rails.
+    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)  #: Range of the uniform length along the line.
+    gap_m: Between = (10.0, 40.0)  #: Range of the uniform gap to the next roof.
+    loss_db: NotNegative = 25.0  #: Loss of signals through the roof.
 
     @field_validator("outer_m")
     @classmethod
@@ -113,14 +106,13 @@ class RoofSettings(ScenarioSettings):
 
 
 class SectionSettings(ScenarioSettings):
-    """One section of the line."""
+    """Section of the line with one kind of surroundings."""
 
-    #: Chainages.
-    from_m: Finite
-    to_m: Finite
-    kind: Kind  #: One of `KINDS`; rows and roofs are the kind's unless given here.
-    rows: tuple[RowSettings, ...] | None = None
-    roofs: tuple[RoofSettings, ...] | None = None
+    from_m: Finite  #: Chainage of the start.
+    to_m: Finite  #: Chainage of the end.
+    kind: Kind  #: Kind of section, one of `KINDS`, which determines the usual walls and roofs.
+    rows: tuple[RowSettings, ...] | None = None  #: Rows of walls; None for those of the kind.
+    roofs: tuple[RoofSettings, ...] | None = None  #: Roofs; None for those of the kind.
 
     _forward = field_validator("to_m")(beyond_start)
 
@@ -128,105 +120,94 @@ class SectionSettings(ScenarioSettings):
 class CorrelatorSettings(ScenarioSettings):
     """Correlator and tracking loops of the receivers."""
 
-    chip_m: Positive = 293.05  #: Length of a C/A chip; faster codes have theirs in proportion.
-    spacing_chips: float = Field(default=0.1, gt=0.0, le=1.0)  #: Early to late.
-    tracking_cn0_dbhz: Finite = 20.0  #: Signals below this C/N0 are lost.
-    #: Bandwidths of the loops: faster multipath fading is averaged.
-    code_loop_hz: Positive = 1.0
-    carrier_loop_hz: Positive = 10.0
-    backward_db: Finite = 15.0  #: Loss of the antenna below the horizon.
+    chip_m: Positive = 293.05  #: Length of a C/A chip; the chips of faster codes are shorter in proportion.
+    spacing_chips: float = Field(default=0.1, gt=0.0, le=1.0)  #: Early-late spacing of the correlator.
+    tracking_cn0_dbhz: Finite = 20.0  #: C/N0 below which a signal is lost.
+    code_loop_hz: Positive = 1.0  #: Bandwidth of the code loop; faster multipath fading is averaged.
+    carrier_loop_hz: Positive = 10.0  #: Bandwidth of the carrier loop.
+    backward_db: Finite = 15.0  #: Loss of the antenna for signals from below the horizon.
 
 
 class AntennaSettings(ScenarioSettings):
-    """Polarisation of the antenna and material of the walls, which a wall's `reflection` then multiplies."""
+    """Polarisation of the antenna and material of the walls; both effects multiply the `reflection` of a wall."""
 
-    #: Gain for left-handed signals below the gain for right-handed signals, at the zenith and at the horizon.
-    cross_polar_zenith_db: NotNegative = 15.0
-    cross_polar_horizon_db: NotNegative = 4.0
-    #: Relative permittivity of the walls: about 6 for concrete and glass.
-    wall_permittivity: float = Field(default=6.0, gt=1.0)
-    #: Gain variation over azimuth at the horizon, reduced by the cosine of the elevation above it; independent for each
-    #: antenna.
+    cross_polar_zenith_db: NotNegative = 15.0  #: Loss of left-handed relative to right-handed signals at the zenith.
+    cross_polar_horizon_db: NotNegative = 4.0  #: Loss of left-handed relative to right-handed signals at the horizon.
+    wall_permittivity: float = Field(default=6.0, gt=1.0)  #: Relative permittivity, about 6 for concrete and glass.
+    #: Standard deviation of the gain over azimuth at the horizon; at other elevations it is proportional to the cosine
+    #: of the elevation. The ripples of the two antennas are independent.
     ripple_sigma_db: NotNegative = 0.0
 
 
 class SideStreetSettings(ScenarioSettings):
-    """Side streets with walls square to the line, uniform between the limits."""
+    """Side streets with walls perpendicular to the line, with uniformly distributed properties."""
 
-    #: From one street to the next, and between its walls.
-    spacing_m: Between = (50.0, 150.0)
-    width_m: Between = (8.0, 25.0)
-    #: Distance of the mouth from the track's axis, and length of the street's walls.
-    front_m: Between = (12.0, 25.0)
-    depth_m: Between = (20.0, 80.0)
-    #: Height of the reflecting walls, and of the walls across the street, over the rails.
-    height_m: Between = (15.0, 60.0)
-    opposite_m: Between = (5.0, 40.0)
-    reflection: Between = (0.3, 1.0)  #: As `RowSettings`.
-    roughness_m: NotNegative = 0.01
-    candidates: int = Field(default=2, ge=1, le=6)  #: Number of streets that can reflect one satellite at a time.
+    spacing_m: Between = (50.0, 150.0)  #: Distance from the end of a street to the next street.
+    width_m: Between = (8.0, 25.0)  #: Distance between the walls of a street.
+    front_m: Between = (12.0, 25.0)  #: Distance of the mouth of the street from the track axis.
+    depth_m: Between = (20.0, 80.0)  #: Length of the walls of the street.
+    height_m: Between = (15.0, 60.0)  #: Height of the reflecting wall above the rails.
+    opposite_m: Between = (5.0, 40.0)  #: Height of the opposite wall of the street above the rails.
+    reflection: Between = (0.3, 1.0)  #: Amplitude reflection coefficient, as in `RowSettings`.
+    roughness_m: NotNegative = 0.01  #: Standard deviation of the surface height.
+    candidates: int = Field(default=2, ge=1, le=6)  #: Number of nearest streets that can reflect a signal.
 
 
 class TreeSettings(ScenarioSettings):
-    """A row of trees along the line, uniform between the limits."""
+    """Row of trees along the line, with uniformly distributed properties."""
 
     sides: Sides = "both"
-    distance_m: Between = (6.0, 12.0)  #: From the track's axis to the trunks.
-    #: Top and lower edge of the crowns over the rails.
-    height_m: Between = (8.0, 16.0)
-    crown_m: Between = (2.5, 4.0)
-    #: Width of a crown, and distance to the next.
-    length_m: Between = (4.0, 9.0)
-    gap_m: Between = (0.0, 6.0)
-    share: Share = 1.0  #: Fraction of the planting positions with a tree.
-    #: Specific attenuation, largest loss, and fraction of the lost amplitude that is scattered forward.
-    attenuation_db_per_m: NotNegative = 1.0
-    most_db: NotNegative = 12.0
-    scatter: Share = 0.5
+    distance_m: Between = (6.0, 12.0)  #: Distance of the trunks from the track axis.
+    height_m: Between = (8.0, 16.0)  #: Height of the top of a crown above the rails.
+    crown_m: Between = (2.5, 4.0)  #: Height of the lower edge of a crown above the rails.
+    length_m: Between = (4.0, 9.0)  #: Width of a crown.
+    gap_m: Between = (0.0, 6.0)  #: Distance to the next crown.
+    share: Share = 1.0  #: Fraction of the planting positions that have a tree.
+    attenuation_db_per_m: NotNegative = 1.0  #: Specific attenuation of a crown.
+    most_db: NotNegative = 12.0  #: Largest loss by a crown.
+    scatter: Share = 0.5  #: Fraction of the lost amplitude that is scattered.
 
 
 class NeighbourSettings(ScenarioSettings):
-    """Vehicles on a parallel track or lane, following each other at constant speed."""
+    """Vehicles on a parallel track or lane that follow each other at constant speed."""
 
     side: Literal["left", "right"] = "right"
-    #: Distance of their side from the track's axis, and their top over the rails.
-    lateral_m: Positive = 2.5
-    height_m: Positive = 4.3
-    #: Length of a vehicle, and spacing from front to front.
-    length_m: Positive = 100.0
-    spacing_m: Positive = 5000.0
-    speed_mps: Finite = -20.0  #: Speed toward rising chainage.
-    reflection: Share = 0.8  #: Amplitude reflection coefficient of their sides.
+    lateral_m: Positive = 2.5  #: Distance of the side of the vehicles from the track axis.
+    height_m: Positive = 4.3  #: Height of the top of the vehicles above the rails.
+    length_m: Positive = 100.0  #: Length of a vehicle.
+    spacing_m: Positive = 5000.0  #: Distance from the start of a vehicle to the start of the next.
+    speed_mps: Finite = -20.0  #: Speed, positive toward rising chainage.
+    reflection: Share = 0.8  #: Amplitude reflection coefficient of the sides of the vehicles.
 
 
 class RoofEquipment(ScenarioSettings):
-    """Equipment on the vehicle's roof near the antenna: air conditioning, pantograph well."""
+    """Equipment on the roof of the vehicle near the antenna, such as air conditioning or a pantograph."""
 
-    ahead_m: Finite  #: Distance of its nearest edge in front of the antenna, negative behind.
-    above_antenna_m: Positive
-    half_width_m: Positive = 1.0
+    ahead_m: Finite  #: Distance of the nearest edge in front of the antenna, negative behind the antenna.
+    above_antenna_m: Positive  #: Height of the top above the antenna.
+    half_width_m: Positive = 1.0  #: Half the width across the vehicle.
 
 
 class EnvironmentSettings(ScenarioSettings):
     """Structures along the line that block, reflect and scatter signals; by default none."""
 
     electrification: ElectrificationSettings | None = None
-    sections: tuple[SectionSettings, ...] = ()  #: Rising, without overlap; between them the line is open.
-    #: Instead of sections: fraction of the line's length by kind; the sections are drawn at random.
+    sections: tuple[SectionSettings, ...] = ()  #: Sections by rising chainage; between them the line is open.
+    #: Fraction of the length of the line by kind of section, instead of `sections`, which are then drawn at random.
     shares: dict[Kind, Share] = Field(default_factory=dict)
-    section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Lengths of the drawn sections.
-    antenna_height_m: Positive = 4.0  #: Over the rails.
-    ground_reflection: Share = 0.5  #: Amplitude reflection coefficient of the ballast; 0 for none.
-    ground_roughness_m: NotNegative = 0.05
+    section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Range of the lengths of drawn sections.
+    antenna_height_m: Positive = 4.0  #: Height of the antennas above the rails.
+    ground_reflection: Share = 0.5  #: Amplitude reflection coefficient of the ballast; 0 for no reflection.
+    ground_roughness_m: NotNegative = 0.05  #: Standard deviation of the height of the ballast.
     receiver: CorrelatorSettings = CorrelatorSettings()
-    #: None: walls reflect with the amplitude `reflection`, whatever the polarisation.
+    #: Polarisation of antenna and walls; None for reflections with the amplitude `reflection` for any polarisation.
     antenna: AntennaSettings | None = None
-    #: "opposite": signals reflected by both nearest rows in sequence.
+    #: "opposite" adds signals that the nearest rows on both sides reflect in sequence.
     second_reflections: Literal["none", "opposite"] = "none"
-    side_streets: SideStreetSettings | None = None  #: All along the line.
-    trees: tuple[TreeSettings, ...] = ()  #: All along the line.
-    neighbours: tuple[NeighbourSettings, ...] = ()
-    equipment: tuple[RoofEquipment, ...] = ()  #: Of both antennas.
+    side_streets: SideStreetSettings | None = None  #: Side streets along the whole line.
+    trees: tuple[TreeSettings, ...] = ()  #: Rows of trees along the whole line.
+    neighbours: tuple[NeighbourSettings, ...] = ()  #: Vehicles on parallel tracks.
+    equipment: tuple[RoofEquipment, ...] = ()  #: Roof equipment, at the same distances from both antennas.
 
     @field_validator("sections")
     @classmethod
@@ -262,25 +243,23 @@ class EnvironmentSettings(ScenarioSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class SightGeometry:
-    """Positions of one antenna and directions to its satellites at T epochs, M channels."""
+    """Positions of one antenna, and directions to satellites, at T epochs for M channels."""
 
     antenna: str  #: "front" or "rear".
     time: Datetimes  #: Shape (T,).
-    #: Shape (M,).
-    satellite: Strings
-    signal: Strings
+    satellite: Strings  #: Satellite of each channel, shape (M,).
+    signal: Strings  #: Signal of each channel, shape (M,).
     chainage_m: Floats  #: Chainage of the centreline point abeam the antenna, shape (T,).
-    speed_mps: Floats  #: Negative toward falling chainage, shape (T,).
-    antenna_ecef_m: Floats  #: Shape (T, 3).
-    heading_deg: Floats  #: Azimuth of the vehicle's forward axis, shape (T,).
-    #: Shape (T, M).
-    elevation_deg: Floats
-    azimuth_deg: Floats
+    speed_mps: Floats  #: Speed, negative toward falling chainage, shape (T,).
+    antenna_ecef_m: Floats  #: Position of the antenna, shape (T, 3).
+    heading_deg: Floats  #: Azimuth of the forward axis of the vehicle, shape (T,).
+    elevation_deg: Floats  #: Shape (T, M).
+    azimuth_deg: Floats  #: Shape (T, M).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """Terms added to the observations, shapes (T, M)."""
+    """Terms that are added to the observations of T epochs and M channels, shapes (T, M)."""
 
     code_m: Floats  #: NaN where the signal is lost; all observables are then absent.
     phase_m: Floats
@@ -288,7 +267,7 @@ class Disturbance:
     cn0_db: Floats  #: Negative where the signal is attenuated.
 
 
-#: A source of disturbances: a function of the geometry alone, so that results do not depend on the chunks.
+#: Function that computes disturbances from the geometry only, so that results do not depend on the chunks.
 Disturbances = Callable[[SightGeometry], Disturbance]
 
 

@@ -1,4 +1,4 @@
-"""Walls and roofs along a line, drawn from settings and a seed: sorted arrays, searched by side and chainage."""
+"""Walls and roofs along a line, drawn from settings and a seed, in arrays sorted by side and chainage."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from railfix.core.arrays import Floats, Indices, Strings
 from railfix.simulate.environment.settings import Kind, RoofSettings, RowSettings, SectionSettings, TreeSettings
 from railfix.simulate.settings import Between
 
-#: A road over the tracks.
+#: Road bridges over the tracks.
 _BRIDGE: Final = RoofSettings(
     inner_m=0.0, outer_m=60.0, height_m=7.5, length_m=(8.0, 20.0), gap_m=(300.0, 700.0), loss_db=60.0
 )
@@ -52,7 +52,7 @@ _CONCOURSE: Final = RoofSettings(
     inner_m=0.0, outer_m=40.0, height_m=8.0, length_m=(12.0, 30.0), gap_m=(150.0, 300.0), loss_db=40.0
 )
 
-#: Rows of walls by kind of section, and roofs; other kinds have none.
+#: Rows of walls, and roofs, by kind of section; other kinds have none.
 ROWS: Final[Mapping[Kind, tuple[RowSettings, ...]]] = {
     "suburban": (_HOUSES, _BLOCKS_BEHIND),
     "urban": (_BLOCKS, _TOWERS_BEHIND),
@@ -65,16 +65,17 @@ ROOFS: Final[Mapping[Kind, tuple[RoofSettings, ...]]] = {
     **dict.fromkeys(("suburban", "urban", "canyon", "cutting"), (_BRIDGE,)),
     "station": (RoofSettings(), _CONCOURSE),
 }
-#: The crown of a tunnel and the ground above it, seen from outside.
+#: Roof that represents the crown of a tunnel and the ground above it, for antennas outside the tunnel.
 TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, loss_db=200.0)
 
 
 def draw_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
-    """Return sections with exactly the given fractions of a line, which add up to 1, in random order from 0 to its end.
+    """Return sections in random order that cover a line from 0 to its end, with exactly the given fractions by kind.
 
-    `section_length_m` is the approximate range of their lengths; a small fraction gives a single shorter section.
+    The fractions `shares` must add up to 1. `section_length_m` is the approximate range of the lengths of sections; a
+    kind with a small fraction has a single shorter section.
     """
     rng = np.random.default_rng([seed, 7101])
     low, high = section_length_m
@@ -103,14 +104,13 @@ SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arra
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """Structures that do not overlap on one side, left ones first, sorted by chainage; n of them."""
+    """n structures that do not overlap on a side, first those on the left, then those on the right, by chainage."""
 
-    #: Chainages, shape (n,).
-    start_m: Floats
-    end_m: Floats
-    border_m: Floats  #: Chainage from which the structure is the nearest, as `side * reach_m + chainage`; shape (n,).
-    reach_m: float  #: Larger than all chainages.
-    value: dict[str, Floats]  #: Properties, each of shape (n,).
+    start_m: Floats  #: Chainage of the start, shape (n,).
+    end_m: Floats  #: Chainage of the end, shape (n,).
+    border_m: Floats  #: `side * reach_m` + chainage from which the structure is the nearest, shape (n,).
+    reach_m: float  #: Length that is larger than all chainages.
+    value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
         """Return the index of the nearest structure on a side (0 left, 1 right); both sides have at least one."""
@@ -122,15 +122,17 @@ class Strips:
 class Structures:
     """Walls, roofs and sections of a line."""
 
-    #: Vertical walls, row by row: `distance_m` (middle), `height_m`, `reflection`, `roughness_m`, `slope` (yaw).
+    #: Rows of vertical walls with `distance_m` (of their middle), `height_m`, `reflection`, `roughness_m` and `slope`
+    #: (tangent of the yaw).
     walls: tuple[Strips, ...]
-    roofs: tuple[Strips, ...]  #: With `inner_m`, `outer_m`, `height_m`, `through` (amplitude).
-    borders_m: Floats  #: From and to of the sections, shape (2 S,).
-    kinds: Strings  #: Kind before the first border, between, and after the last; shape (2 S + 1,).
+    #: Rows of roofs with `inner_m`, `outer_m`, `height_m` and `through` (amplitude factor of signals through the roof).
+    roofs: tuple[Strips, ...]
+    borders_m: Floats  #: Start and end chainages of the S sections, shape (2 S,).
+    kinds: Strings  #: Kind of section before, between and after the borders, shape (2 S + 1,).
 
 
 def build_structures(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Structures:
-    """Return the walls and roofs of given sections, which rise; the same seed gives the same structures."""
+    """Return the walls and roofs of sections in order of chainage; equal seeds give equal structures."""
     ends = np.array([section.to_m for section in sections])
     reach = 4.0 * (max(line_length_m, ends.max(initial=0.0)) + 2.0 * BEYOND_M)
     walls: dict[int, list[list[list[float]]]] = {}
@@ -149,7 +151,7 @@ def build_structures(sections: Sequence[SectionSettings], line_length_m: float, 
             over = (TUNNEL_CROWN,)
         for r, roof in enumerate(over):
             for s, side in enumerate(SIDES):
-                # A roof over the track is the same structure on both sides.
+                # A roof over the track has the same seed on both sides, because it is one structure.
                 rng = np.random.default_rng([seed, 7103, i, r, 0 if roof.inner_m == 0.0 else s])
                 tunnel = [(low, high)] if section.kind == "tunnel" else None
                 if roof.sides in (side, "both"):
@@ -168,7 +170,10 @@ def build_structures(sections: Sequence[SectionSettings], line_length_m: float, 
 
 
 def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int) -> tuple[Strips, ...]:
-    """Rows of trees along all of a line, with `distance_m`, `height_m`, `crown_m` and the values of the settings."""
+    """Return rows of trees along the whole line, one per element of `settings`.
+
+    Their properties are `distance_m`, `height_m`, `crown_m`, `attenuation_db_per_m`, `most_db` and `scatter`.
+    """
     reach = 4.0 * (line_length_m + 2.0 * BEYOND_M)
     names = ("distance_m", "height_m", "crown_m", "attenuation_db_per_m", "most_db", "scatter")
     rows = []
@@ -187,7 +192,7 @@ def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int)
 def _spans(
     length_m: Between, gap_m: Between, low: float, high: float, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Return plots between two chainages in sequence."""
+    """Return start and end of consecutive structures between two chainages, with random lengths and gaps."""
     spans = []
     at = low + rng.uniform(0.0, 1.0) * gap_m[1]
     while at < high:
@@ -208,7 +213,10 @@ def _row(row: RowSettings, low: float, high: float, rng: np.random.Generator) ->
 
 
 def _strips(sides: list[list[list[float]]], names: tuple[str, ...], reach: float) -> Strips:
-    """Return the arrays of both sides; an empty side gets a structure of zero length far behind the line."""
+    """Return the arrays of both sides; each side begins with a structure of zero length far before the line.
+
+    This structure ensures that `Strips.nearest` finds a structure on an empty side.
+    """
     absent = [-0.3 * reach, -0.3 * reach, *([1.0] * (len(names) - 1)), 0.0]
     tables = [np.array([absent, *side]) for side in sides]
     borders = []

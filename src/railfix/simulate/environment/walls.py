@@ -1,6 +1,7 @@
-"""Vertical walls along the line, side streets, trees, vehicles: shadowing and specular reflection.
+"""Shadowing and specular reflection by vertical walls along the line, side streets, trees and vehicles.
 
-Frame of the antenna: x along the line (rising chainage), y to the right, z up; the line is assumed straight near it.
+Coordinates are relative to the antenna: x along the line (rising chainage), y to the right, z up. The line is assumed
+to be straight near the antenna.
 """
 
 from __future__ import annotations
@@ -22,30 +23,36 @@ from railfix.simulate.environment.settings import AntennaSettings, NeighbourSett
 from railfix.simulate.environment.structures import Strips
 
 FREE_V: Final = -99.0  #: Fresnel parameter of an unobstructed ray.
-_LEAST_LATERAL: Final = 1e-3  #: Least component of a direction: rays along the line meet no wall, tree or vehicle.
+_LEAST_LATERAL: Final = 1e-3  #: Lower limit of direction components, which avoids division by zero for parallel rays.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rays(RowArrays):
-    """N directions to satellites from one antenna's positions."""
+    """N directions from positions of an antenna to satellites."""
 
-    chainage_m: Floats  #: Shape (N,).
-    height_m: float  #: Height of the antenna over the rails.
-    #: Unit vector to the satellite, shape (N,).
-    x: Floats
-    y: Floats
-    z: Floats
+    chainage_m: Floats  #: Chainage of the antenna, shape (N,).
+    height_m: float  #: Height of the antenna above the rails.
+    x: Floats  #: Component x of the unit vector to the satellite, shape (N,).
+    y: Floats  #: Component y of the unit vector to the satellite, shape (N,).
+    z: Floats  #: Component z of the unit vector to the satellite, shape (N,).
     wavelength_m: Floats  #: Shape (N,).
 
 
 def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:
-    """Return sines of the angles at which rays pass a level edge and a vertical one, by their component across both."""
+    """Return the sines of the angles between rays and a horizontal edge, and between rays and a vertical edge.
+
+    `across` is the component of the unit vector perpendicular to the plane of both edges.
+    """
     size = np.abs(across)
     return size / np.sqrt(across**2 + z**2), size / np.sqrt(np.maximum(1.0 - z**2, 1e-9))
 
 
 def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
-    """Return the index of the wall that a horizontal ray meets, starting from the distance of the wall abeam."""
+    """Return the index of the wall of a row that a ray meets in plan, shape (N,).
+
+    The ray starts at the chainage `x0` and lateral distance `lateral0`, with direction components `along` and
+    `lateral`. The wall is found by iteration, starting with the distance of the wall abeam.
+    """
     distance = row.value["distance_m"]
     slant = along / lateral
     wall = row.nearest(side, x0)
@@ -55,7 +62,11 @@ def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Fl
 
 
 def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
-    """Return the Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
+    """Return the Fresnel parameter of rays at walls with level top and vertical ends, positive inside the outline.
+
+    `x` and `z` are chainage and height relative to the antenna where the ray meets the plane of the wall, `far_m` is
+    the distance, and `across` the component of the ray perpendicular to the wall.
+    """
     scale = per_metre(far_m, rays.wavelength_m)
     rise, level = _slants(across, rays.z)
     top = (row.value["height_m"][wall] - rays.height_m - z) * rise
@@ -64,7 +75,10 @@ def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m
 
 
 def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | float = 0.0) -> Floats:
-    """Return the Fresnel parameter of the walls of a row that obstruct the satellites from `x0`, `y0`, shape (N,)."""
+    """Return the Fresnel parameter of the walls of a row on the side of the satellites, positive in the shadow, (N,).
+
+    The rays start at the point (`x0`, `y0`) relative to the antenna. The parameter is at least `FREE_V`.
+    """
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     begin = np.where(rays.y > 0.0, 1.0, -1.0) * y0
@@ -81,22 +95,23 @@ def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | fl
 
 @dataclass(frozen=True, kw_only=True)
 class Reflections:
-    """Reflections by one row of walls, shapes (N,)."""
+    """Reflections of N rays by one row of walls, shapes (N,)."""
 
-    amplitude: Floats  #: 0 where the wall is absent or too small.
-    extra_m: Floats  #: Excess over the direct path.
-    rate: Floats  #: Growth of the excess with the antenna's chainage [m/m].
-    #: Mirror image of the antenna, from the antenna.
-    x_m: Floats
-    y_m: Floats
-    #: Horizontal direction of arrival.
-    back_x: Floats
-    back_y: Floats
-    cosine: Floats  #: Cosine of the angle of incidence from the wall's normal.
+    amplitude: Floats  #: Amplitude; nearly 0 where there is no wall or it is too small.
+    extra_m: Floats  #: Extra path compared with the direct signal.
+    rate: Floats  #: Growth of the extra path with the chainage of the antenna [m/m].
+    x_m: Floats  #: Coordinate x of the mirror image of the antenna, relative to the antenna.
+    y_m: Floats  #: Coordinate y of the mirror image of the antenna, relative to the antenna.
+    back_x: Floats  #: Component x of the unit vector from the antenna toward the reflected signal.
+    back_y: Floats  #: Component y of this unit vector.
+    cosine: Floats  #: Cosine of the angle of incidence from the normal of the wall.
 
 
 def reflections(row: Strips, rays: Rays) -> Reflections:
-    """Mirror each satellite in the row on the other side: extra path 2 D (-n . u), n the normal of its plane."""
+    """Return the reflections of signals by a row of walls on the side opposite the satellites.
+
+    The extra path is 2 D (-n . u) with the distance D of the wall, its normal n and the unit vector u to the satellite.
+    """
     sign = np.where(rays.y > 0.0, -1.0, 1.0)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     wall = wall_met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
@@ -126,10 +141,10 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
 
 
 def roof_amplitude(row: Strips, rays: Rays) -> Floats:
-    """Return the amplitude left by the level roofs of a row, shape (N,)."""
+    """Return the amplitude of signals behind the level roofs of a row, relative to that without roofs, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     least = np.maximum(rays.z, 0.02)
-    # Roofs of one row are nearly always at one height: the roof overhead gives the first guess.
+    # Roofs of a row mostly have the same height, so the roof overhead is a good first approximation.
     roof = row.nearest(side, rays.chainage_m)
     for _ in range(2):
         far = (row.value["height_m"][roof] - rays.height_m) / least
@@ -137,7 +152,7 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     far = (row.value["height_m"][roof] - rays.height_m) / least
     x, lateral = rays.chainage_m + far * rays.x, far * np.abs(rays.y)
     inner = row.value["inner_m"][roof]
-    # A roof over the track has no edge in its middle.
+    # A roof over the track (inner_m = 0) has no inner edge.
     across = np.minimum(np.where(inner > 0.0, lateral - inner, 1e3), row.value["outer_m"][roof] - lateral)
     along = np.minimum(x - row.start_m[roof], row.end_m[roof] - x)
     scale = per_metre(far, rays.wavelength_m)
@@ -148,13 +163,16 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     return np.where(over, np.maximum(edge_amplitude(v), np.where(v > 0.0, row.value["through"][roof], 0.0)), 1.0)
 
 
-_LEAST_TWICE: Final = 0.05  #: Path of rays that are reflected twice.
+_LEAST_TWICE: Final = 0.05  #: Smallest lateral component of rays for which second reflections are computed.
 
 
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Reflect by both sides: amplitude, extra path ``2 (d_A + d_B) |u_y|`` [m] and growth [m/m], shapes (N,)."""
+    """Return amplitude, extra path [m] and growth [m/m] of reflections by both sides of the line, shapes (N,).
+
+    The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d of the walls of the first row on both sides.
+    """
     row = rows[0]
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_TWICE)
@@ -187,22 +205,19 @@ _LEAST_SIDE: Final = 0.02  #: Lower limit of the lateral and longitudinal compon
 
 @dataclass(frozen=True, kw_only=True)
 class SideStreets:
-    """Side streets on one side of the line, n of them, by rising chainage."""
+    """n side streets on one side of the line, by rising chainage."""
 
-    #: Chainages of the street's edges, where the walls are; shape (n,).
-    start_m: Floats
-    end_m: Floats
-    #: Distance of the street's mouth from the track's axis, and length of the street's walls; shape (n,).
-    front_m: Floats
-    depth_m: Floats
-    #: Height of the reflecting walls and of the walls across the street, and amplitude that they reflect; shape (n,).
-    height_m: Floats
-    opposite_m: Floats
-    reflection: Floats
+    start_m: Floats  #: Chainage of the near wall, shape (n,).
+    end_m: Floats  #: Chainage of the far wall, shape (n,).
+    front_m: Floats  #: Distance of the mouth of the street from the track axis, shape (n,).
+    depth_m: Floats  #: Length of the walls of the street, shape (n,).
+    height_m: Floats  #: Height of the reflecting wall above the rails, shape (n,).
+    opposite_m: Floats  #: Height of the opposite wall of the street above the rails, shape (n,).
+    reflection: Floats  #: Amplitude reflection coefficient, shape (n,).
 
 
 def side_streets(settings: SideStreetSettings, *, first_m: float, last_m: float, seed: int, side: int) -> SideStreets:
-    """Return the side streets of one side between two chainages, drawn from the settings."""
+    """Return the side streets on one side (0 left, 1 right) between two chainages, drawn from the seed."""
     rng = np.random.default_rng([seed, 7104, side])
     rows, at = [], first_m + rng.uniform() * settings.spacing_m[1]
     while at < last_m:
@@ -217,8 +232,10 @@ def side_streets(settings: SideStreetSettings, *, first_m: float, last_m: float,
 def street_reflections(
     streets: tuple[SideStreets, ...], rays: Rays, *, candidates: int, roughness_m: float
 ) -> list[tuple[Floats, Floats, Floats, Floats]]:
-    """Amplitude, extra path ``2 D |u_x|`` [m], growth [m/m] and cosine of incidence of the reflection of each candidate
-    street, by a wall across at a distance D along the line, shapes (N,).
+    """Return the reflections by the walls of side streets, one per candidate street.
+
+    A reflection has amplitude, extra path [m], growth [m/m] and cosine of incidence, of shape (N,). The extra path is
+    ``2 D |u_x|`` for a wall perpendicular to the line at a distance D along the line.
     """
     along, lateral = np.maximum(np.abs(rays.x), _LEAST_SIDE), np.maximum(np.abs(rays.y), _LEAST_SIDE)
     ahead = np.where(rays.x < 0.0, 1.0, -1.0)
@@ -244,7 +261,7 @@ def street_reflections(
             front, width = street.front_m[number], street.end_m[number] - street.start_m[number]
             top = street.height_m[number]
             inside = np.minimum(aside - front, front + street.depth_m[number] - aside) * along[rows]
-            # Through the mouth: where the ray leaves the street it is at most the street's width before the wall.
+            # The ray must pass the mouth: there its distance to the wall must be less than the width of the street.
             mouth = (width - distance * (1.0 - front / np.maximum(aside, front))) * lateral[rows]
             over = height + rays.z[rows] * width / along[rows] - street.opposite_m[number]
             margin = np.minimum(np.minimum(inside, mouth), np.minimum(top - height, over))
@@ -258,11 +275,14 @@ def street_reflections(
     return found
 
 
-_EDGE_M: Final = 0.5  #: Width of the edge of a crown over which the loss rises [m].
+_EDGE_M: Final = 0.5  #: Width of the edge of a crown over which the loss increases to its full value [m].
 
 
 def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
-    """Amplitude left by trees, amplitude and extra path [m] of their scatter, shapes (N,) (ITU-R P.833-9, 2.1)."""
+    """Return the effect of a row of trees on the side of the satellites, shapes (N,) (ITU-R P.833-9, 2.1).
+
+    The results are the amplitude factor of the direct signal, and amplitude and extra path [m] of the scattered signal.
+    """
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     tree = wall_met(row, side, rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
@@ -281,16 +301,19 @@ def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
     return left, value["scatter"] * (1.0 - left), 0.5 * way * (1.0 + rays.x)
 
 
-_SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the lateral component of rays toward a side.
+_SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of y on a side of the line.
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
-    """Return the Fresnel parameter of the vehicles on a parallel track, positive where obstructing, shape (N,)."""
+    """Return the Fresnel parameter of vehicles on a parallel track, positive where they obstruct, shape (N,).
+
+    `time_s` is the time of day, which determines the positions of the vehicles.
+    """
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     far = settings.lateral_m / lateral
     spacing = settings.spacing_m
     place = np.remainder(rays.chainage_m + far * rays.x - settings.speed_mps * time_s, spacing)
-    # Distance inside of the nearest end of the vehicle, negative in a gap.
+    # Distance to the nearest end of a vehicle, positive beside the vehicle, negative in a gap between vehicles.
     ends = np.where(
         place < settings.length_m,
         np.minimum(place, settings.length_m - place),
@@ -303,14 +326,14 @@ def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats)
 
 
 def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return amplitude, extra path [m] and growth [m/m] of reflections by the sides of vehicles on a parallel track."""
+    """Return amplitude, extra path [m] and growth [m/m] of reflections by vehicles on a parallel track, shapes (N,)."""
     v = neighbour_clearance(settings, replace(rays, y=-rays.y), time_s)
     amplitude = settings.reflection * np.where(rays.y * _SIDE[settings.side] < 0.0, edge_amplitude(-v), 0.0)
     return amplitude, 2.0 * settings.lateral_m * np.abs(rays.y), np.zeros(len(rays.x))
 
 
 def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Floats:
-    """Return the remaining amplitude of the direct signal after equipment on the vehicle's own roof, shape (N,)."""
+    """Return the amplitude factor of the direct signal by equipment on the roof of the vehicle, shape (N,)."""
     amplitude = np.ones(len(rays.x))
     for part in equipment:
         along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)
