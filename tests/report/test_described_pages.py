@@ -32,7 +32,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0CurveSource, Cn0Mean
 from railfix.ranges.cn0_curve_fit import Cn0Samples
-from railfix.report import plots, read_runs, report_page
+from railfix.report import figures, plots, read_runs, report_page
 from railfix.report.campaign import report_campaign, write_campaign_page
 from railfix.report.charts_page import write_network_page
 from railfix.report.explain import explain_epoch, write_explanation
@@ -300,6 +300,8 @@ def _pictures(folder: Path) -> Iterator[Iterable[str]]:
         for more in ({}, {"cant_m": cant, "gradient_permille": 100.0 * cant}):
             faulty = Track.from_geodetic(latitude, longitude, 50.0 + enu[:, 2], name="faulty", **more)
             network.plot_track_quality(check_track(faulty), folder / "quality.png")
+        for step_m in (12.0, 13.0):  # a limit is drawn from a quarter of it on
+            network.plot_track_quality(check_track(line_track(4, step_m)), folder / "quality.png")
         track = line_track()
         sigma = {"sigma_plan_m": np.linspace(0.5, 1.0, 9), "sigma_height_m": np.linspace(1.0, 2.0, 9)}
         runs = [SimpleNamespace(ecef_m=track.ecef_m[::2] + shift) for shift in (0.0, 1.0)]
@@ -315,7 +317,7 @@ def _pictures(folder: Path) -> Iterator[Iterable[str]]:
         elevation = np.array([[10.0, 12.0], [30.2, 60.0]])
         samples.add(elevation / 2.0 + 30.0, elevation, np.array(["G01", "E02"]), np.array(["1C", "1C"]))
         screens.draw_cn0_curve(folder / "curve.png", _curve(), samples)
-    assert len(kept) == 7
+    assert len(kept) == 9
     yield from (describe_figure(figure) for figure in kept)
 
 
@@ -348,6 +350,9 @@ def unpacked(value: Any) -> Any:
 def _reports(folder: Path) -> Iterator[Iterable[str]]:
     """The whole report with and without a reference, filter and observations, and on two runs."""
     run, bare = made_report_run(folder / "run"), made_report_run(folder / "bare", filtered=False, observations=False)
+    unknown = pl.when(pl.col("chainage_m") % 2.0 == 0.0).then(pl.col("error_m"))
+    worst = figures._worst(long_errors().head(300).with_columns(error_m=unknown, conventional_error_m=unknown / 4.0))
+    yield describe((worst - START) / np.timedelta64(1, "s"), "worst epochs [s]")  # type: ignore[operator]
     for runs, references in (([run], [folder / "truth.csv"]), ([bare], []), ([bare, run], [folder / "truth.csv"])):
         reported, evaluation = read_runs(runs, references, conventional=[bare] * len(references) * (len(runs) == 1))
         document = report_page(reported, evaluation)

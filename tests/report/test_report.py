@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,13 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
+from railfix.core.errors import InputFileError
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.tables import error_tables, group_tables, level_tables, select_evaluation
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
-from railfix.report.charts_page import pack_array, script_json
+from railfix.report.charts_page import pack_array, read_background, script_json
 from railfix.report.figures import NO_LEVELS, NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
@@ -355,20 +357,21 @@ def test_a_background_is_drawn_below_the_plan(folder: Path, tmp_path: Path) -> N
         assert "JSON" in result.output or "WGS 84" in result.output
 
 
+@pytest.mark.parametrize(
+    "point", [(180.0, 90.0), (-180.0, -90.0), (180.5, 0.0), (-180.5, 0.0), (0.0, 90.5), (0.0, -90.5)]
+)
+def test_a_background_is_in_degrees(tmp_path: Path, point: tuple[float, float]) -> None:
+    path = tmp_path / "streets.geojson"
+    path.write_text(json.dumps({"type": "LineString", "coordinates": [[1.0, 2.0], point]}))
+    inside = abs(point[0]) <= 180.0 and abs(point[1]) <= 90.0
+    with nullcontext() if inside else pytest.raises(InputFileError, match="WGS 84"):
+        assert read_background(path)[0].tolist() == [[1.0, 2.0], [*point]]
+
+
 def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tmp_path: Path) -> None:
     mine = tmp_path / "run"
     shutil.copytree(folder, mine)
-    columns = (
-        "time_gpst",
-        "antenna",
-        "status",
-        "chainage_m",
-        "along_sigma_m",
-        "x_m",
-        "y_m",
-        "z_m",
-        "protection_level_m",
-    )
+    columns = "time_gpst antenna status chainage_m along_sigma_m x_m y_m z_m protection_level_m".split()
     train = pl.read_parquet(mine / "positions.parquet").select(columns).with_columns(status=pl.lit("tracking"))
     train.write_parquet(mine / "train.parquet")
     runs, evaluation = read_runs([mine], [demo_truth()])
