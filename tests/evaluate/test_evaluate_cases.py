@@ -433,7 +433,7 @@ def test_another_track_is_refused(tmp_path: Path):
     assert read_track(moved).chainage_m[-1] == pytest.approx(2000.0, abs=0.01)
     moved.write_text("# note: the same with a remark\n" + moved.read_text())
     found = evaluate_run(run, known, options=along, files=TrackFiles(track=(moved,)))
-    assert any("not byte for byte" in note for note in found.runs[0].notes)
+    assert any("not identical to" in note for note in found.runs[0].notes)
 
 
 def test_sections_tell_the_environment_where_the_reference_does_not(tmp_path: Path):

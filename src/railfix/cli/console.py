@@ -210,7 +210,7 @@ def show_table(console: Console, table: Table, *, most: int | None = None) -> No
 
 
 def show_verdict(console: Console, lines: Iterable[str]) -> None:
-    """Print the first lines of a command, and a blank line."""
+    """Print the lines of a verdict, and a blank line."""
     for line in lines:
         console.print(line)
     console.print()

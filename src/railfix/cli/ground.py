@@ -146,7 +146,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
     async def watch() -> None:
         while not recorded:
             await asyncio.sleep(0.5)
-            show("nothing for too long:", monitor.silent(time.monotonic()))
+            show("no fixes for too long:", monitor.silent(time.monotonic()))
 
     async def session() -> None:
         tasks = [asyncio.create_task(work()), asyncio.create_task(watch())]

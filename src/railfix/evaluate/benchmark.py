@@ -108,12 +108,12 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
-        raise MismatchError(f"{log.path}: is of the {antenna} antenna, of which the run has no epochs")
+        raise MismatchError(f"{log.path}: has positions of the {antenna} antenna, but the run has no epochs of it")
     places = np.stack([floats(epochs, name) for name in ("x_m", "y_m", "z_m")], axis=1)
     trajectory, _, _ = find_trajectory(own, antenna, floats(epochs, "chainage_m"), places, TrackFiles())
     table = table_of_positions(log, epochs, trajectory)
     if table["chainage_m"].null_count() == len(table):
-        raise MismatchError(f"{log.path}: has no position at the epochs of the log of {run}; give that of the same run")
+        raise MismatchError(f"{log.path}: has no position at the epochs of {run}; give positions of the same run")
     line: dict[str, Any] = own.part("line")
     if name := own.track_facts.get("file"):
         line = {**line, "track": {**own.track_facts, "file": str((run / str(name)).absolute())}}
@@ -137,7 +137,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
     if program is None:
         return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
     if any(find_kind(path) == "receiver" for path in inputs.front):
-        return "no row of RTKLIB: the log is not RINEX (railfix convert makes it so)"
+        return "no row of RTKLIB: the log is not RINEX (railfix convert writes it as RINEX)"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         files = [*_unpack(inputs.front, folder, "obs"), *_unpack(inputs.nav, folder, "nav")]

@@ -214,14 +214,14 @@ def _evaluate(
     entries = [fingerprint(kind, path) for kind, path in used]
     recorded = {entry["sha256"] for entry in folder.record.get("inputs", ())}
     notes += [
-        f"{entry['path']}: is not byte for byte the {entry['input']} of the run, but gives the same positions"
+        f"{entry['path']}: is not identical to the {entry['input']} file of the run, but gives the same positions"
         for entry in entries
         if entry["sha256"] not in recorded
     ]
     if stretches is not None:
         notes += [
             f"{name}: the sections give the environment of {antenna.from_sections} of "
-            f"{int(antenna.table['in_reference'].sum())} epochs, the reference comes before them"
+            f"{int(antenna.table['in_reference'].sum())} epochs, for which the reference states none"
             for name, antenna in antennas.items()
         ]
     if folder.level_kind == UNKNOWN_KIND:

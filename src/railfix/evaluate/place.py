@@ -298,7 +298,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
     if off > SAME_MAP_M + (0.0 if point == "antenna" else _WITHIN_VEHICLE_M):
         return f"the chainages of run and reference are not of one map (off by {off:.1f} m at the median)", False
     if point != "antenna":
-        return f"the run's chainage is that of the {point}, the reference's that of the antenna", True
+        return f"the chainage of the run refers to the {point}, the chainage of the reference to the antenna", True
     return None, True
 
 

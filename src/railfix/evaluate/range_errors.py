@@ -151,7 +151,7 @@ def base_station_from_files(
         raise InputFileError(paths[0], "its header has no position; give that of the station (--base-position)")
     station = base_station(parts, processor, np.asarray(place), name=parts[0].header.marker or paths[0].name)
     if not np.isfinite(station.error_m).any():
-        raise InputFileError(paths[0], "gives no range error of any satellite; is the navigation file of the same day?")
+        raise InputFileError(paths[0], "gives no range error of any satellite; give a navigation file of the same day")
     return station
 
 
@@ -162,7 +162,7 @@ class RangeErrors:
     samples: ErrorSamples
     time: Datetimes  #: Shape (n,).
     satellite: Strings  #: Shape (n,).
-    epochs: int  #: Epochs with a reference position.
+    epochs: int  #: Number of epochs with a reference position.
 
 
 def range_errors(
@@ -291,7 +291,7 @@ def error_model_from_runs(
     runs = [_run_errors(source, number, fit) for number, source in enumerate(inputs)]
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
-        raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
+        raise MismatchError("no pseudorange error could be computed; give reference and station of the same run")
     samples = join_rows(parts)
     conditions = runs[0].conditions
     for source, run in zip(inputs[1:], runs[1:], strict=True):

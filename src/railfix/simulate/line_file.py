@@ -99,7 +99,7 @@ class GeneratedLine(ScenarioSettings):
     def _from_the_start(cls, terrain: tuple[Terrain, ...]) -> tuple[Terrain, ...]:
         starts = [part.from_m for part in terrain]
         if not starts or starts[0] != 0.0 or any(a >= b for a, b in pairwise(starts)):
-            raise ValueError(f"must begin at 0 and rise; its from_m are {starts}")
+            raise ValueError(f"must begin at 0, in rising order; the values of from_m are {starts}")
         return terrain
 
 
@@ -162,15 +162,15 @@ class LineSettings(ScenarioSettings):
         """Reject settings that belong to another kind of line, and lengths that do not fit the kind."""
         total = math.fsum(item.length_m for item in self.elements)
         if (self.kind == "elements") != bool(self.elements) or (self.gradients and not self.elements):
-            raise ValueError(f"elements (and gradients) go with kind 'elements', got {self.kind!r}")
+            raise ValueError(f"elements and gradients belong to kind 'elements', got kind {self.kind!r}")
         if (self.kind == "file") != (self.file is not None):
-            raise ValueError(f"file goes with kind 'file', got kind {self.kind!r}")
+            raise ValueError(f"file belongs to kind 'file', got kind {self.kind!r}")
         if self.kind != "generated" and self.generated != GeneratedLine():
-            raise ValueError(f"generated goes with kind 'generated', got {self.kind!r}")
+            raise ValueError(f"generated belongs to kind 'generated', got kind {self.kind!r}")
         if self.length_m > LONGEST_LINE_M:
             raise ValueError(f"length_m is {self.length_m:g}, expected at most {LONGEST_LINE_M:g}")
         if self.kind == "file" and not math.isnan(self.length_m):
-            raise ValueError("length_m is the file's own; use from_m and to_m of the file for a part")
+            raise ValueError("length_m follows from the file; give from_m and to_m of the file to use a part")
         if self.kind == "elements" and abs(self.length_m - total) > 1e-6:
             raise ValueError(f"length_m is {self.length_m}, but the elements are {total} m long")
         if self.kind != "file" and not self.length_m >= 100.0:
@@ -205,7 +205,7 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
             raise SettingsError(f"line.elements {k + 1} and {k + 2} are both transitions; make them one")
         if "transition" not in both and (element.radius_m, element.cant_m) != (following.radius_m, following.cant_m):
             raise SettingsError(
-                f"line.elements {k + 1} ({element.kind}) and {k + 2} ({following.kind}) meet without a transition"
+                f"line.elements {k + 1} ({element.kind}) and {k + 2} ({following.kind}) need a transition between them"
             )
     knot = np.concatenate([[0.0], np.cumsum([item.length_m for item in elements])])
     ends = np.zeros((2, len(knot)))

@@ -78,7 +78,7 @@ class RunSettings(ScenarioSettings):
     def _apart(cls, stations: tuple[Station, ...]) -> tuple[Station, ...]:
         places = [station.at_m for station in stations]
         if len(places) == 1 or any(b - a < 10.0 for a, b in pairwise(places)):
-            raise ValueError(f"must be two or more, rising by 10 m or more; they are at {places}")
+            raise ValueError(f"must be at least two, in rising order and at least 10 m apart; they are at {places}")
         return stations
 
 
@@ -127,7 +127,7 @@ class SkySettings(ScenarioSettings):
     @classmethod
     def _letters(cls, systems: str) -> str:
         if not systems or set(systems) - set(SYSTEMS) or len(set(systems)) < len(systems):
-            raise ValueError(f"must be letters out of {SYSTEMS!r}, each once")
+            raise ValueError(f"must be letters of {SYSTEMS!r}, each at most once")
         return systems
 
     @model_validator(mode="after")
@@ -208,7 +208,7 @@ class Scenario(ScenarioSettings):
     def _distinct_names(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
         names = [*_FILES, *(station.name for station in stations)]
         if len(set(names)) < len(names):
-            raise ValueError(f"must have different names, none of {', '.join(_FILES)}")
+            raise ValueError(f"must have different names, other than {', '.join(_FILES)}")
         return stations
 
     @model_validator(mode="after")
@@ -238,14 +238,14 @@ class Scenario(ScenarioSettings):
         reach = max(abs(v) for v in (self.vehicle.front[0], self.vehicle.rear[0], self.vehicle.bogie_distance_m / 2.0))
         if length_m <= 2.0 * margin or margin < reach + 1.0:
             return (
-                f"run.end_margin_m is {margin} m; expected at least {reach + 1.0:g} m, for the vehicle extends "
+                f"run.end_margin_m is {margin} m; expected at least {reach + 1.0:g} m, because the vehicle extends "
                 f"{reach:g} m from its middle, and less than half of the line, which is {length_m:g} m long"
             )
         outside = [item.at_m for item in stations if not margin <= item.at_m <= length_m - margin]
         if outside:
             return (
-                f"run.stations: {outside[0]} m lies within {margin} m of an end of the line or beyond, "
-                f"which is {length_m:g} m long"
+                f"run.stations: {outside[0]} m lies within {margin} m of an end of the line or beyond it; "
+                f"the line is {length_m:g} m long"
             )
         return ""
 

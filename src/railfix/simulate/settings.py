@@ -34,7 +34,7 @@ SYSTEMS = "GJEC"  #: Letters of the constellations that are simulated.
 
 def _rising(pair: tuple[float, float]) -> tuple[float, float]:
     if not pair[0] <= pair[1]:
-        raise ValueError("must be two numbers, the smaller one first")
+        raise ValueError("must be two numbers, the smaller number first")
     return pair
 
 
@@ -66,7 +66,7 @@ def _gps_time(value: Any) -> np.datetime64:
     with suppress(ValueError):
         if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
             return time
-    raise ValueError("must be a time as 2024-03-05T03:10:00, GPS time without a zone")
+    raise ValueError("must be a GPS time without a time zone, such as 2024-03-05T03:10:00")
 
 
 def _toml_time(time: np.datetime64) -> datetime | str:
@@ -249,13 +249,13 @@ class TachometerSettings(ScenarioSettings):
     def _in_order(cls, slips: tuple[SlipInterval, ...]) -> tuple[SlipInterval, ...]:
         for before, after in pairwise(slips):
             if after.start_s < before.end_s:
-                raise ValueError(f"must be in order; one from {after.start_s} s follows one to {before.end_s} s")
+                raise ValueError(f"must not overlap; a slip from {after.start_s} s follows a slip to {before.end_s} s")
         return slips
 
     @model_validator(mode="after")
     def _small_error(self) -> TachometerSettings:
         if not abs(self.diameter_error_m) < 0.5 * self.wheel_diameter_m:
-            raise ValueError(f"diameter_error_m must be small compared with the diameter, got {self.diameter_error_m}")
+            raise ValueError(f"diameter_error_m must be less than half the diameter, got {self.diameter_error_m}")
         return self
 
 

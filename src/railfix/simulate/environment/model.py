@@ -85,7 +85,8 @@ class Conductor:
         Only conductors on the side opposite the satellite scatter. The amplitude is that of a metal cylinder in
         geometrical optics, sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and bistatic angle b; half of the
         scattered power has the antenna's polarisation. The extra path is rho c (1 - cos(phi)), where c is the component
-        of the ray perpendicular to the conductor and phi the angle between this component and the conductor.
+        of the ray perpendicular to the conductor and phi the angle between this component and the direction to the
+        conductor.
         """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)

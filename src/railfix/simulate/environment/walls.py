@@ -64,8 +64,8 @@ def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Fl
 def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
     """Return the Fresnel parameter of rays at walls with level top and vertical ends, positive inside the outline.
 
-    `x` and `z` are chainage and height relative to the antenna where the ray meets the plane of the wall, `far_m` is
-    the distance, and `across` the component of the ray perpendicular to the wall.
+    `x` is the chainage and `z` the height above the antenna at which the ray meets the plane of the wall, `far_m` is
+    the distance from the antenna, and `across` the component of the ray perpendicular to the wall.
     """
     scale = per_metre(far_m, rays.wavelength_m)
     rise, level = _slants(across, rays.z)
