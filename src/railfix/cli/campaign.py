@@ -104,7 +104,7 @@ def campaign(
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
     """Print on standard error the number of finished runs and the remaining time; `kept` runs are of earlier calls."""
     minutes, seconds = divmod(round(left_s), 60)
-    before = f" ({kept} from before)" if kept else ""
+    before = f" ({kept} of earlier calls)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
     sys.stderr.flush()
 

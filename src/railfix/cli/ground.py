@@ -351,7 +351,7 @@ def centre(
     except ValueError as error:
         raise SettingsError(f"--page {choices.page!r}, --orders {choices.orders!r}: {error}") from None
     word, people = (secrets.token_urlsafe(12), {}) if password is None else read_passwords(password)
-    words = iter(("the page, to open in a browser", "orders, to open in a browser"))
+    words = iter(("the page, to open in a browser", "the page for orders, to open in a browser"))
 
     def announce(url: str) -> None:
         console.print(f"{next(words)}: {url}")
@@ -441,4 +441,4 @@ def _show_figures(figures: dict[str, Any]) -> None:
         [name, (", ".join(f"{k} {v}" for k, v in value.items()) or "none") if isinstance(value, dict) else str(value)]
         for name, value in figures.items()
     ]
-    show_table(TableConsole(), plain_table(["what happened", ""], rows, texts=2, boxed=True))
+    show_table(TableConsole(), plain_table(["result", ""], rows, texts=2, boxed=True))

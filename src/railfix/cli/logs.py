@@ -114,7 +114,7 @@ def which_track(
     show_notes(console, decision.notes)
     if save_last is not None:
         write_last_place(last, decision.end, save_last)
-        console.print(f"last place: {save_last}")
+        console.print(f"track probabilities: {save_last}")
     if out is not None:
         from railfix.report.plots.network import plot_track_decision
 

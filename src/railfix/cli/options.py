@@ -145,7 +145,7 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
         default = field.default
     if numbers:
         shown = "" if field.is_required() else f"; {','.join(f'{value:g}' for value in field.default)} by default"
-        helped += f" Numbers with commas, or repeated{shown}."
+        helped += f" Separate numbers by commas, or repeat the option{shown}."
     annotation: Any = list[str] if numbers else list[kind] if several else kind  # type: ignore[valid-type]
     if default is None:
         annotation = annotation | None
