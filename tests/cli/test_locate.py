@@ -105,7 +105,7 @@ def test_novatel_logs_are_those_of_their_manual(tmp_path: Path) -> None:
     assert log.quality.tolist() == [1, -1]
     assert log.sigma_m[0] == pytest.approx([0.009, 0.008, 0.017])
     path.write_text("nothing\n")
-    with pytest.raises(InputFileError, match="a log of positions"):
+    with pytest.raises(InputFileError, match="a position log"):
         read_positions(path)
 
 

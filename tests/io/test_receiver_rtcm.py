@@ -144,7 +144,7 @@ def test_satellites_without_a_date_are_named(tmp_path: Path) -> None:
     path.write_bytes(
         message(1020, 0, {"number": 5, "channel": 4, "p": 0, "hour": 4, "minute": 15, "tb_s": 18, **place})
     )
-    with pytest.raises(InputFileError, match=r"the ephemerides of R05 carry no full date \(--date gives one\)"):
+    with pytest.raises(InputFileError, match=r"the ephemerides of R05 have no full date; give a date \(--date\)"):
         railfix.read_navigation(path)
 
 

@@ -111,7 +111,7 @@ def test_of_a_plain_log_the_fixes_count(tmp_path: Path) -> None:
     assert len(read_reference(path, ["front"], quality=(1, 2))["front"]) == 3
     with pytest.raises(InputFileError, match=r"with a time and quality 2, 5 \(the log has 2 of quality 1, 1 of"):
         read_reference(path, ["front"], quality=(2, 5))
-    with pytest.raises(InputFileError, match=r"a column antenna \(front, rear\) is needed"):
+    with pytest.raises(InputFileError, match=r"must have a column antenna \(front, rear\)"):
         read_reference(path, ["front", "rear"])
 
 
@@ -125,7 +125,7 @@ ROW = "2024-03-05T01:00:0{},front,-3957000,3310000,3737000,0.02,rtk"
         ([ROW.format(0), ROW.format(1).replace("rtk", "guess")], "line 3: source is 'guess'"),
         ([ROW.format(0), ROW.format(0)], "fewer than two positions for the antenna front with a time"),
         ([ROW.format(0), ROW.format(1).replace("0.02", "small")], "line 3: column sigma_m: 'small' is not a number"),
-        ([ROW.format(0), ROW.format("x")], "line 3: time_gpst '2024-03-05T01:00:0x' is no ISO 8601 time"),
+        ([ROW.format(0), ROW.format("x")], "line 3: time_gpst '2024-03-05T01:00:0x' is not an ISO 8601 time"),
         ([ROW.format(0).replace("front", "rear"), ROW.format(1)], "fewer than two positions"),
     ],
 )

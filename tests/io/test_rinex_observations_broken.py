@@ -228,7 +228,7 @@ def _navigation() -> bytes:
 
 WRONG_FILE: dict[str, tuple[bytes, str]] = {
     "navigation file": (_navigation(), "is a RINEX navigation file (--nav); a RINEX observation file was expected"),
-    "SP3 file": (_sp3(), "is a file of precise orbits"),
+    "SP3 file": (_sp3(), "is an SP3 file of precise orbits"),
     "NMEA log": (b"$GNGGA,023313.00,2218.0,N,11410.0,E,1,12,0.6,5.0,M,,M,,*7F\n" * 9, "is an NMEA log"),
     "log of a phone": (b"# \n# Header Description:\n# \n# Version: 1.4.0.0, Platform: N\n", "Android's GnssLogger"),
     "position log": (b"% program   : RTKPOST ver.2.4.3\n" * 9, "is an RTKLIB solution"),

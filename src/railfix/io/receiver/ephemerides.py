@@ -1,8 +1,9 @@
-"""Ephemerides combined from navigation subframes as they are received.
+"""Assemble ephemerides from navigation subframes in the order of a stream.
 
-A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
-B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` combines the subframes of a piece of a stream with
-those left by earlier pieces, so that records do not depend on the division of a stream.
+A record needs several subframes of one issue: three of GPS and QZSS, five words (I/NAV) or four pages (F/NAV) of
+Galileo, three (D1, B-CNAV1, B-CNAV2) or ten pages (D2) of BeiDou, and four strings of GLONASS. `assemble_records`
+combines the subframes of a piece with subframes of earlier pieces, so that records do not depend on the division of
+a stream.
 """
 
 from __future__ import annotations
@@ -44,30 +45,33 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
 _STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which its strings 1 to 4 are sent.
-_EPOCH_BEFORE_S: Final = 5.0  #: Longest time from the last epoch to a string that counts as received at that epoch.
-#: Time from one GLONASS frame to the next.
+_EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch whose time it is assigned.
+#: Duration of a GLONASS frame.
 _FRAME_S: Final = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """Unfinished records: `latest` identifies the last record (`issued`); `waiting` are GLONASS satellites."""
+    """Unfinished records after a piece of a stream."""
 
+    #: Fields of the latest subframe by satellite and subframe number.
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
+    #: Issue of the last record by satellite and message, which identifies repetitions.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    #: Next epoch (NaT: not yet received) by GLONASS satellite whose complete strings have no certain frame.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """Records of a piece of a stream in order of completion, its time (NaT: unknown), and satellites `undated`."""
+    """Records of a piece of a stream, in order of completion."""
 
     records: tuple[RawRecord, ...]
-    complete_at: Datetimes
+    complete_at: Datetimes  #: Time at which each record was complete, NaT where unknown.
     klobuchar: Mapping[str, np.ndarray]
     leap_seconds: int | None
     skipped: Mapping[str, int]
-    undated: frozenset[str] = frozenset()
+    undated: frozenset[str] = frozenset()  #: Satellites with subframes whose date is unknown.
 
 
 def assemble_records(
@@ -78,7 +82,11 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides completed by a piece, and the new state; `time` is before each, `after` after each."""
+    """Return the ephemerides completed by a piece, and the new state.
+
+    `time` and `after` are the epochs before and after each subframe, and `first` is the first epoch of the piece; NaT
+    where unknown.
+    """
     builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     pages, counts = decode_pages(subframes)
@@ -92,7 +100,10 @@ def assemble_records(
 def assemble_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished
 ) -> tuple[Assembled, Unfinished]:
-    """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) received at times, shape (N,), repeated ones once."""
+    """Return the ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) without repetitions, and the new state.
+
+    `time` is the time of reception of each message, shape (N,).
+    """
     builder = _EphemerisBuilder(state)
     for (_, kind, values), at in zip(messages, time, strict=True):
         satellite = f"{_RTCM_SYSTEMS[kind]}{int(values['number']):02d}"
@@ -102,7 +113,7 @@ def assemble_rtcm(
 
 
 def _rtcm_record(kind: int, satellite: str, values: Values, time: np.datetime64) -> Record | None:
-    """Record of one RTCM 3 ephemeris message."""
+    """Return the record of one RTCM 3 ephemeris message."""
     match kind:
         case 1045:
             return galileo_record(satellite, {**values, "source": float(E5A_SOURCE)}, time)
@@ -128,7 +139,7 @@ def assemble_navigation(parts: Assembled, *, sources: tuple[str, ...] = ()) -> N
 
 
 class _EphemerisBuilder:
-    """Latest subframes of all satellites, and the records completed by them."""
+    """Builder of records from the latest subframes of all satellites."""
 
     def __init__(self, state: Unfinished) -> None:
         self.latest, self.issued, self.waiting = dict(state.latest), dict(state.issued), dict(state.waiting)
@@ -140,7 +151,10 @@ class _EphemerisBuilder:
         self.leap_seconds: int | None = None
 
     def needs_date(self, satellite: str, time: np.datetime64) -> bool:
-        """Whether no date is known of a satellite that sends none (GPS, QZSS: a week of 10 bits; GLONASS: a time)."""
+        """Return whether the date of a record is unknown, and note the satellite as undated.
+
+        GPS and QZSS send ten bits of the week, and GLONASS sends only the time of day.
+        """
         if satellite[0] in "GJR" and np.isnat(time):
             self.undated.add(satellite)
             return True
@@ -160,11 +174,11 @@ class _EphemerisBuilder:
         return records, Unfinished(latest=self.latest, issued=self.issued, waiting=self.waiting)
 
     def add(self, satellite: str, number: int, values: Values, time: np.datetime64, after: np.datetime64) -> None:
-        """Add one subframe between two epochs; a record that it completes is appended."""
+        """Add a subframe received between two epochs, and append the record that it completes."""
         letter = satellite[0]
         if letter == "R":
             self.waiting.pop(satellite, None)
-            if number == 1:  # strings before it belong to another frame
+            if number == 1:  # earlier strings belong to another frame
                 for k in (2, 3, 4):
                     self.latest.pop((satellite, k), None)
         self.latest[satellite, number] = {**values, "received": float(time.astype(np.int64))}
@@ -177,7 +191,7 @@ class _EphemerisBuilder:
         self.issue(record, time)
 
     def _maker(self, letter: str, number: int) -> Callable[[str, np.datetime64], Record | None]:
-        """Return the function that makes a record of a message from its subframes."""
+        """Return the method that builds a record from the subframes of a message."""
         if number >= BCNAV1_FROM:
             return self._bcnav1
         if number > FNAV_FROM:
@@ -187,14 +201,14 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append records of GLONASS strings whose next epoch arrived within their frame, up to a time or all known."""
+        """Append records of complete GLONASS strings whose next epoch is known and not after `until` (None: any)."""
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
                 del self.waiting[satellite]
                 self.issue(self._glonass(satellite, after, within=_FRAME_S), after)
 
     def issue(self, record: Record | None, time: np.datetime64) -> None:
-        """Append a record unless it repeats the satellite's last one of that message or is implausible."""
+        """Append a record unless it repeats the satellite's last record of the same message, or is implausible."""
         if record is None:
             return
         raw, issue = record
@@ -214,7 +228,7 @@ class _EphemerisBuilder:
         return None if any(part is None for part in parts) else [part for part in parts if part is not None]
 
     def _ionosphere_gps(self, letter: str, values: Values) -> None:
-        # Page 18 of GPS has identity 56, as the page of QZSS for its wide area (that for Japan has 61).
+        # Page 18 of GPS and the wide-area page of QZSS have identity 56; the QZSS page for Japan has 61.
         if values["page_sv"] == 56 and values["data_id"] in (1, 3):
             self.klobuchar[letter] = np.array([values[f"ion{k}"] for k in range(8)])
             self.leap_seconds = int(values["leap_seconds"]) if letter == "G" else self.leap_seconds
@@ -244,7 +258,7 @@ class _EphemerisBuilder:
         return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
 
     def _cnav_record(self, satellite: str, _: np.datetime64) -> Record | None:
-        """Record of CNAV; its three messages are of one issue if their reference times are equal."""
+        """Return the CNAV record if the reference times of the three messages are equal, else None."""
         parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.CNAV))
         if parts is None or not parts[0]["toe_sow_s"] == parts[1]["toe_sow_s"] == parts[2]["toc_s"]:
             return None
@@ -255,7 +269,7 @@ class _EphemerisBuilder:
         return cnav_record(satellite, {**parts[2], **parts[1], **parts[0]})
 
     def _bcnav2(self, satellite: str, _: np.datetime64) -> Record | None:
-        """Record of B-CNAV2: message 11 follows 10, and the clock's issue ends with the ephemeris issue."""
+        """Return the B-CNAV2 record if message 11 follows message 10 and IODC ends with the bits of IODE, else None."""
         parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.BCNAV2))
         if (
             parts is None
@@ -266,7 +280,7 @@ class _EphemerisBuilder:
         return bcnav_record(satellite, "CNV2", {**parts[2], **parts[1], **parts[0]})
 
     def _bcnav1(self, satellite: str, _: np.datetime64) -> Record | None:
-        """Record of B-CNAV1, whose pages are of one frame, with the health in the last."""
+        """Return the B-CNAV1 record if the pages are of one frame and the last page has the health, else None."""
         parts = self._parts(satellite, tuple(BCNAV1_FROM + k for k in nav_messages.BCNAV1))
         if parts is None or len({part["tow_s"] for part in parts}) != 1:
             return None
@@ -300,7 +314,7 @@ class _EphemerisBuilder:
             return None
         # All strings are of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1
         # may have come before the receiver's first epoch, so that its time of reception is unknown; where epochs are
-        # lost or rare, the first one after all strings shows that no later frame can have begun.
+        # lost or rare, the first epoch after all strings shows that no later frame can have begun.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")
@@ -315,7 +329,7 @@ class _EphemerisBuilder:
 
 
 def merge_records(parts: list[Assembled]) -> Assembled:
-    """Return the records of several pieces of one stream."""
+    """Join the records of several pieces of one stream; the last ionosphere and leap seconds are used."""
     klobuchar: dict[str, np.ndarray] = {}
     leap: int | None = None
     for part in parts:

@@ -1,4 +1,4 @@
-"""Frames of UBX, RTCM 3, SBF and NMEA in a stream of bytes, protocols mixed, checksums verified.
+"""Find frames of UBX, RTCM 3, SBF and NMEA, also mixed, in a byte stream, and verify their checksums.
 
 Sources: u-blox F9 HPG interface description (UBX-20033635), section 3; RTCM 10403.3, section 4; Septentrio mosaic-X5
 reference guide, section 4.1 (SBF); NMEA 0183, section 5.3.
@@ -18,11 +18,11 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.checksums import crc24q
 from railfix.core.files import FilePath, open_stream
 
-#: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers send less than 16 KiB.
+#: Longest accepted payload or block [bytes]. UBX and SBF allow 65 535, but receivers send less than 16 KiB.
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-#: Whether a byte can be the first and the second of the address of an NMEA sentence; 0 is beyond the buffer's end.
+#: Whether a byte is valid as the first and as the second character of an NMEA address; 0 marks the buffer's end.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
 #: Value of each byte as a hexadecimal digit, 255 for others.
@@ -34,36 +34,36 @@ _HEX[np.frombuffer(b"0123456789ABCDEFabcdef", np.uint8)] = [*range(16), *range(1
 class Frames:
     """Frames with valid checksums, in order of the stream."""
 
-    data: Bytes  #: The buffer.
+    data: Bytes  #: Buffer that contains the frames.
     protocol: Strings  #: "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
     kind: Integers  #: UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0; shape (N,).
-    #: Payload in `data`: UBX without header and checksum; RTCM 3 likewise (message number included); SBF from the time
-    #: stamp on (after the 8 bytes of header); NMEA from ``$`` up to, not including, ``*`` (the end of its line belongs
-    #: to the frame); shape (N,).
+    #: Start and end of the payload in `data`, shape (N,). UBX and RTCM 3: without header and checksum, with the RTCM
+    #: message number. SBF: from the time stamp, after the header of 8 bytes. NMEA: from ``$`` to before ``*``, while
+    #: the frame includes the end of the line.
     start: Indices
     end: Indices
     frame_start: Indices  #: Offset of the first byte of the frame, sync included; shape (N,).
     consumed: int  #: Number of processed bytes of the buffer; the rest may be the start of a frame.
-    skipped_bytes: int  #: Bytes outside frames among these.
-    bad_checksums: int  #: Complete candidates (sync and length plausible) outside frames whose checksum failed.
+    skipped_bytes: int  #: Number of processed bytes outside frames.
+    bad_checksums: int  #: Number of complete frame candidates outside frames whose checksum is wrong.
 
     def __len__(self) -> int:
         return len(self.start)
 
     def of(self, protocol: str, *kinds: int) -> Indices:
-        """Return the positions of the frames of a protocol, of some kinds or of all."""
+        """Return the indices of the frames of a protocol, of the given kinds or of all kinds."""
         own = self._by_protocol.get(protocol, np.empty(0, dtype=np.intp))
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
     def structures(self, protocol: str, kinds: Iterable[int], layout: np.dtype) -> tuple[Indices, np.ndarray]:
-        """Return positions of the frames of some kinds that are long enough for a layout, and their first fields."""
+        """Return the indices of the frames of some kinds that are long enough for a layout, and their first fields."""
         chosen = self.of(protocol, *kinds)
         chosen = chosen[self.end[chosen] - self.start[chosen] >= layout.itemsize]
         return chosen, gather_structures(self.data, self.start[chosen], layout)
 
     @cached_property
     def _by_protocol(self) -> dict[str, Indices]:
-        """Positions of the frames of each protocol, computed once: a live epoch looks up many kinds that are absent."""
+        """Return the indices of the frames of each protocol, computed once because live epochs look up many kinds."""
         return {name: np.flatnonzero(self.protocol == name) for name in set(self.protocol.tolist())}
 
 
@@ -87,7 +87,7 @@ class _FrameCandidates:
 
 
 def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
-    """Find the frames in a buffer of uint8; with `at_end` an incomplete frame at its end is skipped."""
+    """Find the frames in a buffer of uint8; an incomplete last frame is skipped with `at_end`, else not consumed."""
     data = np.asarray(data, dtype=np.uint8)
     candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data, at_end=at_end)]
     incomplete = [c.frame[c.frame_end > len(data)] for c in candidates]
@@ -126,7 +126,7 @@ def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
 
 
 def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
-    """Return the valid candidates, earliest first, that do not lie inside a previously accepted one."""
+    """Return the indices of the valid candidates that do not begin inside a previously accepted frame."""
     accepted, free = [], 0
     for k in np.flatnonzero(valid).tolist():
         if start[k] >= free:
@@ -144,12 +144,12 @@ def _outside(places: Indices, start: Indices, end: Integers) -> int:
 
 
 def _at(data: Bytes, index: Indices) -> Integers:
-    """Return bytes at offsets; 0 beyond the end."""
+    """Return the bytes at offsets, 0 beyond the end of the buffer."""
     return np.where(index < len(data), data[np.minimum(index, len(data) - 1)], 0).astype(np.int64)
 
 
 def _pairs(data: Bytes, first: int, second: int) -> Indices:
-    """Return offsets where two bytes follow each other."""
+    """Return the offsets where the byte `first` is followed by the byte `second`."""
     return np.flatnonzero((data[:-1] == first) & (data[1:] == second)) if len(data) > 1 else np.zeros(0, np.intp)
 
 
@@ -204,7 +204,7 @@ def _sbf(data: Bytes) -> _FrameCandidates:
 
 def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     dollar = np.flatnonzero(data == ord("$"))
-    # An address begins with a letter and a letter or digit; any other byte 36 is one of a damaged message.
+    # An address begins with a letter, and a letter or digit; any other ``$`` is part of a damaged message.
     dollar = dollar[_ADDRESS[0, _at(data, dollar + 1)] & _ADDRESS[1, _at(data, dollar + 2)]]
     star = np.flatnonzero(data == ord("*"))
     after = np.searchsorted(star, dollar)
@@ -219,17 +219,17 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     valid[complete] = (sums[stop] ^ sums[first]) == (_HEX[data[stop + 1]] << 4 | _HEX[data[stop + 2]])
     line_end = end + 3 + (_at(data, end + 3) == ord("\r"))
     frame_end = line_end + (_at(data, line_end) == ord("\n"))
-    if not at_end:  # a sentence whose line may continue waits for the rest of the line
+    if not at_end:  # a sentence whose line end may be incomplete is kept for the next buffer
         frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
 
-#: Number of bytes in which a log must have a frame with a valid checksum to be recognised.
+#: Number of first bytes in which a log must have a frame with a valid checksum to be recognised.
 _HEAD_BYTES: Final = 1 << 16
 
 
 def is_receiver_log(head: bytes) -> bool:
-    """Return whether bytes from the beginning of a file hold a UBX, RTCM 3 or SBF frame with a valid checksum."""
+    """Return whether the first bytes of a file contain a UBX, RTCM 3 or SBF frame with a valid checksum."""
     frames = find_frames(np.frombuffer(head, dtype=np.uint8))
     return bool(np.isin(frames.protocol, ["ubx", "rtcm3", "sbf"]).any())
 
@@ -240,15 +240,15 @@ def read_head(path: FilePath) -> bytes:
         return stream.read(_HEAD_BYTES)
 
 
-#: A field: first bit, number of bits, factor, and how it is coded ("u" unsigned, "s" two's complement,
-#: "m" sign and magnitude). A field in pieces is a tuple of (first bit, number of bits) instead of the first two.
+#: Field of a message: first bit, number of bits, factor and coding ("u" unsigned, "s" two's complement, "m" sign and
+#: magnitude). A field in pieces has a tuple of (first bit, number of bits) pairs in place of the first bit.
 Field = tuple[int | tuple[tuple[int, int], ...], int, float, str]
 
 _LONGEST: Final = 62
 
 
 def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
-    """Return the unsigned integers from a bit field, shape (N,)."""
+    """Return unsigned integers from a bit field of N messages, bits of shape (N, bits); ValueError: over 62 bits."""
     if length > _LONGEST:
         raise ValueError(f"a field has at most {_LONGEST} bits, {length} were requested")
     value = np.zeros(len(bits), dtype=np.int64)
@@ -270,7 +270,7 @@ def sign_magnitude(bits: Bytes, first: int, length: int) -> Integers:
 
 
 def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
-    """Return all fields of a layout, scaled, shape (N,) each, of bits of shape (N, bits)."""
+    """Return all fields of a layout by name, scaled, shape (N,) each, from bits of shape (N, bits)."""
     values = {}
     for name, (where, length, factor, coding) in layout.items():
         if isinstance(where, tuple):
@@ -289,8 +289,8 @@ class Subframes(RowArrays):
 
     satellite: Strings
     signal: Integers  #: Signal number (UBX sigId; other formats are translated to it); shape (N,).
-    glonass_channel: Integers
-    #: Words of 30 or 32 bits, right-aligned; unused ones 0; shape (N, 10).
+    glonass_channel: Integers  #: Frequency channel of a GLONASS satellite, shape (N,).
+    #: Words of 30 or 32 bits, right-aligned; unused words are 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
     order: Integers  #: Offset in the stream, which determines the preceding epoch; shape (N,).
     skipped: Mapping[str, int] = field(default_factory=dict)  #: Pages left out, by reason.
@@ -300,34 +300,34 @@ class Subframes(RowArrays):
 
 
 def join_subframes(first: Subframes, second: Subframes) -> Subframes:
-    """Return the subframes of two formats of one stream, in its order."""
+    """Join the subframes of two formats in one stream, in the order of the stream."""
     if not len(second) and not second.skipped:
         return first
     both = replace(join_rows([first, second]), skipped={**first.skipped, **second.skipped})
     return both.take(np.argsort(both.order, kind="stable"))
 
 
-#: Signal numbers among subframes of SBAS on L5 and of pages of B-CNAV1; UBX has none.
+#: Signal numbers for SBAS on L5 and for B-CNAV1 pages in `Subframes`, which UBX does not define.
 SBAS_L5, BCNAV1_PAGE = -5, -6
 
 
 @dataclass(frozen=True, kw_only=True)
 class SbasFrames:
-    """N SBAS messages as output by a receiver; parity and preamble are not checked here."""
+    """SBAS messages as output by a receiver, N rows; preamble and parity are not checked."""
 
-    #: 1 ns after the receiver's epoch before the message; NaT before the receiver knew the time; shape (N,).
+    #: 1 ns after the last epoch before the message, NaT before the first time of the log; shape (N,).
     time: Datetimes
 
-    prn: Integers
-    octets: Bytes  #: The 250 bits from the first preamble bit on, then zeros; shape (N, 32).
-    on_l5: Masks  #: Sent on L5, not on L1; shape (N,).
+    prn: Integers  #: PRN of the satellite, shape (N,).
+    octets: Bytes  #: Message of 250 bits, beginning with the preamble, padded with zeros; shape (N, 32).
+    on_l5: Masks  #: Whether the message was sent on L5 instead of L1, shape (N,).
 
     def __len__(self) -> int:
         return len(self.time)
 
 
 def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
-    """Return SBAS messages among subframes: eight words of 32 bits, left-aligned (UBX-22008968, 3.17.9)."""
+    """Return the SBAS messages among subframes; each has eight words of 32 bits (UBX-22008968, 3.17.9)."""
     rows = np.flatnonzero(np.char.startswith(subframes.satellite, "S"))
     octets = subframes.words[rows, :8].astype(">u4").view(np.uint8).reshape(len(rows), 32).copy()
     octets[:, 31] &= 0xC0
@@ -337,7 +337,7 @@ def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
 
 
 def unpack_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:
-    """Bits of words of which the lowest `drop` are left out and the next `keep` kept, shape (N, words * keep)."""
+    """Return the `keep` bits above the lowest `drop` bits of each word, shape (N, words * keep)."""
     shift = np.arange(keep - 1, -1, -1, dtype=np.uint32) + np.uint32(drop)
     bits = words[:, :, None] >> shift & np.uint32(1)
     return bits.reshape(len(words), words.shape[1] * keep).astype(np.uint8)

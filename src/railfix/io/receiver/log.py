@@ -1,4 +1,4 @@
-"""Receiver logs (UBX, RTCM 3, SBF, protocols mixed) in pieces of bounded memory, with indicators and positions.
+"""Read receiver logs (UBX, RTCM 3, SBF, also mixed) in pieces, with interference indicators and receiver positions.
 
 Sources: u-blox F9 HPG 1.32 interface description (UBX-22008968), 3.14.5 MON-RF, 3.14.2 MON-HW; u-blox X20 HPG 2.00
 (SEC-SIG, versions 1 and 2; SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
@@ -40,32 +40,32 @@ RF_STATUS: Final = 4092
 RECEIVER_STATUS: Final = 4014
 
 JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
-#: u-blox states that are used: jamming is critical, spoofing is affirmed. State 2 (warning, indicated) was sent for 571
-#: of 581 s of a recording without interference.
+#: u-blox state from which an alarm is set: jamming critical, spoofing affirmed. State 2 (warning, indicated) was sent
+#: for 571 of 581 s of a recording without interference.
 _CERTAIN: Final = 3
-#: Septentrio: a band with interference that is not cancelled.
+#: Septentrio mode of a band with interference that is not cancelled.
 _NOT_MITIGATED: Final = 8
 _MON_HW_BYTES: Final = 60
-_BLOCK: Final = 24  #: u-blox: bytes of a block of MON-RF after the four of the head.
-#: Septentrio: first block of bands or front ends after the time stamp (6 bytes).
+_BLOCK: Final = 24  #: Bytes of each MON-RF block of u-blox, after a header of four bytes.
+#: Septentrio: offsets of the first band block and the first front-end block in the payload.
 _BANDS, _FRONT_ENDS = 12, 24
 _NO_GAIN: Final = -128
-#: u-blox SEC-SIGLOG: bytes of an event, and duration of the effect of a single trigger [s].
+#: u-blox SEC-SIGLOG: bytes of each event, and duration of the effect of a single trigger [s].
 _EVENT: Final = 8
 _TRIGGERED_S: Final = 10
-_SIMULATED: Final = 0  #: Kind of detection that is used; jamming detections begin with a warning, as in that recording.
+_SIMULATED: Final = 0  #: Detection type that is used: simulated signals. Jamming detections begin with a warning.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Indicators:
-    """Last indicators of each kind of message so far: alarm bits, and the gain, NaN where no message has it."""
+    """Latest alarm bits of each kind of message, and latest front-end gain, NaN before the first gain."""
 
     alarm: Mapping[int, int] = field(default_factory=dict)
     gain: float = np.nan
 
 
 def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
-    """Return alarm bits and gain at rising `places` of the stream, shape (T,) each, and the last indicators of all."""
+    """Return alarm bits and gain at rising offsets `places`, shape (T,) each, and the indicators after all messages."""
     found = sorted(_messages(frames))
     alarm, gain = dict(before.alarm), before.gain
     alarms, gains = np.zeros(len(places), dtype=np.uint8), np.full(len(places), np.nan)
@@ -82,7 +82,7 @@ def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple
 
 
 def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
-    """Yield offset in the stream, kind, alarm bits and gain of each message."""
+    """Yield offset in the stream, kind, alarm bits and gain of each valid message with indicators."""
     readers = {
         ("ubx", MON_RF): _mon_rf,
         ("ubx", MON_HW): _mon_hw,
@@ -99,7 +99,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _mon_rf(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming state of any band, and the gain of the first band."""
+    """Return the jamming bit, which any band sets, and the gain of the first band; None for a broken message."""
     if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
         return None
     blocks = data[4:].reshape(-1, _BLOCK)
@@ -108,14 +108,14 @@ def _mon_rf(data: Bytes) -> tuple[int, float] | None:
 
 
 def _mon_hw(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming state and gain of receivers up to the M8."""
+    """Return the jamming bit and gain from receivers up to the M8; None for a broken message."""
     if len(data) != _MON_HW_BYTES:
         return None
     return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
 
 
 def _sec_sig(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming and spoofing states, each where its detection is on."""
+    """Return the jamming and spoofing bits, which are 0 if the detection is off; None for an unknown version."""
     if len(data) >= 12 and data[0] == 1:
         jamming, spoofing = int(data[4]), int(data[8])
     elif len(data) >= 4 and data[0] == 2:
@@ -127,9 +127,9 @@ def _sec_sig(data: Bytes) -> tuple[int, float] | None:
 
 
 def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
-    """Simulated signals that the log has begun and not ended, by the newest event, are spoofing.
+    """Return the spoofing bit, set if simulated signals have begun and not ended, or were triggered within 10 s.
 
-    Abnormal signals, contradictions of an inertial unit and abrupt changes are not used: tunnels cause them.
+    Events of abnormal signals, inconsistent inertial data and abrupt changes are ignored, because tunnels cause them.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
@@ -140,7 +140,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the uncancelled interference, and misleading or unauthentic signals."""
+    """Return the jamming bit (interference not cancelled) and the spoofing bit (misleading or unauthentic signals)."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -151,7 +151,7 @@ def _rf_status(data: Bytes) -> tuple[int, float] | None:
 
 
 def _receiver_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the gain of the first front end [dB]."""
+    """Return the gain of the first front end [dB], NaN if unavailable; None for a broken message."""
     if len(data) < _FRONT_ENDS or int(data[20]) < 1 or len(data) < _FRONT_ENDS + int(data[21]):
         return None
     gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])
@@ -162,7 +162,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read the positions that a receiver computed; `date` is for UBX logs without a dated NAV-PVT."""
+    """Read a receiver's positions; `date`, within half a week, is for UBX logs without a dated NAV-PVT message."""
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
     undated, rest = 0, b""
@@ -197,40 +197,40 @@ _MSM: Final = "RTCM 3 MSM"
 
 @dataclass(frozen=True, kw_only=True)
 class LogPiece:
-    """One block of a receiver log, its bytes outside frames, failed checksums, and a base station's position."""
+    """Decoded block of a receiver log."""
 
     measurements: Measurements
     ephemerides: Assembled
     sbas: SbasFrames
-    station: tuple[float, float, float] | None = None
-    skipped_bytes: int = 0
+    station: tuple[float, float, float] | None = None  #: Position of the base station (RTCM 3), ECEF [m].
+    skipped_bytes: int = 0  #: Number of bytes outside frames.
     bad_checksums: int = 0
-    bytes: int = 0
+    bytes: int = 0  #: Number of processed bytes.
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """State after the bytes so far: kind of observations used, last time of any message, station of RTCM."""
+    """State of the decoder of a stream after a block."""
 
-    rest: bytes = b""
+    rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch, or a time near.
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
-    observed: bool = False
-    kind: str = ""
-    clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    observed: bool = False  #: Whether UBX or SBF measurements with a time have been decoded.
+    kind: str = ""  #: Kind of observation messages used, blank before the first epoch.
+    clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last time of any message.
     indicators: Indicators = field(default_factory=Indicators)
-    station: tuple[float, float, float] | None = None
+    station: tuple[float, float, float] | None = None  #: As in `LogPiece`.
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
-    """Decode a block of bytes; a stream cut anywhere gives the same. `state.time` resolves the week of RTCM 3."""
+    """Decode a block of bytes; return its contents and the new state. Blocks may end anywhere in the stream."""
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:
         unfinished = rtcm.find_unfinished_epoch(frames)
-        if unfinished is not None:  # the rest of its messages is in the next block, for which it is kept
+        if unfinished is not None:  # an incomplete epoch is kept for the next block
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
     channels = rtcm.glonass_channels(frames, state.glonass_channels)
     msm, msm_places = rtcm.msm_measurements(frames, state.time, channels)
@@ -277,7 +277,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
 
 
 def _of_old_kinds(frames: Frames) -> dict[str, int]:
-    """Return messages with observations that are not read, by kind: RTCM 3 before MSM4, u-blox before the M8."""
+    """Return the number of observation messages of each unsupported kind: RTCM 3 before MSM4, u-blox before the M8."""
     small = (start + n for start in range(1070, 1140, 10) for n in (1, 2, 3))
     kinds = (*range(1001, 1005), *range(1009, 1013), *small)
     counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in kinds}
@@ -286,7 +286,7 @@ def _of_old_kinds(frames: Frames) -> dict[str, int]:
 
 
 def _places(frames: Frames, kind: str) -> Integers:
-    """Offsets in the stream of the messages of one kind with observations."""
+    """Return the offsets in the stream of the observation messages of one kind."""
     chosen = {
         _RAWX: frames.of("ubx", ubx.RXM_RAWX),
         _MEAS_EPOCH: frames.of("sbf", sbf.MEAS_EPOCH),
@@ -296,7 +296,7 @@ def _places(frames: Frames, kind: str) -> Integers:
 
 
 def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Integers) -> str:
-    """Return the kind of the first epoch with a date, empty without any: a receiver sends its ranges once."""
+    """Return the kind of the first epoch with a date, "" if there is none; further kinds repeat the same ranges."""
     begins = {kind: _places(frames, kind)[-len(part.time)] for kind, part in own.items() if len(part.time)}
     if len(msm_places):
         begins[_MSM] = msm_places[0]
@@ -304,19 +304,19 @@ def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Int
 
 
 def _of_other_kinds(frames: Frames, kind: str) -> dict[str, int]:
-    """Return the messages with observations of unused kinds, counted by kind."""
+    """Return the number of observation messages of each unused kind."""
     counts = {other: len(_places(frames, other)) for other in (_RAWX, _MEAS_EPOCH, _MSM) if other != kind}
-    return {f"{other} messages beside {kind}, which is taken": n for other, n in counts.items() if n}
+    return {f"{other} messages next to {kind}, which is used": n for other, n in counts.items() if n}
 
 
 class _Dated(NamedTuple):
-    """Epochs, or other messages with a date, in the order of the stream."""
+    """Offsets and times of epochs, or of other messages with a date, in the order of the stream."""
 
     places: Integers
     times: Datetimes
 
     def last_before(self, places: Integers, before: np.datetime64) -> Datetimes:
-        """Time of the last epoch before each offset of the stream; `before` for offsets before the first epoch here."""
+        """Return the time of the last epoch before each offset of the stream, `before` where there is none."""
         if not len(self.times):
             return np.full(len(places), before, dtype="datetime64[ns]")
         index = np.searchsorted(self.places, places) - 1
@@ -329,7 +329,7 @@ class _Dated(NamedTuple):
 
 
 def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
-    """Return the receiver's epochs, from messages at offsets; before the first one, from other messages with a date."""
+    """Return the receiver's epochs; before the first epoch of the stream, the times of other messages with a date."""
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
         return _Dated(epochs_at, raw.time)
@@ -344,7 +344,7 @@ def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: b
 def _navigation(
     frames: Frames, dated: _Dated, msm: _Dated, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Return the ephemerides and SBAS messages of a block; `msm` are the epochs of RTCM 3."""
+    """Return the ephemerides and SBAS messages of a block, and unfinished records; `msm` are the epochs of RTCM 3."""
     subframes = join_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     after = dated.first_after(subframes.order)
@@ -362,8 +362,8 @@ def _navigation(
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[LogPiece]:
-    """Yield pieces of a receiver log; `date` within half a week is for RTCM 3 without ephemerides, whose log does not
-    contain the week; `progress` is called with the fraction read. MismatchError: the ephemerides contradict the date.
+    """Yield the pieces of a receiver log; `progress` is called with the fraction read. `date`, within half a week of
+    the log, resolves the week of RTCM 3 logs without ephemerides. MismatchError: the ephemerides contradict the date.
     """
     state = StreamState(time=_week_of_log(path, date))
     with open_stream(path, content="bytes") as stream:
@@ -377,12 +377,12 @@ def scan_pieces(
                 return
 
 
-#: Date and ephemerides farther apart than this belong to different weeks.
+#: A date and ephemerides that differ by more than this contradict each other.
 _SAME_WEEK: Final = np.timedelta64(5, "D")
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
-    """Return a time near the log for RTCM 3: of its first ephemerides, or `date`, or NaT."""
+    """Return a time near an RTCM 3 log: `date`, else the time of the first ephemerides, else NaT."""
     own: np.datetime64 = np.datetime64("NaT", "ns")
     rest = b""
     with open_stream(path, content="bytes") as stream:
@@ -400,7 +400,7 @@ def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
 
 
 def at_station(observations: Observations, station: tuple[float, float, float] | None) -> Observations:
-    """Return observations with the position of their base station in the header, where it is known."""
+    """Return the observations with the position of the base station in the header; unchanged if it is None."""
     if station is None:
         return observations
     return replace(observations, header=replace(observations.header, approximate_ecef_m=np.array(station)))
@@ -437,12 +437,12 @@ def scan_receiver_log(
 
 
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
-    """Return navigation records of receiver logs; without `date`, satellites without a full date are noted."""
+    """Read the navigation records of receiver logs; InputFileError: no record is complete and has a date."""
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
     whole = merge_records(parts)
     undated = sorted(whole.undated - {record.satellite for record in whole.records})
-    why = f"the ephemerides of {', '.join(undated)} carry no full date (--date gives one)" if undated else ""
+    why = f"the ephemerides of {', '.join(undated)} have no full date; give a date (--date)" if undated else ""
     if not whole.records:
         kinds = "UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046"
         raise InputFileError(", ".join(names), why or f"contains no complete ephemeris ({kinds})")

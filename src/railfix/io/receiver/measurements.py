@@ -1,4 +1,4 @@
-"""Measurements and navigation records as receivers send them."""
+"""Measurements and navigation records decoded from receiver messages."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Measurements:
 
     time: Datetimes  #: Time tags in the order of the stream, shape (T,).
     epoch: Indices  #: Epoch of each measurement, shape (N,).
-    #: Blank where RINEX has no name for it: not used, counted; shape (N,).
+    #: Satellite and signal, blank where RINEX has no name (counted, not used); shape (N,).
     satellite: Strings
     signal: Strings
     #: NaN where absent or declared invalid by the receiver, shape (N,).
@@ -37,10 +37,10 @@ class Measurements:
     phase_cycles: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
-    lock_s: Floats  #: Time that the phase has been tracked without a break (at least), shape (N,).
-    half_cycle: Masks  #: Half a cycle is unresolved, shape (N,).
+    lock_s: Floats  #: Minimum time of continuous phase tracking, shape (N,).
+    half_cycle: Masks  #: Whether a half-cycle ambiguity of the phase is unresolved, shape (N,).
     polarity: Integers  #: A change indicates a jump of half a cycle, shape (N,).
-    glonass_channel: Integers  #: Frequency channel where the satellite is of GLONASS, shape (N,).
+    glonass_channel: Integers  #: Frequency channel of a GLONASS satellite, shape (N,).
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
@@ -51,14 +51,17 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """State after the epochs: the last one, and lock time [s] and polarity of the last phase of each channel."""
+    """State after epochs: time of the last epoch, and lock time [s] and polarity of the last phase by channel."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def join_observations(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
-    """Return observations by epoch and sorted channel, and the state after; epochs that do not rise are counted."""
+    """Return measurements as observations with sorted channels, and the new state.
+
+    Epochs that are not later than all preceding epochs are skipped and counted.
+    """
     tracking = tracking or Tracking()
     rising = rising_epochs(measurements.time, None if np.isnat(tracking.last) else tracking.last)
     known = (measurements.satellite != "") & (measurements.signal != "")
@@ -106,7 +109,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
 
 
 def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
-    """Return the values of the accepted epochs; default values for a log without them."""
+    """Return the values of the accepted epochs, `absent` for all epochs of a log without such values."""
     kind = np.float64 if np.isnan(absent) else np.uint8
     return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
@@ -114,7 +117,7 @@ def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDA
 def _tracking_after(
     observations: Observations, tracking: Tracking, channels: Strings, lock_s: Floats, polarity: Floats
 ) -> Tracking:
-    """Return the state after a piece: of each channel the last lock time and polarity."""
+    """Return the state after a piece, with the last lock time and polarity of each channel."""
     rows = np.where(np.isnan(lock_s), -1, np.arange(len(lock_s))[:, None]).max(axis=0)
     seen = np.flatnonzero(rows >= 0)
     lock = {str(channels[k]): (float(lock_s[rows[k], k]), float(polarity[rows[k], k])) for k in seen.tolist()}
@@ -123,7 +126,7 @@ def _tracking_after(
 
 
 def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
-    """Return epochs later than all before them, shape (T,)."""
+    """Return whether each epoch is later than all preceding epochs and than `after`, shape (T,)."""
     ns = time.astype(np.int64)
     floor = np.iinfo(np.int64).min if after is None else int(after.astype("datetime64[ns]").astype(np.int64))
     before = np.concatenate([[floor], np.maximum(np.maximum.accumulate(ns), floor)[:-1]]) if len(ns) else ns
@@ -131,7 +134,10 @@ def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
 
 
 def slips(lock_s: Floats, polarity: Floats) -> Masks:
-    """Flag discontinuous phases (T, M): lock time 0 or less than before, or changed polarity; NaN without phase."""
+    """Return which phases are discontinuous, shape (T, M): lock time 0 or less than before, or changed polarity.
+
+    Inputs are NaN where there is no phase.
+    """
     present = ~np.isnan(lock_s)
     epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
     last = np.concatenate([np.full((1, lock_s.shape[1]), -1), np.maximum.accumulate(epochs, axis=0)[:-1]])
@@ -155,7 +161,7 @@ def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> 
 
 
 def no_measurements(receiver: str) -> Measurements:
-    """Create measurements without a row."""
+    """Return measurements without rows."""
     kinds = {
         **dict.fromkeys(("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "lock_s"), "<f8"),
         "satellite": "<U3", "signal": "<U3", "half_cycle": "?", "polarity": "<i8", "glonass_channel": "<i8",
@@ -166,7 +172,7 @@ def no_measurements(receiver: str) -> Measurements:
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
-    """Return the measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
+    """Join the measurements of several pieces; epochs with equal time tags in different pieces stay separate."""
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     epoch = np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)])
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
@@ -179,12 +185,12 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-#: A record, and the key that distinguishes it from the satellite's next record.
+#: Record, and its issue, which distinguishes it from the satellite's next record.
 Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
-#: Data source of Galileo: the clock refers to E5a and E1.
+#: Bit of the Galileo data source: the clock refers to E5a and E1.
 _E5A_CLOCK: Final = 1 << 8
 _MOSCOW_S: Final = 3 * 3600.0
 
@@ -205,7 +211,7 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
 
 
 def cnav_record(satellite: str, values: Values) -> Record:
-    """Record of GPS or QZSS from the fields of CNAV messages 10, 11 and 30 (13 bits of the week: no date is needed)."""
+    """Return the record of GPS or QZSS from the fields of CNAV messages 10, 11 and 30, which have a unique week."""
     sent = from_week(int(values["week"]), values["tow_s"])
     toc = nearest_week(values["toc_s"], sent)
     delays = ("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4)))
@@ -221,7 +227,10 @@ def cnav_record(satellite: str, values: Values) -> Record:
 
 
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
-    """Record of BeiDou from the fields of B-CNAV1 or 2, with the whole week; None of another satellite."""
+    """Return the record of BeiDou from the fields of B-CNAV1 or B-CNAV2, which have a unique week.
+
+    None: the fields are of another satellite or an unknown kind of orbit.
+    """
     if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
         return None
     sent = from_week(int(values["week"]) + _BDS_WEEK_MINUS_GPS, values["tow_s"])
@@ -235,7 +244,7 @@ def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
 
 
 def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Record of Galileo: I/NAV from the fields of words 1 to 5 or of RTCM 1046, F/NAV from the fields of RTCM 1045."""
+    """Return the Galileo record from the fields of I/NAV words 1 to 5, F/NAV pages 1 to 4, RTCM 1046 or RTCM 1045."""
     week, epoch = _week_and_toc(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)
     health = 0
     for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # as RINEX packs them
@@ -255,7 +264,7 @@ def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def beidou_record(satellite: str, message: str, values: Values, time: np.datetime64) -> Record | None:
-    """Record of BeiDou from the fields of D1, D2 or RTCM 1042; None where the parts are of two issues."""
+    """Return the BeiDou record from the fields of D1, D2 or RTCM 1042; None if the fields are of two issues."""
     if values["toc_s"] != values["toe_sow_s"]:  # one issue has one reference time (ICD, 5.2.4.9)
         return None
     week, epoch = _week_and_toc(values, int(values["week"]) + _BDS_WEEK_MINUS_GPS, time)
@@ -272,12 +281,12 @@ def beidou_record(satellite: str, message: str, values: Values, time: np.datetim
 
 
 def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Record of GLONASS from the fields of its strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
+    """Return the GLONASS record from the fields of strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
     epoch = nearest_day(values["tb_s"] - _MOSCOW_S, gpst_to_utc(time))
     _, message_time = to_week(nearest_day(_frame_s(values), gpst_to_utc(time)))
     numbers = {
         **values,
-        "health": float(bool(values["health"]) or bool(values["ln"])),  # either stops the use (ICD, 4.4, B_n and l_n)
+        "health": float(bool(values["health"]) or bool(values["ln"])),  # B_n and l_n (ICD, 4.4)
         "clock_bias": -values["tau_s"],
         "message_time": float(message_time),
         "frequency_channel": values["channel"],
@@ -297,7 +306,7 @@ def _frame_s(values: Values) -> float:
 
 
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
-    """Return the week of toe, and toc.
+    """Return the GPS week of toe, and toc as GPS time.
 
     The broadcast week is the week of transmission: at its end, toe is in the next week. RTCM 3 has no time of
     transmission; it is replaced by the time of week of `time`, when the message was received.
@@ -313,7 +322,7 @@ def _issue(values: Values, *names: str) -> tuple[float, ...]:
 
 
 def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers: Mapping[str, float]) -> RawRecord:
-    """Return a record in RINEX order of numbers; missing ones are NaN."""
+    """Return a record with its numbers in RINEX order; missing numbers are NaN."""
     values = [float(numbers.get(name, np.nan)) for name in list_fields(satellite[0], message)]
     return RawRecord(
         satellite[0], satellite, message, np.asarray(epoch, dtype="datetime64[ns]").reshape(1)[0], values, 3.0

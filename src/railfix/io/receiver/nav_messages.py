@@ -1,11 +1,11 @@
-"""Navigation messages, bit by bit: GPS, QZSS LNAV and CNAV, Galileo I/NAV, F/NAV, BeiDou D1, D2, B-CNAV1, 2, GLONASS.
+"""Decode navigation messages: GPS and QZSS LNAV and CNAV, Galileo I/NAV and F/NAV, BeiDou D1, D2, B-CNAV1 and
+B-CNAV2, and GLONASS.
 
-Each function converts the bits of many messages of one kind to their fields, scaled, as arrays.
-Angles are turned from semicircles into radians.
+The bits of many messages of one kind are converted to arrays of scaled fields. Angles are in radians.
 
 Sources: IS-GPS-200N, 20.3.3 and 30.3.3; IS-QZSS-PNT-005, 4.1.2 and 4.3.2; Galileo OS SIS ICD 2.1, 4.2.3 and 4.3.5;
-BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B1C 1.0, 6.2 and B2a 1.0, 6.2 and 7 (as cssrlib
-1.2.1 reads them); GLONASS ICD L1, L2 5.1, 4.4.
+BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B1C 1.0, 6.2 and B2a 1.0, 6.2 and 7 (as read by cssrlib 1.2.1); GLONASS
+ICD L1, L2 5.1, 4.4.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from railfix.core.checksums import crc24q
 from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, fields, read_unsigned, unpack_words
 
 _PI: Final = np.pi
-Coding = tuple[int, float, str]  #: Number of bits, factor, and how it is coded, of a field (as in `Field`).
+Coding = tuple[int, float, str]  #: Number of bits, factor and coding of a field (as in `Field`).
 Values = Mapping[str, float]  #: Fields of a message by name.
 Place = int | tuple[tuple[int, int], ...]
 
 
 def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
-    """Layout of a message from the codings of its family and where each field begins (or its pieces, with lengths)."""
+    """Return the layout of a message from codings of fields, and the first bit or the pieces of each field."""
     return {name: (place, *codings[name]) for name, place in places.items()}
 
 
 def _with_head(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
-    """Return layouts by kind, with the fields that all messages of the family begin with."""
+    """Return layouts by kind, each extended by the fields `head`, which all kinds have."""
     return {kind: head | fields for kind, fields in kinds.items()}
 
 
@@ -42,13 +42,13 @@ def _flags(**lengths: int) -> dict[str, Coding]:
 
 
 def _klobuchar(first: int) -> dict[str, Field]:
-    """Return the layout of the ionospheric parameters of GPS, eight bits each from `first` on."""
+    """Return the layout of the eight ionospheric parameters of GPS, of eight bits each, the first at bit `first`."""
     factors = (2.0**-30, 2.0**-27, 2.0**-24, 2.0**-24, 2.0**11, 2.0**14, 2.0**16, 2.0**16)
     return {f"ion{k}": (first + 8 * k, 8, factor, "s") for k, factor in enumerate(factors)}
 
 
 _ANGLE: Final[Coding] = (32, 2.0**-31 * _PI, "s")
-#: Orbits of all messages but CNAV and B-CNAV2.
+#: Codings of orbit parameters in all messages except CNAV, B-CNAV1 and B-CNAV2.
 _ORBIT: Final[dict[str, Coding]] = {
     **dict.fromkeys(("m0", "omega0", "i0", "omega"), _ANGLE),
     "delta_n": (16, 2.0**-43 * _PI, "s"),
@@ -74,7 +74,7 @@ LNAV_CODINGS: Final[dict[str, Coding]] = {
     "af0_s": (22, 2.0**-31, "s"),
     "leap_seconds": (8, 1.0, "s"),
 }
-#: LNAV subframes without parity (10 words of 24 bits); TOW count and number are in all of them.
+#: LNAV subframes without parity (10 words of 24 bits); all have the TOW count and the subframe number.
 LNAV_HEAD: Final = layout(LNAV_CODINGS, tow_s=24, subframe=43)
 LNAV: Final = _with_head(LNAV_HEAD, {
     1: layout(LNAV_CODINGS, week=48, accuracy=60, health=64, iodc=((70, 2), (168, 8)), group_delay_1_s=160, toc_s=176,
@@ -137,7 +137,7 @@ _CNAV_CODINGS: Final[dict[str, Coding]] = {
     "af2": (10, 2.0**-60, "s"),
     **dict.fromkeys(("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4))), (13, 2.0**-35, "s")),
 }
-#: CNAV messages of 300 bits; PRN, type and TOW count are in all of them.
+#: CNAV messages of 300 bits; all have PRN, message type and TOW count.
 CNAV_HEAD: Final = layout(_CNAV_CODINGS, number=8, type=14, tow_s=20)
 CNAV: Final = _with_head(CNAV_HEAD, {
     10: layout(_CNAV_CODINGS, week=38, health=51, top=54, accuracy_index=65, toe_sow_s=70, delta_a=81, a_dot=107,
@@ -148,8 +148,8 @@ CNAV: Final = _with_head(CNAV_HEAD, {
                inter_signal_0=140, inter_signal_1=153, inter_signal_2=166, inter_signal_3=179, week_top=256)
     | _klobuchar(192),
 })  # fmt: skip
-CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: A group delay of CNAV that is not available (IS-GPS-200N, 30.3.3.3.1.1).
-#: Semi-major axes [m] that CNAV refers to, and rate of the node [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: Value of an unavailable CNAV group delay (IS-GPS-200N, 30.3.3.3.1.1).
+#: Reference semi-major axes [m] and rate of right ascension [rad/s] of CNAV (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
 CNAV_OMEGA_DOT: Final = -2.6e-9 * _PI
 _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
@@ -161,7 +161,7 @@ _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
     "af2": (11, 2.0**-66, "s"),
     **dict.fromkeys(("group_delay_1_s", "group_delay_2_s", "inter_signal_1"), (12, 2.0**-34, "s")),
 }
-#: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; PRN, type and SOW are in all of them.
+#: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; all have PRN, type and SOW.
 BCNAV2_HEAD: Final = layout(_BCNAV2_CODINGS, number=0, tow_s=12)
 BCNAV2: Final = _with_head(BCNAV2_HEAD, {
     10: layout(_BCNAV2_CODINGS, week=30, iode=53, toe_sow_s=61, kind=72, delta_a=74, a_dot=100, delta_n=125,
@@ -178,7 +178,8 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
 BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health; others are unknown.
-#: Bits of subframes 2 and 3 of B-CNAV1 in each of the pages that a frame is passed on as, after PRN, number and SOW.
+#: A B-CNAV1 frame is passed on as three pages. Subframe, first bit and end of the bits of each page, which follow PRN,
+#: page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
 BCNAV1: Final = _with_head(BCNAV1_HEAD, {
@@ -188,7 +189,7 @@ BCNAV1: Final = _with_head(BCNAV1_HEAD, {
               toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
     2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
 })  # fmt: skip
-#: Reference semi-major axes of B-CNAV1 and B-CNAV2 [m]: medium orbits (kind 3), and orbits with the Earth's period.
+#: Reference semi-major axes of B-CNAV1 and B-CNAV2 [m] for geosynchronous (kinds 1 and 2) and medium (3) Earth orbits.
 BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
 CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
@@ -217,8 +218,8 @@ D1: Final = _with_head(BDS_HEAD, {
               omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
               omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
 })  # fmt: skip
-#: Where each page of D2, subframe 1, begins in the 3000 bits of its ten pages one after the other: page k (1 to 10) at
-#: 300 (k - 1); fields that go over a page are given in pieces.
+#: First bit of each page of D2 subframe 1 in the 3000 bits of its ten consecutive pages; fields that extend over two
+#: pages are given in pieces.
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
 D2: Final = layout(
     BEIDOU_CODINGS,
@@ -276,7 +277,10 @@ URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 
 
 
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
-    """Return words of I/NAV page pairs (N, 8), even first, as bits (N, 128), and which have a valid CRC, no alert."""
+    """Return I/NAV words as bits (N, 128) from page pairs (N, 8), even page first, and whether they are valid.
+
+    Pairs are valid with a correct CRC, and without the alert flag.
+    """
     bits = unpack_words(words[:, :8], drop=0, keep=32)
     even, odd = bits[:, :120], bits[:, 128:248]
     checked = has_crc(np.concatenate([even[:, :114], odd[:, :106]], axis=1), 196)
@@ -285,7 +289,7 @@ def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple
 
 
 def has_crc(bits: Bytes, checked: int) -> Masks:
-    """Return whether the 24 bits after the first `checked` are their CRC-24Q, shape (N,)."""
+    """Return whether the 24 bits after the first `checked` bits are the CRC-24Q of these, shape (N,)."""
     before = np.zeros((len(bits), -checked % 8), dtype=np.uint8)
     data = np.packbits(np.concatenate([before, bits[:, :checked]], axis=1), axis=1)
     start = np.arange(len(data)) * data.shape[1]
@@ -294,7 +298,7 @@ def has_crc(bits: Bytes, checked: int) -> Masks:
 
 
 def sisa_m(index: Floats) -> Floats:
-    """Return signal-in-space accuracy of Galileo [m] by index; NaN where no prediction is available (ICD, table 89)."""
+    """Return Galileo signal-in-space accuracy [m] by index; NaN where no prediction is available (ICD, table 89)."""
     return np.asarray(np.interp(index, (0, 50, 75, 100, 125), (0.0, 0.5, 1.0, 2.0, 6.0), right=np.nan))
 
 
@@ -326,7 +330,7 @@ Pages = Iterator[tuple[int, int, Values]]  #: Row, page number of the satellite,
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
-    """Return the decoded pages in the order of the stream: row, satellite, number, fields."""
+    """Return the decoded pages in the order of the stream (row, satellite, number, fields), and skipped counts."""
     counts = Counter(subframes.skipped)
     pages: list[tuple[int, str, int, Values]] = []
     letters = subframes.satellite.astype("<U1")
@@ -342,7 +346,7 @@ def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values
 def _of_kinds(
     bits: Bytes, valid: Masks, kind: Integers, layouts: Mapping[int, Mapping[str, Field]], first: int = 0
 ) -> Pages:
-    """Yield the row, number (`first` and the kind) and fields of the valid pages of each kind."""
+    """Yield row, number (`first` plus the kind) and fields of the valid pages of each kind."""
     for k, layout in layouts.items():
         rows = np.flatnonzero(valid & (kind == k))
         table = fields(bits[rows], layout)
@@ -353,7 +357,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Return the bits of pages, and which of `here` have their preamble and CRC; the others are counted as `fault`."""
+    """Return the bits of pages, and which pages of `here` have a valid preamble and CRC; invalid ones are counted."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here
@@ -372,7 +376,7 @@ def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
     checked, fault = CNAV_CHECKED, f"{letter} CNAV without valid CRC"
     bits, valid = _with_crc(part, cnav, checked, counts, fault, _PREAMBLE)
     kind = read_unsigned(bits, 14, 6)
-    kind = np.where((kind == 61) & (letter == "J"), 30, kind)  # a message of type 61 of QZSS is one of type 30
+    kind = np.where((kind == 61) & (letter == "J"), 30, kind)  # QZSS message type 61 has the layout of type 30
     yield from _of_kinds(bits, valid, kind, CNAV, CNAV_FROM)
     bits = unpack_words(part.words, drop=6, keep=24)
     yield from _of_kinds(bits, civil & (read_unsigned(bits, 0, 8) == _PREAMBLE), read_unsigned(bits, 43, 3), LNAV)
@@ -395,7 +399,7 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
     """Yield the pages of D1, D2, B-CNAV1 and B-CNAV2."""
     legacy, first, b2a = (np.isin(part.signal, signals) for signals in (_D_SIGNALS, _B1C, _B2A))
     frame = part.signal == BCNAV1_PAGE
-    counts["C pages of B-CNAV1 of UBX (that of SBF is read)"] += int(np.count_nonzero(first))
+    counts["C pages of B-CNAV1 in UBX (supported in SBF only)"] += int(np.count_nonzero(first))
     counts["C pages of other messages"] += int(np.count_nonzero(~legacy & ~first & ~b2a & ~frame))
     bits, valid = _with_crc(part, b2a, BCNAV2_CHECKED, counts, "C B-CNAV2 without valid CRC")
     yield from _of_kinds(bits, valid, read_unsigned(bits, 6, 6), BCNAV2, CNAV_FROM)

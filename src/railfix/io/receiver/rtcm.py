@@ -1,4 +1,4 @@
-"""RTCM 3 messages as arrays: multiple signal messages (MSM4 to MSM7) and ephemerides.
+"""Decode RTCM 3 messages: multiple signal messages (MSM4 to MSM7) and ephemerides.
 
 Source: RTCM 10403.3, sections 3.5.11 (1019, 1020, 1042, 1044 to 1046) and 3.5.16 (MSM).
 """
@@ -20,7 +20,7 @@ from railfix.io.receiver.framing import Field, Frames, fields, read_signed, read
 from railfix.io.receiver.measurements import Measurements, join_measurements, no_measurements
 from railfix.io.receiver.nav_messages import Coding, layout
 
-#: Constellation letter by tens of the message number of an MSM.
+#: Constellation letter by the first three digits of an MSM number.
 SYSTEMS: Final = {107: "G", 108: "R", 109: "E", 110: "S", 111: "J", 112: "C"}
 #: RINEX signal by constellation and number in the signal mask.
 SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
@@ -37,7 +37,8 @@ SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
 }  # fmt: skip
 _MS: Final = SPEED_OF_LIGHT * 1e-3
 _HEADER_BITS: Final = 169
-#: Bits and resolution [ms] of fine code and phase, bits of lock and C/N0, resolution of C/N0, fine rate present.
+#: Layout by MSM type: bits and resolution [ms] of the fine code and of the fine phase, bits of lock time and of C/N0,
+#: resolution of C/N0 [dB-Hz], and whether the message has range rates.
 _LAYOUT: Final = {
     4: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, False),
     5: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, True),
@@ -48,13 +49,13 @@ MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAY
 #: Name of the count of messages whose week cannot be resolved.
 UNDATED: Final = "RTCM 3 observations without a date"
 IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
-_BEIDOU_LATE_S: Final = 14  #: GPS time is ahead of BeiDou time [s].
+_BEIDOU_LATE_S: Final = 14  #: GPS time minus BeiDou time [s].
 _MOSCOW_S: Final = 10_800.0
 _GLONASS_RANGE: Final = range(-7, 7)
 
 
 def _lock_table(bits: int) -> Floats:
-    """Return the least lock time [s] by indicator: DF402 (4 bits), DF407 (10 bits)."""
+    """Return the minimum lock time [s] by indicator: DF402 (4 bits), DF407 (10 bits)."""
     if bits == 4:
         return np.array([0.0] + [2.0 ** (k + 4) for k in range(1, 16)]) * 1e-3
     steps = np.concatenate([np.ones(64), np.repeat(2.0 ** np.arange(1, 21), 32)])
@@ -63,7 +64,7 @@ def _lock_table(bits: int) -> Floats:
 
 
 class ChannelNews(NamedTuple):
-    """Frequency channels of GLONASS as received: offset in the stream, satellite number, channel, (N,) each."""
+    """GLONASS frequency channels in order of reception: offset in the stream, satellite number, channel, (N,) each."""
 
     place: Indices
     number: Integers
@@ -74,7 +75,7 @@ class ChannelNews(NamedTuple):
         return dict(zip(self.number.tolist(), self.channel.tolist(), strict=True))
 
     def at(self, place: Indices, numbers: Integers) -> Integers:
-        """Channels of satellites known at offsets of the stream, shape (places, satellites); -99 where unknown."""
+        """Return channels known at offsets of the stream, shape (offsets, satellites); -99 where unknown."""
         found = np.full((len(place), len(numbers)), -99)
         for k, number in enumerate(numbers.tolist()):
             mine = self.number == number
@@ -84,7 +85,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Return the channels of 1020 messages after those known before; MSM4 and MSM6 carry none themselves."""
+    """Return the channels known before, then the channels in 1020 messages; MSM4 and MSM6 do not contain channels."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -93,7 +94,10 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 
 
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
-    """Decode all MSM4 to MSM7 messages, and where each epoch begins; `near` is within half a week of the first."""
+    """Decode all MSM4 to MSM7 messages; return the measurements and the offset of each epoch in the stream.
+
+    `near` is within half a week of the first message; if it is NaT, messages are only counted.
+    """
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
         (order, rows, np.full(len(order), SYSTEMS[number // 10]))
@@ -126,7 +130,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
 
 
 def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
-    """Counts of multiple signal messages without measurements: empty, or with masks or a length that do not fit."""
+    """Return the numbers of MSM without satellites, and of broken MSM, whose masks or length do not fit."""
     if len(messages) == used:
         return {}
     empty = int(np.count_nonzero(~take_bits(frames, messages, 137)[:, 73:137].any(axis=1)))
@@ -149,7 +153,7 @@ def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move times by whole weeks to within half a week of the preceding one; GLONASS only in a separate log."""
+    """Shift times by whole weeks to within half a week of the preceding time; GLONASS times only if all are GLONASS."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
@@ -159,7 +163,7 @@ def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move GLONASS times, whose day some encoders leave at 0 (DF416), by whole days to the previous message."""
+    """Shift GLONASS times by whole days toward the previous message, because some encoders leave the day 0 (DF416)."""
     others = np.flatnonzero(~glonass)
     if not len(others) or not glonass.any():
         return time
@@ -169,7 +173,7 @@ def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def take_bits(frames: Frames, chosen: Indices, length: int) -> Bytes:
-    """Return the first bits of some payloads, 0 beyond their ends, shape (N, at least `length`)."""
+    """Return the first bits of payloads, 0 beyond the payload, shape (N, `length` rounded up to whole bytes)."""
     octets = np.arange((length + 7) // 8)
     place = frames.start[chosen][:, None] + octets
     inside = octets < (frames.end - frames.start)[chosen][:, None]
@@ -188,12 +192,12 @@ def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
 
 
 def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
-    """Return whether multiple signal messages are the last ones of their epoch (DF393 is 0), shape (len(chosen),)."""
+    """Return which MSM are the last message of their epoch (DF393 is 0), shape (len(chosen),)."""
     return np.asarray(take_bits(frames, chosen, 56)[:, 54] == 0)
 
 
 def find_unfinished_epoch(frames: Frames) -> int | None:
-    """Return the offset of the first message of a last epoch of which more messages are to follow (DF393)."""
+    """Return the offset of the first message of the last epoch if more messages are to follow (DF393), else None."""
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
         return None
@@ -211,7 +215,7 @@ def find_unfinished_epoch(frames: Frames) -> int | None:
 def _of_number(
     frames: Frames, number: int, near: np.datetime64, channels: ChannelNews
 ) -> Iterator[tuple[Integers, Measurements]]:
-    """Yield measurements of one kind of message, grouped by equal masks; and the offsets of the messages."""
+    """Yield the offsets and measurements of messages of one number, grouped by equal masks."""
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
         return
@@ -220,7 +224,7 @@ def _of_number(
     n_signals = head[:, 137:169].sum(axis=1).astype(np.int64)
     cells = n_satellites * n_signals
     plausible = (cells > 0) & (cells <= 64)
-    if SYSTEMS[number // 10] != "R":  # an encoder was met that writes 2^30 - 14 000 ms for BeiDou as a week begins
+    if SYSTEMS[number // 10] != "R":  # one encoder writes 2^30 - 14 000 ms for BeiDou at the beginning of a week
         plausible &= read_unsigned(head, 24, 30) < 604_800_000
     used = np.where(np.arange(64) < cells[:, None], head[:, 169:233], 0)
     keys = np.packbits(np.concatenate([head[:, 73:169], used], axis=1), axis=1)
@@ -251,7 +255,7 @@ def _decode(
     near: np.datetime64,
     known: Integers,
 ) -> Measurements:
-    """Decode N messages with equal masks; `known` are GLONASS channels for messages that carry none."""
+    """Decode N messages with equal masks; `known` are GLONASS channels for messages without channels."""
     system = SYSTEMS[number // 10]
     code_bits, code_step, phase_bits, phase_step, lock_bits, cn0_bits, cn0_step, with_rate = _LAYOUT[number % 10]
     n_satellites, n_cells = len(satellites), int(mask.sum())
@@ -314,7 +318,7 @@ def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
 
 
 def _sequence(codings: Mapping[str, Coding], names: str) -> dict[str, Field]:
-    """Return a layout from fields that follow each other after the message number."""
+    """Return the layout of consecutive fields after the message number."""
     lengths = [codings[name][0] for name in names.split()]
     places = np.cumsum([12, *lengths[:-1]]).tolist()
     return layout(codings, **dict(zip(names.split(), places, strict=True)))
@@ -361,19 +365,20 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: Weeks of ephemeris messages: the origin of the system in GPS weeks, and the number of weeks of the field.
+#: Week numbers in ephemeris messages: GPS week of week 0, and number of weeks after which the field repeats.
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
-#: GPS week of the first log with MSM (July 2011, RTCM 10403.1 amendment 5): an earlier week is impossible.
+#: GPS week in which MSM were introduced (July 2011, RTCM 10403.1 amendment 5); no log with MSM is older.
 _FIRST_MSM_WEEK: Final = 1642
 
 
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
-    """Return the time of the ephemerides of a log, which determines the week of its observations; NaT without any.
+    """Return the median time of the ephemerides in a log, which resolves the week of observations; NaT without any.
 
-    The weeks of Galileo and BeiDou are unique; the GPS week, modulo 1024, is resolved to the week nearest to `near`, or
-    without it to the first since MSM were defined (July 2011 to February 2031): the computer's clock is not used.
+    The weeks of Galileo and BeiDou are unique. The GPS week, modulo 1024, is resolved to the week nearest to `near`;
+    without `near`, to a week from July 2011, when MSM were introduced, to February 2031. The computer's clock is not
+    used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

@@ -1,4 +1,4 @@
-"""Septentrio SBF blocks as arrays: measurements, navigation pages, the receiver's own positions.
+"""Decode Septentrio SBF blocks: measurements, navigation pages and receiver positions.
 
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
 (GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
@@ -50,7 +50,7 @@ BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
-#: Navigation pages: constellation, and UBX signal number by SBF signal number (None: of all signals).
+#: Blocks with navigation pages: constellation, and UBX signal number by SBF signal number (None: 0 for all signals).
 _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GPS_RAW_CA: ("G", None),
     QZS_RAW_L1CA: ("J", None),
@@ -66,14 +66,14 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GEO_RAW_L1: ("S", None),
     GEO_RAW_L5: ("S", {25: SBAS_L5}),
 }
-_EVEN_BITS, _BDS_BITS = 114, 300  #: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
+_EVEN_BITS, _BDS_BITS = 114, 300  #: Bits of an even Galileo I/NAV page without its tail, and of a BeiDou page.
 #: Constellation and RINEX signal by signal number.
 SIGNALS: Final = {
     0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
     11: "R2C", 12: "R3Q", 13: "C1P", 14: "C5P", 15: "I5A", 17: "E1C", 19: "E6C", 20: "E5Q", 21: "E7Q", 22: "E8Q",
     24: "S1C", 25: "S5I", 26: "J5Q", 28: "C2I", 29: "C7I", 30: "C6I", 32: "J1L", 33: "J1Z", 34: "C7D", 39: "J5P",
 }  # fmt: skip
-#: First and last SVID of each constellation, and the difference to the RINEX number.
+#: First and last SVID, constellation, and number that is added to obtain the RINEX number.
 _NUMBERS: Final = (
     (1, 37, "G", 0), (38, 61, "R", -37), (63, 68, "R", -38), (71, 106, "E", -70), (120, 140, "S", -100),
     (141, 180, "C", -140), (181, 187, "J", -180), (191, 197, "I", -190), (198, 215, "S", -157), (223, 245, "C", -182),
@@ -108,8 +108,8 @@ _FRAME: Final = np.dtype(
 _PVT: Final = np.dtype(
     [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
 )
-#: RTKLIB's quality by mode of a PVT block: stand-alone, differential, fixed position, RTK fixed and float, SBAS, moving
-#: base fixed and float, PPP fixed and float.
+#: RTKLIB's quality by mode of a PVT block: 1 stand-alone, 2 differential, 3 fixed position, 4 RTK fixed, 5 RTK float,
+#: 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF
@@ -134,7 +134,7 @@ _SIGNAL_NAMES: Final = np.array([SIGNALS.get(number, "") for number in range(64)
 
 
 def meas_epoch_measurements(frames: Frames) -> Measurements:
-    """Return the measurements of all MeasEpoch blocks; malformed ones are skipped and counted."""
+    """Return the measurements of all MeasEpoch blocks; malformed blocks are skipped and counted."""
     chosen, head = frames.structures("sbf", [MEAS_EPOCH], _HEAD)
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
     scrambled = dated & (head["flags"] & _SCRAMBLED != 0)
@@ -163,7 +163,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
 
 
 def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, int]] | None:
-    """Offsets of the sub-blocks of one block, each with its first-type sub-block's offset; None for a broken block."""
+    """Return the offset of each sub-block of a block, and of its type-1 sub-block; None if the block is broken."""
     cursor, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
     size1, size2 = int(head["size1"]), int(head["size2"])
     places: list[tuple[int, int]] = []
@@ -179,7 +179,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, in
 
 
 def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
-    """Return measurements of sub-blocks: the first type is absolute, the second type is relative to the first."""
+    """Decode sub-blocks; those of type 1 have absolute values, those of type 2 are relative to their `master`."""
     own = place == master
     first = gather_structures(frames.data, master, _FIRST)
     other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first
@@ -236,7 +236,7 @@ def _read_signed(value: Integers, bits: int) -> Integers:
 
 
 def navigation_subframes(frames: Frames) -> Subframes:
-    """Return navigation pages that passed the receiver's check, their words laid out as in UBX RXM-SFRBX."""
+    """Return the navigation pages that passed the receiver's check, with words as in UBX RXM-SFRBX."""
     chosen = frames.of("sbf", *_PAGES)
     # The shortest block (GLONASS, three words) has 24 bytes; words that a block lacks are zero.
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= 24]
@@ -305,12 +305,12 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
 
 
 def _align_words(bits: Bytes, length: int) -> Words:
-    """Return ten words of a number of bits, right-aligned, from bits put after each other, shape (..., 10 * length)."""
+    """Return ten right-aligned words of `length` bits, shape (N, 10), from bits of shape (..., 10 * length)."""
     return read_unsigned(bits.reshape(-1, length), 0, length).reshape(-1, 10).astype(np.uint32)
 
 
 def _inav_words(words: Words) -> Words:
-    """Return the even and odd page in four words each, from both joined without the even page's tail."""
+    """Return the even and the odd page in four words each, from both pages joined without the even page's tail."""
     bits = unpack_words(words, drop=0, keep=32)
     pages = np.zeros((len(words), 320), dtype=np.uint8)
     pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]
@@ -319,7 +319,7 @@ def _inav_words(words: Words) -> Words:
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:
-    """Return the receiver's own positions, of PVTGeodetic, else PVTCartesian blocks: columns of `PositionLog`."""
+    """Return the receiver's positions (PVTGeodetic blocks, else PVTCartesian blocks) as columns of `PositionLog`."""
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     _, rows = frames.structures("sbf", [PVT_GEODETIC if geodetic else PVT_CARTESIAN], _PVT)
     mode = rows["mode"] & 15

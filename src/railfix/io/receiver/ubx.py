@@ -1,4 +1,4 @@
-"""u-blox UBX messages as arrays: raw measurements, navigation subframes, the receiver's own positions.
+"""Decode u-blox UBX messages: raw measurements, navigation subframes and receiver positions.
 
 Source: u-blox F9 HPG 1.32 interface description (UBX-22008968), sections 3.15 (NAV) and 3.17 (RXM).
 """
@@ -17,7 +17,7 @@ from railfix.io.receiver.framing import Frames, Subframes, gather_structures
 from railfix.io.receiver.measurements import Measurements
 
 RXM_RAWX: Final = 0x0215
-#: Raw measurements of receivers up to the u-blox 7; counted, not read.
+#: Raw measurements of receivers up to the u-blox 7, which are counted but not read.
 RXM_RAW: Final = 0x0210
 RXM_SFRBX: Final = 0x0213
 NAV_PVT: Final = 0x0107
@@ -34,14 +34,15 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
     6: {0: "1C", 2: "2C"},
     7: {0: "5A"},
 }
-#: Data bits of a word of LNAV that its parity bits D25 to D30 sum, and which of these sum bit 29 of the word before.
+#: Masks of the data bits in the parity equations of D25 to D30 of an LNAV word, and equations that contain the previous
+#: word's D29.
 _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
 _LNAV_WITH_D29: Final = (0, 2, 5)
-#: Last plausible GPS week of a log: 2079. A later date would put every following epoch out of order.
+#: Last plausible GPS week of a log, in 2079. After a later date, all following epochs would be out of order.
 _LAST_WEEK: Final = 5200
-#: Codes [m], phases [cycles] and Dopplers [Hz] from here on are invalid; RINEX has no field for them.
+#: Codes [m], phases [cycles] and Dopplers [Hz] from this value on are invalid; they exceed the fields of RINEX.
 _LARGEST: Final = 1e10
-#: One measurement of RXM-RAWX.
+#: Measurement in RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
     [
         ("code", "<f8"), ("phase", "<f8"), ("doppler", "<f4"), ("gnss", "u1"), ("sv", "u1"), ("signal", "u1"),
@@ -50,7 +51,7 @@ _MEASUREMENT: Final = np.dtype(
     ]
 )  # fmt: skip
 _SFRBX_HEADER: Final = np.dtype([*((name, "u1") for name in ("gnss", "sv", "signal", "channel", "count")), ("_", "V3")])
-_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Most words of RXM-SFRBX that are used.
+_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Words of RXM-SFRBX, of which at most ten are used.
 _RAWX_HEADER: Final = np.dtype(
     [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
 )
@@ -70,7 +71,7 @@ _HPPOSLLH: Final = np.dtype(
     ]
 )  # fmt: skip
 _PHASE_VALID, _HALF_CYCLE_KNOWN, _HALF_CYCLE_REMOVED, _CODE_VALID = 2, 4, 8, 1
-#: Largest standard deviation of a phase that is used, in units of 0.004 cycle (as RTKLIB 2.4.3 does).
+#: Largest standard deviation of a phase that is used, in units of 0.004 cycle (as in RTKLIB 2.4.3).
 _LARGEST_PHASE_STD: Final = 5
 
 
@@ -88,7 +89,7 @@ _NAMES: Final = _name_table()
 
 
 def rawx_measurements(frames: Frames) -> Measurements:
-    """Return the raw measurements of all RXM-RAWX messages; malformed ones are counted."""
+    """Return the raw measurements of all RXM-RAWX messages; malformed messages are skipped and counted."""
     chosen, header = frames.structures("ubx", [RXM_RAWX], _RAWX_HEADER)
     whole = frames.end[chosen] - frames.start[chosen] == 16 + 32 * header["count"].astype(np.int64)
     plausible = whole & (header["week"] > 0) & (header["week"] <= _LAST_WEEK)
@@ -131,7 +132,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
 
 
 def sfrbx_subframes(frames: Frames) -> Subframes:
-    """Return the subframes of all RXM-SFRBX messages; L1 C/A subframes with wrong parity are counted."""
+    """Return the subframes of all RXM-SFRBX messages; L1 C/A subframes with wrong parity are skipped and counted."""
     chosen, header = frames.structures("ubx", [RXM_SFRBX], _SFRBX_HEADER)
     whole = frames.end[chosen] - frames.start[chosen] == 8 + 4 * header["count"].astype(np.int64)
     chosen, header = chosen[whole], header[whole]
@@ -155,7 +156,8 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
 def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> Masks:
     """Return whether the parity of all ten words of LNAV subframes is correct, shape (N,) (IS-GPS-200, table 20-XIV).
 
-    u-blox inverts a word whose predecessor ends in 1; the previous bit is then the exclusive or of its last two bits.
+    u-blox inverts each word that follows a word with D30 = 1. In the parity equations, D30 of the previous word
+    therefore cancels, and D29 is replaced by the exclusive or of D29 and D30.
     """
     data, parity = words >> np.uint32(6) & np.uint32(0xFFFFFF), words & np.uint32(63)
     before = np.zeros_like(parity)
@@ -170,7 +172,10 @@ def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> 
 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
-    """Return the receiver's own positions, columns of `PositionLog`; `near` is within half a week."""
+    """Return the receiver's positions as columns of `PositionLog`; `near` is within half a week of them.
+
+    If `near` is NaT, there are no rows.
+    """
     _, pvt = frames.structures("ubx", [NAV_PVT], _PVT)
     fixed = (pvt["flags"] & 1 == 1) & np.isin(pvt["fix"], [2, 3, 4])
     carrier = pvt["flags"] >> 6
@@ -194,7 +199,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal_mm"] * 1e-3, rows["vertical_mm"] * 1e-3
     if np.isnat(near):
         kept = np.zeros(len(rows), dtype=bool)
-    # u-blox states one error for both horizontal directions together.
+    # u-blox reports one standard deviation for both horizontal directions together.
     sigma = np.stack([horizontal / np.sqrt(2.0), horizontal / np.sqrt(2.0), vertical], axis=-1)
     time = np.full(len(rows), np.datetime64("NaT", "ns"))
     if kept.any():
@@ -214,13 +219,13 @@ def find_date(frames: Frames) -> np.datetime64:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Return the offsets in the stream of NAV-PVT with a valid date, and their times."""
+    """Return the offsets in the stream of NAV-PVT messages with a valid date, and their times."""
     days, rows, places = _date(frames)
     return places, nearest_week(rows["tow_ms"] * 1e-3, days)
 
 
 def _date(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
-    """Return days (UTC), rows and offsets of NAV-PVT with a valid date."""
+    """Return the days (UTC), rows and offsets of NAV-PVT messages with a valid date."""
     chosen, rows = frames.structures("ubx", [NAV_PVT], _PVT)
     valid = rows["valid"] & 3 == 3
     rows = rows[valid]

@@ -18,11 +18,11 @@ from railfix.io.file_kind import wrong_kind
 from railfix.io.rinex.observations_epochs import FaultLog
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_columns
 
-#: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
+#: Time systems of TIME OF FIRST OBS, and the default time system by constellation of files without this record.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-ALL: Final = ""  #: Key of the types of a RINEX 2 file, which hold for all constellations.
-#: Longest header; a longer file without END OF HEADER is no RINEX file.
+ALL: Final = ""  #: Key of the types of a RINEX 2 file, which apply to all constellations.
+#: Longest accepted header; a file without END OF HEADER up to there is not RINEX.
 _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
 #: Alternative names of time systems written by some programs.
@@ -40,16 +40,16 @@ class RinexHeader:
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     #: SYS / SCALE FACTOR by constellation and type.
     scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    #: The part that becomes `Observations.header`.
+    #: Part of the header that becomes `Observations.header`.
     public: ObservationHeader = field(default_factory=ObservationHeader)
 
     @property
     def reading(self) -> tuple[object, ...]:
-        """Return everything that decides how the lines after the header are read."""
+        """Return the contents that determine how the lines after the header are read."""
         return self.version, self.system, self.time_system, self.types, self.scale
 
     def get_types(self, system: str) -> tuple[str, ...] | None:
-        """Return the declared types of a constellation, None for an undeclared one."""
+        """Return the declared types of a constellation, None if it is not declared."""
         return self.types.get(ALL if self.version < 3.0 else system)
 
     def columns(self, system: str) -> tuple[SignalColumn, ...]:
@@ -58,7 +58,10 @@ class RinexHeader:
 
 
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
-    """Read the header of an observation file, and the bytes read after it; InputFileError where it does not end."""
+    """Return the header lines of an observation file, and the bytes read after them.
+
+    InputFileError: the file is not a RINEX observation file, or the header does not end.
+    """
     data = b""
     found = -1
     while found < 0:
@@ -79,8 +82,9 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
 
 
 def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:
-    """Parse the header of an observation file that begins at a line; `log` receives notes on missing columns, and on
-    unreadable records that do not matter where broken lines do not stop the reading.
+    """Parse the header of an observation file, which begins at `first_line`; InputFileError: it cannot be used.
+
+    `log` receives notes on records that are not in their columns, and on unreadable records that are skipped.
     """
     version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
@@ -97,7 +101,7 @@ def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: 
 
 
 def read_version(path: FilePath, line: str) -> float:
-    """Read the version of a RINEX file from its first line."""
+    """Return the version of a RINEX file from its first line; InputFileError: the version is not supported."""
     try:
         version = float(line[:9])
     except ValueError as error:
@@ -119,7 +123,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header: by columns, otherwise by words, with a note."""
+    """Reader of header records into a copy of a header; records that are not in their columns are read by words."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
@@ -136,7 +140,7 @@ class _HeaderRecords:
         self._scaling: tuple[str, float, int] | None = None
 
     def read(self, line: str, number: int) -> None:
-        """Read one line."""
+        """Read one header record at a line number."""
         self._line = number
         label = line[60:80].strip()
         text = f"{line[:60]:<60}"
@@ -150,7 +154,7 @@ class _HeaderRecords:
                 self._changes |= self._by_words(name, label, text)
 
     def _by_words(self, name: str, label: str, text: str) -> dict[str, Any]:
-        """Return a value by the words of a record; none where it cannot be read and broken lines do not stop."""
+        """Return the value of a record read by its words; no value if it is unreadable and broken lines are counted."""
         read = _BY_WORDS.get(label)
         try:
             if read is not None:
@@ -191,7 +195,7 @@ class _HeaderRecords:
         return int(text)
 
     def types_2(self, text: str) -> None:
-        """# / TYPES OF OBSERV."""
+        """Read a record # / TYPES OF OBSERV."""
         if text[:6].strip():
             self._declared[ALL] = (self._count(text[:6], "# / TYPES OF OBSERV"), self._line)
             self._types[ALL] = ()
@@ -201,7 +205,7 @@ class _HeaderRecords:
         self._extend(ALL, names, text[6:].split(), "# / TYPES OF OBSERV", r"[CPLDSTX][0-9A-D]")
 
     def types_3(self, text: str) -> None:
-        """SYS / # / OBS TYPES."""
+        """Read a record SYS / # / OBS TYPES."""
         words = text.split()
         beside = re.match(r" +[A-Z] +\d+ ", text)
         if text[0] != " " or beside:
@@ -228,7 +232,7 @@ class _HeaderRecords:
         self._types[system] += tuple(names)
 
     def scale_factor(self, text: str) -> None:
-        """SYS / SCALE FACTOR."""
+        """Read a record SYS / SCALE FACTOR."""
         if re.match(r" +[A-Z] +\d+( |$)", text):
             self._remark("SYS / SCALE FACTOR")
             text = f"{text.lstrip():<60}"
@@ -259,7 +263,7 @@ class _HeaderRecords:
         self._scaling = (system, scale, left - len(names))
 
     def time_of_first(self, text: str) -> None:
-        """TIME OF FIRST OBS: its time system; the time itself is taken from the first epoch."""
+        """Read the time system of TIME OF FIRST OBS; the time is taken from the first epoch instead."""
         name = text[48:51].strip()
         if name and name not in TIME_SYSTEMS:
             word = text.split()[-1]
@@ -271,13 +275,13 @@ class _HeaderRecords:
             self._changes["time_system"] = name
 
     def strength_unit(self, text: str) -> None:
-        """SIGNAL STRENGTH UNIT."""
+        """Check SIGNAL STRENGTH UNIT; InputFileError: the unit is not DBHZ."""
         unit = text[:20].strip().upper()
         if unit not in ("DBHZ", ""):
             raise self._fail(f"SIGNAL STRENGTH UNIT: '{unit}' was found, DBHZ was expected")
 
     def glonass_slots(self, text: str) -> None:
-        """GLONASS SLOT / FRQ #."""
+        """Read a record GLONASS SLOT / FRQ #."""
         for satellite, channel in re.findall(r"R([ \d]\d)\s+([+-]?\d+)", text[3:]):
             self._channels[f"R{int(satellite):02d}"] = int(channel)
 
@@ -300,7 +304,7 @@ def _three(text: str) -> Floats:
 
 
 def _place(text: str) -> Floats:
-    """Return three coordinates; NaN where they are 0, which means unknown."""
+    """Return three coordinates, NaN if all are 0, which means unknown."""
     xyz = _three(text)
     return xyz if xyz.any() else np.full(3, np.nan)
 
@@ -310,7 +314,7 @@ def _interval(text: str) -> float:
     return value if value > 0.0 and math.isfinite(value) else math.nan
 
 
-#: Records that become one value of `ObservationHeader` each, and their readers.
+#: Field of `ObservationHeader` and reader of each record with one value.
 _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
     "APPROX POSITION XYZ": ("approximate_ecef_m", _place),
     "ANTENNA: DELTA H/E/N": ("antenna_delta_hen_m", _three),
@@ -323,7 +327,7 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
 }
 
 
-#: Readers of such records by their words.
+#: Readers of some records in `_VALUES` by their words.
 _BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
     "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
     "ANTENNA: DELTA H/E/N": lambda words: _three("".join(f"{word:>14}" for word in words[:3])),

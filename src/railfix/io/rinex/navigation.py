@@ -1,4 +1,4 @@
-"""RINEX navigation files of versions 2, 3 and 4: broadcast orbits, clocks and ionosphere."""
+"""Reader of RINEX 2, 3 and 4 navigation files: broadcast orbits, clocks and ionosphere."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from railfix.io.rinex.navigation_records import (
     number,
 )
 
-#: Constellations by the names of IONOSPHERIC CORR (RINEX 3.05, table A5).
+#: Constellation letters by the names in IONOSPHERIC CORR (RINEX 3.05, table A5).
 _ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
 
 
 @dataclass
 class NavigationContent:
-    """Records and headers of one or several files; `seen` finds duplicates, `klobuchar` has eight coefficients each."""
+    """Records and header values of one or several files; `klobuchar` has eight coefficients by constellation letter."""
 
     broken_lines: BrokenLines
     records: list[RawRecord] = field(default_factory=list)
@@ -43,7 +43,7 @@ class NavigationContent:
     seen: set[tuple[object, ...]] = field(default_factory=set)
 
     def add(self, record: RawRecord) -> None:
-        """Add a record, or count it as a duplicate (joined files of several receivers)."""
+        """Add a record, or count it as a duplicate, as in joined files of several receivers."""
         key = (record.satellite, record.epoch, record.message, *record.numbers)
         if key in self.seen:
             self.skipped["duplicate"] += 1
@@ -63,14 +63,14 @@ class NavigationContent:
         self.notes.append(f"skipped: {error}")
 
     def keep_ionosphere(self, letter: str, half: str, values: list[float]) -> None:
-        """Keep four Klobuchar coefficients ("A" alpha, "B" beta): the first set that is not all zero."""
+        """Store four Klobuchar coefficients ("A" alpha, "B" beta), unless non-zero coefficients are already stored."""
         stored = self.klobuchar.setdefault(letter, [0.0] * 8)
         part = slice(0, 4) if half == "A" else slice(4, 8)
         if not any(stored[part]):
             stored[part] = [0.0 if np.isnan(v) else v for v in values]
 
     def klobuchar_sets(self) -> dict[str, Floats]:
-        """Return the coefficients by constellation; all-zero sets, which were not received, are noted."""
+        """Return the coefficients by constellation; sets of zeros, which were not received, are left out and noted."""
         received = {}
         for letter, values in self.klobuchar.items():
             if any(values):
@@ -81,7 +81,7 @@ class NavigationContent:
 
 
 def read_header(path: FilePath, lines: list[str], content: NavigationContent) -> tuple[float, str, int]:
-    """Read version, file type letter and index of the first line after the header of a navigation file."""
+    """Read a navigation header; return version, file type letter and index of the first line after the header."""
     version, kind = _version(path, lines[0] if lines else "")
     for i, line in enumerate(lines):
         label = line[60:80].strip()
@@ -114,17 +114,17 @@ def _header_line(line: str, label: str, content: NavigationContent) -> None:
         content.skipped[f"ionosphere {line[:4].strip()}"] += 1
 
 
-#: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
-#: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
+#: Minimum and maximum number of lines of a record, including the epoch line, by constellation (RINEX 2.11, tables A4
+#: and A11; 3.05, tables A6 to A16). GLONASS has a fifth line since 3.05, whose flags are not needed.
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
-#: Messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Numbers of lines of messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
 _LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
-#: Messages by constellation as RINEX 4 names them.
+#: Message names of RINEX 4 by constellation.
 _MESSAGES: Final = {
     "G": ("LNAV", "CNAV", "CNV2"), "J": ("LNAV", "CNAV", "CNV2"), "E": ("INAV", "FNAV"),
     "C": ("D1", "D2", "CNV1", "CNV2", "CNV3"), "R": ("FDMA",),
 }  # fmt: skip
-#: File types, and the constellation of records without a letter (RINEX 2.11, 2.12; 3.00 has types of its own, too).
+#: Constellation of records without a letter, by file type (RINEX 2.11, 2.12; 3.00 also has types by constellation).
 _FILE_SYSTEMS: Final = {"N": "G", "G": "R", "H": "S", "E": "E", "L": "E", "J": "J"}
 _SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped: SBAS, NavIC.
 _WIDTH: Final = 19  #: Width of a number.
@@ -133,10 +133,10 @@ _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navigation:
-    """Read all records of one or several navigation files: plain, gzip, compress.
+    """Read all records of one or several navigation files, plain or packed.
 
-    A broken record stops the reading, or is counted in `skipped` and described in `notes`. InputFileError: a file is
-    missing, is not a navigation file, or (with "stop") has a broken record; or no file has a usable record.
+    With "count" a broken record is counted in `skipped` and described in `notes`. InputFileError: a file is missing, is
+    not a navigation file, or (with "stop") has a broken record; or no file has a usable record.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -165,7 +165,7 @@ class _Block:
     name: str
     message: str
     text: list[str]
-    last: bool = False  #: Whether it is the last record of the file, which may be cut.
+    last: bool = False  #: Whether this is the last record of the file, which may be incomplete.
 
 
 def _read_file(path: FilePath, content: NavigationContent) -> None:
@@ -205,7 +205,7 @@ def _reject_stray(path: FilePath, lines: list[str], begin: int, starts: list[int
 
 
 def _blocks_4(path: FilePath, lines: list[str], begin: int, content: NavigationContent) -> Iterator[_Block]:
-    """Yield the ephemerides of version 4; ionosphere records are kept, others are counted."""
+    """Yield the ephemerides of version 4; ionosphere records are stored in `content`, other records are counted."""
     starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
     _reject_stray(path, lines, begin, starts)
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
@@ -263,7 +263,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
             path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
-    lettered = version >= 3.0 or first[:1].isalpha()  # RINEX 2.12: a letter before the number shifts all by a column
+    lettered = version >= 3.0 or first[:1].isalpha()  # in RINEX 2.12 a letter shifts all columns by one
     try:
         epoch = _instant(first[4:], 4) if version >= 3.0 else _instant(first[2 + lettered :], 3)
     except ValueError:
@@ -279,11 +279,11 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
 
 
 def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> list[float]:
-    """Parse the numbers of a record in the order of the file; blank is NaN."""
+    """Parse the numbers of a record in the order of the file; blank numbers are NaN."""
     names = list_fields(satellite[0], block.message)
     numbers: list[float] = []
     for k, name in enumerate(names):
-        # The first line has three numbers, after satellite and time; the others have four.
+        # The first line has three numbers after satellite and time; other lines have four.
         row, place = divmod(k + 1, 4)
         text = block.text[row]
         column = shift - 15 + _WIDTH * place
@@ -296,7 +296,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
 
 
 def _instant(text: str, digits: int) -> np.datetime64:
-    """Parse a time that begins with a year of a number of digits; RINEX 2 has seconds with a decimal."""
+    """Parse a time whose year takes `digits` characters (RINEX 2: 3, with decimals of seconds); ValueError if wrong."""
     year, rest = int(text[:digits]), text[digits:]
     if digits < 4:
         year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0

@@ -1,4 +1,4 @@
-"""Conversion of raw navigation records to the arrays of `railfix.gnss.navigation`."""
+"""Convert raw navigation records to the arrays of `railfix.gnss.navigation`."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from railfix.core.arrays import Floats, Integers, Strings
 from railfix.core.timescale import bdt_to_gpst, nearest_day, nearest_week, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
-#: Numbers of a Keplerian record in the order of the file, the three of the clock first.
+#: Names of the numbers of a Keplerian record in the order of the file, beginning with three clock coefficients.
 _KEPLER: Final = (
     "af0_s af1 af2 iode crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot "
     "i_dot data_source week flag accuracy_m health group_delay_1_s group_delay_2_s transmitted fit"
 ).split()
-#: Numbers of a GLONASS record in the order of the file.
+#: Names of the numbers of a GLONASS record in the order of the file.
 _GLONASS: Final = (
     "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
     "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
 ).split()
-#: First numbers of CNAV and of CNV1 to CNV3; toe of CNAV is its clock time (IS-GPS-200, 30.3.3.1.1).
+#: First numbers of CNAV and of CNV1 to CNV3; CNAV records have no toe, which equals toc (IS-GPS-200, 30.3.3.1.1).
 _ORBIT_4: Final = (
     "af0_s af1 af2 a_dot crs delta_n m0 cuc eccentricity cus sqrt_a {} cic omega0 cis i0 crc omega omega_dot "
     "i_dot delta_n_dot "
@@ -53,8 +53,8 @@ _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
 )
-#: Generous limits of the numbers: clocks within a second; orbits between 10 000 and 70 000 km;
-#: angles within a turn; small angles for harmonic corrections; time within its week.
+#: Limits of plausible numbers: clock biases within a second, semi-major axes of about 10 000 to 70 000 km, angles
+#: within a turn, small harmonic corrections, and times of week within a week.
 _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
     "sqrt_a": (3.1e3, 8.4e3),
     "eccentricity": (0.0, 0.3),
@@ -77,13 +77,13 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
 }
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 _BLANK: Final = float("nan")
-_UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
+_UNKNOWN: Final = 0.99e9  #: Numbers from here to 1.01E9 are unknown; RINEX has 0.9999E9.
 _TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this from toe are invalid [s].
 
 
 @dataclass(frozen=True)
 class RawRecord:
-    """One record of a file: epoch in the time of the constellation, numbers in file order."""
+    """Record of a file, with the epoch in the constellation's time, and numbers in file order."""
 
     system: str
     satellite: str
@@ -94,7 +94,7 @@ class RawRecord:
 
     @property
     def fields(self) -> Sequence[str]:
-        """Names of the numbers."""
+        """Names of the numbers in file order."""
         return list_fields(self.system, self.message)
 
 
@@ -104,7 +104,10 @@ def list_fields(system: str, message: str) -> Sequence[str]:
 
 
 def number(text: str) -> float:
-    """Parse a FORTRAN number; blank and 0.9999E9 are the same NaN object, so that equal records compare equal."""
+    """Parse a FORTRAN number; blank and 0.9999E9 give the same NaN object, so that equal records compare equal.
+
+    ValueError: the text is not a finite number.
+    """
     text = text.strip()
     if not text:
         return _BLANK
@@ -126,7 +129,7 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
 
 
 def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Convert Keplerian records; blank rates, corrections, health and issues are 0, as RINEX defines."""
+    """Convert Keplerian records; blank rates, corrections, health and issues are 0, as defined by RINEX."""
     column = _columns(raw)
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
     system = satellite.astype("<U1")
@@ -134,7 +137,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     of_clock = np.isnan(column["toe_sow_s"])
     column["toe_sow_s"] = np.where(of_clock, to_week(own)[1], column["toe_sow_s"])
     toe = np.where(of_clock, own, nearest_week(column["toe_sow_s"], own))
-    # The week follows from the clock reference time, not from the week number: converted files are 1024 weeks off.
+    # The week follows from the clock reference time, because week numbers of converted files may be wrong by 1024.
     sent_sow = column["transmitted"]
     usable = np.abs(np.where(np.isnan(sent_sow), np.inf, sent_sow)) < 2 * 604_800
     sent = nearest_week(np.where(usable, sent_sow, 0.0), toe)
@@ -142,7 +145,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     beidou = system == "C"
     gps_like = np.isin(system, ["G", "J"])
     integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
-    # The field of IODC is the second group delay of Galileo and BeiDou; BeiDou's AODC is in the field of the fit
+    # The field of IODC has the second group delay for Galileo and BeiDou. BeiDou's AODC is in the field of the fit
     # interval.
     cnv = ~np.isnan(column["iodc"])
     iodc = np.select(
@@ -174,7 +177,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
 
 
 def _columns(raw: Sequence[RawRecord]) -> dict[str, Floats]:
-    """Return the numbers of all records by name, shape (n,) each; NaN where a message does not have one."""
+    """Return the numbers of all records by name, shape (n,) each; NaN where a message lacks the number."""
     names = {name for key, own in FIELDS.items() if key != "R" for name in own}
     column = {name: np.full(len(raw), _BLANK) for name in names}
     layouts: dict[tuple[str, ...], list[int]] = {}
@@ -188,7 +191,7 @@ def _columns(raw: Sequence[RawRecord]) -> dict[str, Floats]:
 
 
 def _ura_m(index: Floats) -> Floats:
-    """Return the nominal value [m] of a URA_ED index, 8192 m for no prediction (IS-GPS-200, 30.3.3.1.1.4)."""
+    """Return the nominal accuracy [m] of a URA_ED index, 8192 m without prediction (IS-GPS-200, 30.3.3.1.1.4)."""
     metres = 2.0 ** np.where(index <= 6, 1.0 + index / 2.0, index - 2.0)
     return np.where((index == 15) | (index == -16), 8192.0, metres)
 
@@ -198,7 +201,7 @@ def _integers(values: Floats) -> Integers:
 
 
 def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satellite: Strings) -> Strings:
-    """Return the messages; before RINEX 4 from the data-source bits of Galileo and the GEO numbers of BeiDou."""
+    """Return the message names; before RINEX 4 they follow from Galileo's data source and BeiDou's GEO numbers."""
     number = np.array([int(s[1:]) for s in satellite.tolist()], dtype=np.int64)
     geo = (number <= 5) | (number >= 59)
     fnav = ((source & 0b010) != 0) & ((source & 0b101) == 0)
@@ -210,7 +213,7 @@ def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satel
 
 
 def _fit_interval(system: Strings, fit: Floats) -> Floats:
-    """Compute the fit interval [h]: GPS in hours (0 means 4, flag 1 means 6), QZSS by flag (0: 2 h, 1: 4 h)."""
+    """Compute the fit interval [h] of GPS (0 means 4 h, 1 means 6 h) and QZSS (0 means 2 h, 1 means 4 h), else NaN."""
     fit = np.nan_to_num(fit)
     gps = np.where(fit == 0, 4.0, np.where(fit == 1, 6.0, fit))
     qzss = np.where(fit == 0, 2.0, np.where(fit == 1, 4.0, fit))
@@ -218,7 +221,7 @@ def _fit_interval(system: Strings, fit: Floats) -> Floats:
 
 
 def glonass_records(raw: Sequence[RawRecord]) -> GlonassRecords:
-    """Convert records of GLONASS: UTC to GPS time, kilometres to metres."""
+    """Convert GLONASS records, with times from UTC to GPS time and lengths from kilometres to metres."""
     table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_GLONASS))
     state = table[:, 3:15].reshape(-1, 3, 4)
     utc = np.array([r.epoch for r in raw], dtype="datetime64[ns]")

@@ -19,7 +19,7 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
 
-UNKNOWN_S: Final = 0.9999e9  #: Values for an unknown transmission time, and for fields of CNV1 that the records lack.
+UNKNOWN_S: Final = 0.9999e9  #: Value of an unknown transmission time, and of CNV1 fields that the records lack.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
 #: Messages of Keplerian records by version.
 _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
@@ -55,14 +55,14 @@ def write_navigation(
     version : {"3.04", "4.02"}
         Version 4 names the message of each record, and has the ionosphere as records.
     comments : sequence of str
-        Each at most 60 characters.
+        Comment lines of at most 60 ASCII characters.
     created : datetime64, optional
-        UTC; blank by default.
+        Date of creation in the header, UTC; blank by default.
 
     Raises
     ------
     ValueError
-        Hatanaka packing, which exists for observations only; a record of an unknown message.
+        `packing` is Hatanaka, which exists for observations only; or the version has no form for a record.
     OutputError
         The file cannot be written.
     """
@@ -111,7 +111,7 @@ def write_navigation(
 
 
 def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04") -> tuple[Navigation, dict[str, int]]:
-    """Return the records that can be written, and counts of the others (CNAV, CNV) by constellation and message."""
+    """Return the records that can be written, and the number of other records by constellation and message."""
     kepler = navigation.kepler
     kept = np.isin(kepler.message, _WRITTEN[version])
     kinds = zip(kepler.satellite[~kept].tolist(), kepler.message[~kept].tolist(), strict=True)
@@ -120,13 +120,13 @@ def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04"
 
 
 def check_messages(records: KeplerRecords, version: RinexVersion) -> None:
-    """Raise ValueError on a record of a message that the version lacks."""
+    """Raise ValueError if the version has no form for the message of a record."""
     if (other := ~np.isin(records.message, _WRITTEN[version])).any():
         raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
 
 
 def _ionosphere_records(navigation: Navigation) -> str:
-    """Klobuchar coefficients as records of version 4 (RINEX 4.02, table A34), dated with the first clock time."""
+    """Return Klobuchar coefficients as records of version 4 (RINEX 4.02, table A34), dated with the first toc."""
     if not len(navigation.kepler):
         return ""
     first = str(_calendar_text(navigation.kepler.toc[:1].min())).strip()
@@ -145,7 +145,7 @@ def _field(values: Floats) -> Strings:
 
 
 def _records(satellite: Strings, time: Datetimes, numbers: Floats) -> Strings:
-    """Format records: satellite, time, three clock fields, then four per line, trailing blank fields omitted."""
+    """Format records: satellite, time, three clock fields, then four fields per line without trailing blanks."""
     text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(numbers.T):
         if i >= 3 and i % 4 == 3:
@@ -163,7 +163,10 @@ def _calendar_text(time: Datetimes) -> Strings:
 
 
 def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Datetimes, Floats]:
-    """Clock time in the constellation's own time, and the numbers of these names (`FIELDS`), shape (n, numbers)."""
+    """Return toc in the constellation's time, and the numbers `names` of `FIELDS`, shape (n, numbers).
+
+    ValueError: a constellation has no Keplerian records in RINEX.
+    """
     letter = records.satellite.astype("<U1")
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
     if unknown.size:
@@ -173,7 +176,7 @@ def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Dateti
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
     toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
     week, sent = _week_and_transmission(records, shift, beidou)
-    # QZSS writes the flag: 0 for two hours, 1 for longer.
+    # For QZSS the flag is written: 0 for two hours, 1 for longer.
     fit = np.where(
         letter == "J",
         np.where(np.isnan(records.fit_interval_h), np.nan, records.fit_interval_h > 2.0),
@@ -195,7 +198,7 @@ def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Dateti
 def _week_and_transmission(
     records: KeplerRecords, shift: NDArray[np.timedelta64], beidou: Masks
 ) -> tuple[Floats, Floats]:
-    """Compute the week of toe in the count of the constellation, and seconds of that week at transmission."""
+    """Compute the constellation's week number of toe, and the seconds of this week at transmission."""
     week, _ = to_week(records.toe + shift)
     origin = np.where(beidou, BDT_EPOCH, GPS_EPOCH)
     # Both counts of weeks begin on a Sunday.
@@ -206,7 +209,7 @@ def _week_and_transmission(
 
 
 def glonass_numbers(records: GlonassRecords) -> tuple[Datetimes, Floats]:
-    """Return the time in UTC, and the numbers in file order (kilometres), shape (n, numbers)."""
+    """Return toe in UTC, and the numbers in file order, lengths in kilometres, shape (n, numbers)."""
     toe, sent = gpst_to_utc(records.toe), gpst_to_utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     position, velocity, acceleration = (

@@ -1,6 +1,6 @@
-"""Observation files of one receiver, RINEX 2, 3 and 4, as `Observations`.
+"""Reader of RINEX 2, 3 and 4 observation files of one receiver.
 
-Reading in pieces and reading at once run through the same code. A broken line stops the reading with an
+Reading in pieces and reading at once use the same code. A broken line stops the reading with an
 `InputFileError`, or with ``broken_lines="count"`` the record, satellite, epoch or rest of the file that it breaks is
 skipped, counted and described in `Observations.problems`. An error in the header that changes how the file is read is
 always raised.
@@ -33,29 +33,29 @@ from railfix.io.rinex.observations_epochs import (
 )
 from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, split_lines
 
-#: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.
+#: Bytes of text in a block: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: A longer line is not RINEX, not even a line filled with zeros by a failing recorder.
+#: Longest accepted line, which is longer than lines that a failing recorder fills with zeros.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
-_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: All other time systems are GPS time.
+_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems equal GPS time.
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Constellations (None: all), times [start_ns, end_ns) since 1970 in GPS time, treatment of broken lines."""
+    """Part of a log to read, and policy for broken lines."""
 
     broken_lines: BrokenLines = "stop"
-    systems: frozenset[str] | None = None
-    start_ns: int = _BEFORE_ALL
-    end_ns: int = int(np.iinfo(np.int64).max)
+    systems: frozenset[str] | None = None  #: Constellation letters, None for all.
+    start_ns: int = _BEFORE_ALL  #: First time, GPS time since 1970.
+    end_ns: int = int(np.iinfo(np.int64).max)  #: End, not included, GPS time since 1970.
 
 
 class BlockReader:
-    """Reader of one file in file order, with its last tag, number of epochs and fraction read.
+    """Reader of one file in file order, with `last_ns`, `epochs` and the fraction `share` of what has been read.
 
-    A cut last record is left out with a note.
+    `last_ns` is the median time of the last block. An incomplete last record is left out, with a note.
     """
 
     def __init__(self, path: FilePath, selection: Selection, *, block_bytes: int = BLOCK_BYTES) -> None:
@@ -109,7 +109,10 @@ class BlockReader:
         return block, not block
 
     def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[Run, RinexHeader, int]:
-        """Read the epochs up to the end of the lines, or to a change of the observation types."""
+        """Read the epochs up to the end of the lines or a change of the observation types.
+
+        Return the epochs, the header after them, and the number of lines read.
+        """
         trial = self._log.fresh()
         table, taken = self._find(lines, header, at_end=at_end, log=trial)
         after = header
@@ -155,7 +158,7 @@ class BlockReader:
             time_ns = _TO_GPST[header.time_system](time_ns.astype("datetime64[ns]")).astype(np.int64)
         self.epochs += len(time_ns)
         if len(time_ns):
-            self.last_ns = int(np.median(time_ns))  # of a block: single tags may be wrong
+            self.last_ns = int(np.median(time_ns))  # the median, because single tags may be wrong
         kept = (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
         epochs, breaks_at, time_ns = epochs[kept], breaks_at[kept], time_ns[kept]
         before = np.diff(breaks_at, prepend=0) > 0
@@ -179,7 +182,7 @@ class BlockReader:
 #: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
-#: The first piece is this fraction of the others.
+#: Length of a piece divided by the length of the first piece.
 _FIRST_PART: Final = 5
 _GAP_INTERVALS: Final = 1.5  #: A step between files is a gap when it is longer than this many intervals.
 
@@ -197,9 +200,9 @@ def scan_observations(
     """Return the observations of one receiver in pieces of at most `epochs` epochs; other arguments as in
     `railfix.read_observations`.
 
-    The first piece is short (`in_pieces`). Each piece has the channels that occur in it; concatenated they are the log.
-    Memory use is one piece and one block of text. `progress` is called repeatedly with the fraction of the files
-    that has been read, 0 to 1.
+    The first piece is shorter (`in_pieces`). Each piece has only the channels that occur in it; the concatenated pieces
+    are the log. Memory use is one piece and one block of text. `progress` is called with the fraction of the files that
+    has been read, 0 to 1.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was requested")
@@ -217,7 +220,10 @@ def scan_observations(
 def _runs(
     paths: list[str], selection: Selection, progress: Callable[[float], None] | None = None
 ) -> Iterator[Observations]:
-    """Yield runs of epochs of all files in order of time; at least one run and one epoch in total."""
+    """Yield runs of epochs of all files in order of time.
+
+    InputFileError: no file has a usable epoch. MismatchError: no epoch is selected, or files are of different runs.
+    """
     firsts = [first_time(path) for path in paths] if len(paths) > 1 else []
     if firsts:
         check_one_run(paths, firsts)
@@ -245,7 +251,7 @@ def _runs(
 def _of_files(
     readers: list[BlockReader], selection: Selection, progress: Callable[[float], None] | None
 ) -> Iterator[Run]:
-    """Yield the runs of files that follow each other, with a break where there is a gap between two."""
+    """Yield the runs of consecutive files, with `break_before` where there is a gap between two files."""
     last: Observations | None = None
     for k, reader in enumerate(readers):
         joint = last is not None
@@ -261,7 +267,7 @@ def _of_files(
             raise InputFileError(reader.path, "has a header but no epochs; the recording is empty or cut short")
 
 
-#: Files of one antenna that are farther apart than this are of two runs.
+#: Files that begin farther apart than this are of different runs.
 LONGEST_GAP: Final = np.timedelta64(7, "D")
 
 
@@ -278,13 +284,13 @@ def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None
 
 
 def first_time(path: str) -> np.datetime64:
-    """Return the time of the first epoch of a file, NaT without any."""
+    """Return the time of the first epoch of a file, NaT without epochs."""
     with closing(BlockReader(path, Selection(broken_lines="count"), block_bytes=_PEEK_BYTES).blocks()) as runs:
         return next((run.epochs.time[0] for run in runs if len(run.epochs)), np.datetime64("NaT", "ns"))
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
-    """Set `break_before` at the first epoch of a further file, unless it follows at the interval of the log."""
+    """Set `break_before` at the first epoch of the next file, unless it follows within 1.5 intervals of the log."""
     if last is None:
         return run
     interval = run.header.interval_s
@@ -299,9 +305,9 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Yield pieces of equal length from runs, the first a fifth of it, so that processing begins early.
+    """Yield pieces of `epochs` epochs from runs; the first piece has a fifth of these, so that processing begins early.
 
-    Problems belong to the piece being collected.
+    Problems are reported in the piece during whose collection they were found.
     """
     waiting: list[Observations] = []
     length, size = 0, -(-epochs // _FIRST_PART)
@@ -330,7 +336,7 @@ def without_empty_channels(observations: Observations) -> Observations:
 
 
 def of_channels(observations: Observations, kept: Masks) -> Observations:
-    """Return some of the channels, shape (M,)."""
+    """Return the observations of the channels `kept`, shape (M,)."""
     arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
     return replace(
         observations,

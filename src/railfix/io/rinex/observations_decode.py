@@ -1,9 +1,9 @@
-"""Decoding of satellite lines to dense arrays over epochs and channels, without loops over either.
+"""Decode satellite lines to dense arrays of epochs by channels, without Python loops over epochs or channels.
 
 Two 64-bit words hold a field of sixteen characters, and eight digits in one integer become their value in three
 multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
 doi:10.1145/360933.360994). The exact integer of thousandths divided by 1000 is the same as ``float(text)``. Fields of
-any other form are read one at a time with `float`.
+other forms are read singly with `float`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Line
 Words = NDArray[np.uint64]
 
 FIELD_WIDTH: Final = 16  #: Number of characters per field.
-#: Blank characters that must follow the last character of a block, so that loads may run over it.
+#: Number of blanks that must follow a block, so that fields can be loaded beyond its end.
 PADDING: Final = 2048
 
 _U = np.uint64
@@ -64,8 +64,9 @@ def read_fields(
 ) -> tuple[Floats, Bytes, Masks]:
     """Return values, loss-of-lock digits and bad fields of n satellite lines by k observation types, shape (n, k).
 
-    A value is NaN where blank or bad, a digit 0 where blank. A field is bad that is neither blank nor a number, or one
-    of whose two indicators is not a digit. `index` and `divisor` (SYS / SCALE FACTOR), shape (k,); rest as `gather`.
+    Values are NaN where blank or bad, and digits are 0 there. A field is bad if it is neither blank nor a number, or if
+    one of its two indicators is neither blank nor a digit. `index` is the field number of each type, and `divisor` its
+    scale factor (SYS / SCALE FACTOR), shape (k,); the other arguments are as in `gather`.
     """
     value, lock, odd = kernels.reading.decode_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
@@ -80,7 +81,7 @@ def read_fields(
 
 
 def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
-    """Read fields of another form: any decimal number that ends at the end of the field."""
+    """Read decimal numbers of any form that end in the last column of the value; return values and wrong fields."""
     value = np.full(len(flat), np.nan)
     wrong = np.ones(len(flat), dtype=np.bool_)
     characters = flat.tobytes().decode("latin-1")
@@ -98,10 +99,10 @@ def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
-#: Satellite names on a RINEX 2 epoch line, and the column of the first one.
+#: Number of satellite names on a RINEX 2 epoch line, and column of the first name.
 NAMES_PER_LINE: Final = 12
 _FIRST_NAME: Final = 32
-#: Observations on a RINEX 2 line.
+#: Number of observations on a RINEX 2 line.
 FIELDS_PER_LINE: Final = 5
 _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
@@ -120,14 +121,14 @@ class DecodedRows:
 
 
 def lines_per_satellite(header: RinexHeader) -> int:
-    """Return the number of observation lines of a satellite: several in RINEX 2, else one."""
+    """Return the number of observation lines per satellite, which is 1 from RINEX 3."""
     return max(-(-len(header.get_types("G") or ()) // FIELDS_PER_LINE), 1) if header.version < 3.0 else 1
 
 
 def decode(
     lines: Lines, epochs: EpochHeads, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> dict[str, Any]:
-    """Decode the observations of epochs (flags 0 and 1) to dense arrays, by their names in `Observations`."""
+    """Decode the observations of epochs (flags 0 and 1) to dense arrays by the field names of `Observations`."""
     rows = _rows(lines, epochs, header)
     rows = _select(lines, rows, header=header, systems=systems, log=log)
     rows = _without_repeats(lines, rows, len(epochs), log)
@@ -167,7 +168,7 @@ def _rows(lines: Lines, epochs: EpochHeads, header: RinexHeader) -> DecodedRows:
 def _select(
     lines: Lines, rows: DecodedRows, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> DecodedRows:
-    """Select rows with a valid name, of a known, selected constellation whose types the header declares."""
+    """Select the rows with a valid satellite name and a known, selected and declared constellation; record others."""
     broken = rows.number < 0
     log.faults(
         SATELLITES,
@@ -210,7 +211,7 @@ def _name(rows: DecodedRows, i: int) -> str:
 
 
 def _without_repeats(lines: Lines, rows: DecodedRows, epochs: int, log: FaultLog) -> DecodedRows:
-    """Keep the first row of a satellite that occurs twice in an epoch."""
+    """Keep only the first row of a satellite that occurs twice in an epoch; record further rows as faults."""
     key = rows.letter.astype(np.int64) * 100 + rows.number
     names, name = _number(key)
     row = np.arange(len(key))
@@ -271,7 +272,7 @@ def _values(
 
 
 def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Masks:
-    """Flag the lines that have non-blank characters after their fields (within one field width)."""
+    """Return which lines have non-blank characters in the 16 columns after their fields."""
     result = np.zeros(len(start), dtype=np.bool_)
     long = np.flatnonzero(length > width)
     if len(long):
@@ -283,7 +284,7 @@ def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Ma
 def _scatter(
     parts: list[tuple[str, DecodedRows, Floats, Bytes, tuple[SignalColumn, ...]]], epochs: int
 ) -> dict[str, Any]:
-    """Fill arrays over epochs and channels; channels without any observation are dropped."""
+    """Fill arrays of epochs by channels; channels without any observation are dropped."""
     satellites: list[str] = []
     signals: list[str] = []
     placed = []

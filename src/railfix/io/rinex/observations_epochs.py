@@ -1,4 +1,4 @@
-"""Search for the epochs of a block of lines."""
+"""Find the epochs in a block of lines, and record faults."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _CONSEQUENCE = {
 
 
 class FaultLog:
-    """Faults of one file; `settle` raises the first one where broken lines stop the reading.
+    """Faults of one file; with `broken_lines` "stop", `settle` raises the first fault.
 
-    A fault of the last line of the file, which is cut where a recording ends, is noted and does not stop it.
+    A fault in the last line of the file, which may be incomplete where a recording ends, is only noted.
     """
 
     def __init__(self, path: str, *, broken_lines: BrokenLines) -> None:
@@ -71,12 +71,12 @@ class FaultLog:
         self._problems += rest
 
     def note(self, message: str) -> None:
-        """Record a fault of records by its complete message."""
+        """Record a broken record, with its complete message."""
         self.count(RECORDS, 1)
         self.remark(message)
 
     def remark(self, message: str) -> None:
-        """Record a deviation from the text of the file, by its complete message."""
+        """Record a deviation from the format that loses no data, with its complete message."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
@@ -97,7 +97,7 @@ class FaultLog:
             self._first = other._first
 
     def settle(self) -> None:
-        """Raise the first fault of the file where broken lines stop the reading."""
+        """Raise the first fault of the file as InputFileError, if `broken_lines` is "stop"."""
         if self.stops and self._first is not None:
             raise InputFileError(self.path, f"{self._first[1]}; {LENIENT}", line=self._first[0])
 
@@ -122,7 +122,7 @@ LABELS: Final = frozenset(
         "PRN / # OF OBS",
     )
 )  # fmt: skip
-#: More lines than the three-digit count of an epoch line allows.
+#: Number of lines that exceeds the largest epoch, whose count has three digits.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
@@ -130,7 +130,10 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
 ) -> tuple[EpochHeads, int]:
-    """Find the complete epochs and events of a block, and their lines; unless `at_end`, the last one is deferred."""
+    """Find the complete epochs and events of a block; return them and the number of lines that were read.
+
+    Unless `at_end`, the last epoch is left for the next block, because it may be incomplete.
+    """
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
     return _find_unmarked(lines, lines_per_satellite=lines_per_satellite, at_end=at_end, log=log)
@@ -180,7 +183,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
 
 
 def _records_after(lines: Lines, head: EpochHeads, room: Integers, log: FaultLog) -> dict[int, tuple[int, int, int]]:
-    """Return header records that follow the lines of an epoch, as events, by the number of the epoch."""
+    """Return header records that follow the lines of an epoch, as events by the index of the epoch."""
     records: dict[int, tuple[int, int, int]] = {}
     for k in np.flatnonzero((head.flaw == 0) & (room > head.count)).tolist():
         first, end = int(head.line[k] + 1 + head.count[k]), int(head.line[k] + 1 + room[k])
@@ -199,7 +202,7 @@ def _counts(records: dict[int, tuple[int, int, int]], epochs: int) -> Integers:
 
 
 def _with_events(epochs: EpochHeads, events: list[tuple[int, int, int]]) -> EpochHeads:
-    """Return epochs with events (line, flag, count) among them."""
+    """Return epochs and events (line, flag, count) in the order of their lines."""
     if not events:
         return epochs
     joined = join_rows([epochs, EpochHeads(*np.array([(*event, 0, 0) for event in events], dtype=np.int64).T)])
@@ -235,7 +238,7 @@ def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log:
 
 
 class _Walk:
-    """Walk from record to record; consecutive epochs without a gap are one step."""
+    """Walk through the records of a RINEX 2 block; consecutive epochs without a gap are one step."""
 
     def __init__(self, lines: Lines, following: Integers, event: Masks, head: EpochHeads, log: FaultLog) -> None:
         self._lines, self._line, self._following, self._event = lines, head.line, following, event
@@ -260,7 +263,7 @@ class _Walk:
         return _with_events(self._head[self._kept], self._events), position
 
     def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
-        """Keep the epochs from the k-th to the first without a successor, and return the line to continue at."""
+        """Keep the epochs from the k-th up to a gap or a broken epoch, and return the line at which to continue."""
         later = self._breaks[np.searchsorted(self._breaks, k) :]
         last = int(later[0]) if len(later) else len(self._line) - 1
         beyond = int(np.searchsorted(self._line, stop))
@@ -310,7 +313,10 @@ class _Walk:
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _header_records(self, position: int, *, at_end: bool) -> int:
-        """Take header records among the epochs as one event; they may continue after the end of the block."""
+        """Add header records among the epochs as one event, and return the line at which to continue.
+
+        Records that may continue after the end of the block are left for the next block.
+        """
         end = position
         while end < len(self._lines) and _is_record(self._lines, end):
             end += 1
@@ -332,6 +338,6 @@ def _no_epoch(lines: Lines, line: int, version: float) -> str:
 
 def _truncate(needed: int, found: int, lines: Lines, line: int) -> str:
     return (
-        f"the file ends in the middle of an epoch: the one of line {lines.number[line]} needs {needed} lines, "
+        f"the file ends in the middle of an epoch: the epoch of line {lines.number[line]} needs {needed} lines, "
         f"{found} are there"
     )

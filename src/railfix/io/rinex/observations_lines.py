@@ -1,9 +1,9 @@
-"""Lines of a block of text, epoch lines, and the signals and observables of RINEX observation types.
+"""Split text into lines, parse epoch lines, and find the signals of RINEX observation types.
 
-RINEX 3 and 4 name the signal themselves ("C1C" is the code of "1C"). RINEX 2 names it by band (RINEX 2.11, table A1;
-RINEX 3.05, tables 4 to 11); L1, D1 and S1 belong to C1's signal where C1 is declared, else to P1's; l2, D2 and S2 to
-P2's where P2 is declared, otherwise to C2's; where no code of the band is declared, to those of C1 and P2. BeiDou of
-RINEX 3.02 calls B1I band 1 ("C1I"): it is read as "2I", as are 1I and 1Q of any version, which have no other meaning.
+In RINEX 3 and 4 a type contains the signal ("C1C" is the code of "1C"). In RINEX 2 a type contains the band (RINEX
+2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 have the signal of C1 if it is declared, otherwise of P1; L2,
+D2 and S2 have the signal of P2 if it is declared, otherwise of C2. Without these codes, they have the signals of C1 and
+P2. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because RINEX 3.02 has B1 as band 1.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Lines:
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block, followed by `PADDING` blanks, into lines; empty ones are kept for RINEX 2."""
+    """Split a block, followed by `PADDING` blanks, into lines; empty lines are kept with `keep_blank` (RINEX 2)."""
     data = np.frombuffer(text, dtype=np.uint8)
     end = kernels.reading.line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
@@ -72,9 +72,10 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 
 @dataclass(frozen=True)
 class EpochHeads:
-    """Epochs and events of a block, shape (n,), `time_ns` in the file's time system (events: 0).
+    """Epoch lines and events of a block, shape (n,).
 
-    Flag and count are -1 where unreadable; `flaw` is an index into `FLAWS`, 0 for a valid line.
+    `time_ns` is in the file's time system since 1970, 0 for events. Flag and count are -1 where unreadable. `flaw` is
+    an index into `FLAWS`, 0 for a valid line.
     """
 
     line: Integers
@@ -107,7 +108,7 @@ _SHORT, _FLAG, _COUNT, _PLACES = 1, 2, 3, 4
 
 
 def epoch_width(version: float) -> int:
-    """Return the number of characters up to the number of satellites."""
+    """Return the length of an epoch line up to and including the number of satellites [characters]."""
     return 35 if version >= 3.0 else 32
 
 
@@ -202,7 +203,7 @@ def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
 
 
 SYSTEMS: Final = "CEGIJRS"  #: Constellation letters of RINEX.
-#: Array of each kind of observable, by the letter before the signal.
+#: Array of `Observations` by the first letter of an observation type.
 KINDS: Final = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
 
 #: Signal of a RINEX 2 code by constellation.
@@ -231,7 +232,7 @@ class SignalColumn:
 
 
 def find_signal(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
-    """Return the signal of an observation type ("C1C", "P2") among all declared; None for X1, T1, I1."""
+    """Return the signal of an observation type ("C1C", "P2"), given all declared types; None for others (X1, T1)."""
     if version >= 3.0:
         if name[0] not in KINDS:
             return None
@@ -254,7 +255,7 @@ def find_signal(name: str, *, system: str, version: float, declared: Sequence[st
 def assign_columns(
     declared: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
 ) -> tuple[SignalColumn, ...]:
-    """Return the columns of a constellation; of two types with the same meaning the first."""
+    """Return the columns of a constellation; of several types with the same meaning only the first."""
     columns: dict[tuple[int, str], SignalColumn] = {}
     for index, name in enumerate(declared):
         signal = find_signal(name, system=system, version=version, declared=declared)

@@ -1,4 +1,4 @@
-"""Writer of RINEX 3.04 and 4.02 observation files (tables A2, A3), and packing: equal arrays give equal bytes."""
+"""Writer of RINEX 3.04 and 4.02 observation files (tables A2, A3), plain or packed; equal arrays give equal bytes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CRX_HEADER_BYTES: Final = 162
 
 
 def detect_packing(path: FilePath) -> Packing:
-    """Return the packing by file name: ``front.crx.gz``, ``log.26d``, ``nav.rnx.gz``, ``log.rnx``."""
+    """Return the packing that a file name implies: ``front.crx.gz``, ``log.26d``, ``nav.rnx.gz``, ``log.rnx``."""
     name = Path(path).name
     inner = name.removesuffix(".gz")
     packing = ("crx" if _HATANAKA_NAME.search(inner) else "", "gz" if inner != name else "")
@@ -41,7 +41,10 @@ def detect_packing(path: FilePath) -> Packing:
 
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
-    """Open a stream, compressed as requested or by the file name; the file appears at the end without error."""
+    """Open a stream to a file, packed as requested or by the file name; the file is created only without an error.
+
+    ValueError: the packing is unknown. OutputError: the text cannot be compressed.
+    """
     kind = detect_packing(path) if packing is None else packing
     if kind not in get_args(Packing):
         raise ValueError(f"packing {kind!r} is unknown; expected one of {', '.join(get_args(Packing))}")
@@ -57,7 +60,7 @@ def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[I
 
 @contextmanager
 def _hatanaka(path: FilePath, sink: IO[bytes]) -> Iterator[IO[bytes]]:
-    """Open a stream that `rnx2crx` of the `hatanaka` package compresses into `sink`."""
+    """Open a stream that is compressed into `sink` by `rnx2crx` of the `hatanaka` package."""
     with (
         hatanaka_program("rnx2crx") as program,
         tempfile.TemporaryFile(prefix="railfix-") as packed,
@@ -95,7 +98,7 @@ PROGRAM = "railfix"
 
 
 def header_line(text: str, label: str) -> str:
-    """Format one header record of 80 columns with its line end; ValueError for more than 60 characters or no ASCII."""
+    """Format one header record of 80 columns with its line end; ValueError: not ASCII of at most 60 characters."""
     if len(text) > 60 or not text.isascii():
         raise ValueError(f"{label}: {text!r} is not ASCII of at most 60 characters")
     return f"{text:<60}{label:<20}\n"
@@ -108,7 +111,7 @@ def program_line(created: np.datetime64 | None) -> str:
 
 
 _BLOCK_EPOCHS: Final = 1024  #: Epochs formatted at once.
-#: Bytes of an epoch line with its line end, and of one observation (F14.3, LLI, SSI).
+#: Bytes of an epoch line with its line end, and of an observation (F14.3, LLI, SSI).
 _EPOCH_WIDTH: Final = 36
 _FIELD_WIDTH: Final = 16
 _BLANK: Final = ord(" ")
@@ -132,8 +135,8 @@ def write_observations(
     Parameters
     ----------
     observations : Observations, or iterable of them
-        A log, or its pieces in order of time. An epoch without observations is written with 0
-        satellites, NaN as blank, `break_before` as epoch flag 1.
+        A log, or its pieces in order of time. An epoch without observations is written with 0 satellites. NaN is
+        written as blank, and `break_before` as epoch flag 1.
     path : path-like
     packing : {"plain", "gz", "crx", "crx.gz"}, optional
         By default from the file name: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
@@ -142,16 +145,16 @@ def write_observations(
         Columns of each constellation (``{"G": ["C1C", "L1C"]}``). By default C, L, D and S of every
         signal of the first piece.
     header : ObservationHeader, optional
-        By default that of the first piece.
+        Header to write, by default the header of the first piece.
     comments : sequence of str
-        Each at most 60 characters.
+        Comment lines of at most 60 ASCII characters.
     created : datetime64, optional
-        UTC; blank by default.
+        Date of creation in the header, UTC; blank by default.
 
     Raises
     ------
     ValueError
-        No epoch; a time tag finer than 100 ns; a value too large for F14.3; a channel that has no column.
+        There is no epoch, a time tag is finer than 100 ns, a value is too large for F14.3, or a channel has no column.
     OutputError
         The file cannot be written.
     """
@@ -239,7 +242,7 @@ def _glonass_slots(channels: Mapping[str, int]) -> list[str]:
 
 @dataclass(frozen=True)
 class _WrittenRows:
-    """Satellites of one constellation, and the channel of each of their columns."""
+    """Satellites of one constellation, with the channel of each column."""
 
     satellites: tuple[str, ...]
     columns: tuple[str, ...]
@@ -274,7 +277,7 @@ def _text_blocks(piece: Observations, columns: Mapping[str, Sequence[str]]) -> I
 
 
 def _satellite_lines(part: Observations, row: _WrittenRows) -> tuple[Bytes, Masks]:
-    """Format the lines of one constellation, shape (T, S, width), and flag the bytes to write."""
+    """Format the lines of one constellation, shape (T, S, width); return them, and which bytes are to be written."""
     epochs, satellites, width = len(part), len(row.satellites), 3 + _FIELD_WIDTH * len(row.columns) + 1
     text = np.full((epochs, satellites, width), _BLANK, dtype=np.uint8)
     text[:, :, :3] = np.array(row.satellites, dtype="S3").view(np.uint8).reshape(satellites, 3)
@@ -302,7 +305,7 @@ def _format_f14_3(value: Floats) -> Bytes:
     present = np.isfinite(value)
     thousandths = np.rint(np.abs(np.where(present, value, 0.0)) * 1e3).astype(np.int64)
     negative = present & (value < 0) & (thousandths > 0)
-    # Ten digits before the point, nine of them after a sign.
+    # F14.3 has ten digits before the point, or nine after a sign.
     if (thousandths >= np.where(negative, 10**12, 10**13)).any():
         raise ValueError("a value has too many digits for the F14.3 of RINEX")
     high, low = np.divmod(thousandths, 10**8)
