@@ -43,10 +43,10 @@ def test_satellites_and_constellations(log: Observations) -> None:
     with pytest.raises(KeyError, match="no G99 among the satellites"):
         log[:5, "G99"]
     for bound in ("noon", "2024-03-05T03:11:00Z", "03:11:00+09:00", datetime(2024, 3, 5, 3, 11, tzinfo=UTC), 0.5):
-        with pytest.raises(KeyError, match="is no GPS time"):
+        with pytest.raises(KeyError, match="is not a GPS time"):
             log[bound:]  # type: ignore[misc]
     for rows in ("G06", 5, [1, 2]):
-        with pytest.raises(KeyError, match=r"is no range of epochs, such as log\[10:20\]"):
+        with pytest.raises(KeyError, match=r"is not a range of epochs, such as log\[10:20\]"):
             log[rows]  # type: ignore[index]
 
 

@@ -1,7 +1,7 @@
 """Broadcast and precise ephemerides as read-only arrays.
 
-One row of a record table is one navigation message of one satellite. All times are GPS time.
-Units follow the interface documents (SI, radians). Absent is NaN (NaT for times).
+Each row of a record table is one navigation message of one satellite. All times are GPS time. Units are SI units and
+radians. Absent values are NaN, or NaT for times.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ class KeplerRecords(_NavigationRecords):
     #: Clock and ephemeris reference times, GPS time. The week is resolved from toc; shape (n,).
     toc: Datetimes
     toe: Datetimes
-    #: Transmission time of the message; NaT where the file has none (or the 0.9999e9 of RINEX); shape (n,).
+    #: Transmission time of the message; NaT where the file has none or an implausible time; shape (n,).
     transmitted: Datetimes
     #: Clock polynomial [s, s/s, s/s^2]; shape (n,).
     af0_s: Floats
     af1: Floats
     af2: Floats
-    #: [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s]; shape (n,).
+    #: Orbit elements at toe [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s]; shape (n,).
     sqrt_a: Floats
     eccentricity: Floats
     m0: Floats
@@ -66,7 +66,7 @@ class KeplerRecords(_NavigationRecords):
     omega: Floats
     omega_dot: Floats
     i_dot: Floats
-    #: Rates of the semi-major axis and of delta_n; 0 in the messages that have none; shape (n,) [m/s, rad/s^2].
+    #: Rates of the semi-major axis and of delta_n; 0 in messages without rates; shape (n,) [m/s, rad/s^2].
     a_dot: Floats
     delta_n_dot: Floats
     #: Harmonic corrections [rad, rad, m, m, rad, rad]; shape (n,).
@@ -76,18 +76,18 @@ class KeplerRecords(_NavigationRecords):
     crs: Floats
     cic: Floats
     cis: Floats
-    #: Toe as seconds of the constellation's own week (BDT for BeiDou): enters the node's longitude; shape (n,).
+    #: Toe in seconds of the constellation's own week (BDT for BeiDou), for the longitude of the node; shape (n,).
     toe_sow_s: Floats
-    #: As broadcast: GPS/QZSS SV health (CNAV: L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS); shape (n,).
+    #: Broadcast health: GPS/QZSS SV health (CNAV: L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS); shape (n,).
     health: Integers
-    #: URA or SISA as written; nominal value of the URA_ED index of CNAV, NaN for CNV1 to CNV3; shape (n,).
+    #: URA or SISA as written; nominal value of the URA_ED index for CNAV, NaN for CNV1 to CNV3; shape (n,).
     accuracy_m: Floats
-    #: Issue of data (IODnav of Galileo in both; AODE and AODC of BeiDou); shape (n,).
+    #: Issues of ephemeris and clock; IODnav in both for Galileo, AODE and AODC for BeiDou D1 and D2; shape (n,).
     iode: Integers
     iodc: Integers
     data_source: Integers  #: Data sources of Galileo, codes on L2 of GPS and QZSS; 0 for BeiDou; shape (n,).
-    #: GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2, of CNV1 and CNV2 TGD_B1Cp and
-    #: TGD_B2ap, of CNV3 TGD_B2bI and NaN; shape (n,).
+    #: Group delays, shape (n,). GPS and QZSS: TGD and NaN. Galileo: BGD E5a/E1 and BGD E5b/E1. BeiDou: TGD1 and TGD2
+    #: of D1 and D2, TGD_B1Cp and TGD_B2ap of CNV1 and CNV2, TGD_B2bI and NaN of CNV3.
     group_delay_1_s: Floats
     group_delay_2_s: Floats
     #: Inter-signal corrections: GPS/QZSS L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P; BeiDou B1C_D and B2a_D; NaN elsewhere;
@@ -102,11 +102,11 @@ class GlonassRecords(_NavigationRecords):
     """State-vector records of GLONASS, n rows."""
 
     satellite: Strings  #: Shape (n,).
-    toe: Datetimes  #: Reference time, UTC of the message turned into GPS time; shape (n,).
+    toe: Datetimes  #: Reference time, converted from UTC to GPS time; shape (n,).
     transmitted: Datetimes  #: Message frame time, GPS time; NaT when absent; shape (n,).
-    clock_bias_s: Floats  #: -tau_n, the correction to be added (as RINEX writes it); shape (n,).
+    clock_bias_s: Floats  #: -tau_n, the correction to be added, as in RINEX; shape (n,).
     relative_frequency: Floats  #: +gamma_n, shape (n,).
-    #: PZ-90, metres (RINEX writes kilometres); the acceleration is the luni-solar part; shape (n, 3).
+    #: State at toe in PZ-90; the acceleration is the luni-solar part only; shape (n, 3).
     position_ecef_m: Floats
     velocity_ecef_mps: Floats
     acceleration_ecef_mps2: Floats
@@ -123,7 +123,7 @@ class PreciseEphemeris(NotebookTable):
     satellite: Strings  #: Shape (N,).
     position_ecef_m: Floats  #: NaN where the file has none (0.000000), shape (E, N, 3).
     clock_s: Floats  #: NaN where the file has none (999999.999999), shape (E, N).
-    source: str = ""  #: The files it was read from.
+    source: str = ""  #: Names of the files.
     notes: tuple[str, ...] = ()  #: Omitted records, with reasons.
 
     def __post_init__(self) -> None:
@@ -142,19 +142,19 @@ class PreciseEphemeris(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Navigation(NotebookTable):
-    """Content of navigation files. Compared and hashed by identity, so that derived tables can be cached."""
+    """Content of navigation files; compared and hashed by identity, so that derived tables can be cached."""
 
     kepler: KeplerRecords
     glonass: GlonassRecords
-    #: Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received, shape (8,). All-zero
-    #: coefficients mean "not received": they are left out, and `notes` records it.
+    #: Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received, shape (8,). Coefficients
+    #: that are all zero were not received, and are left out with a note.
     klobuchar: Mapping[str, Floats] = field(default_factory=dict)
     leap_seconds: int | None = None  #: GPST - UTC [s] from the header.
     #: Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").
     skipped: Mapping[str, int] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()  #: Remarks for the user (no ionosphere, week resolved from the clock time).
-    precise: PreciseEphemeris | None = None  #: When given, used in place of the broadcast orbits and clocks.
-    sources: tuple[str, ...] = ()  #: The files it was read from.
+    notes: tuple[str, ...] = ()  #: Remarks for the user, such as on rejected records.
+    precise: PreciseEphemeris | None = None  #: Ephemeris that replaces the broadcast orbits and clocks, if any.
+    sources: tuple[str, ...] = ()  #: Names of the files.
 
     def __repr__(self) -> str:
         satellite = np.concatenate([self.kepler.satellite, self.glonass.satellite])
@@ -166,6 +166,6 @@ class Navigation(NotebookTable):
 
 @lru_cache(maxsize=8)
 def glonass_channels(navigation: Navigation) -> dict[str, int]:
-    """Return the GLONASS channels by records, for logs whose header lacks GLONASS SLOT / FRQ #."""
+    """Return the GLONASS frequency channel by satellite, for logs whose header lacks GLONASS SLOT / FRQ #."""
     records = navigation.glonass
     return dict(zip(records.satellite.tolist(), records.frequency_channel.tolist(), strict=True))

@@ -1,7 +1,6 @@
 """Observations of one receiver as read-only arrays, and carrier frequencies.
 
-Axis 0 is time, axis 1 the *channel*: one satellite on one signal, so nothing is padded for signals that a constellation
-does not have. Absent is NaN; 0 is a value.
+Axis 0 is time, and axis 1 is the channel, which is one satellite on one signal. Absent values are NaN; 0 is a value.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ def carrier_frequency_hz(
     Parameters
     ----------
     satellite, signal : ndarray of str, shape (M,)
-        "R05" on "1C".
+        Names such as "R05", and signals such as "1C".
     glonass_channel : mapping of str to int, optional
         Frequency channel of GLONASS satellites.
 
     Returns
     -------
     ndarray, shape (M,) [Hz]
-        NaN where the band is not one of the constellation's, or a GLONASS channel is unknown.
+        NaN where the constellation has no such band, or a GLONASS channel is unknown.
     """
     channels = np.array([(glonass_channel or {}).get(name, np.nan) for name in satellite.tolist()], dtype=np.float64)
     return frequency_by_name_hz(np.char.add(satellite.astype("<U1"), signal), channels)
@@ -63,14 +62,14 @@ MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; fu
 class ObservationHeader:
     """Header of an observation log."""
 
-    version: float = float("nan")  #: RINEX version, NaN when the log is no RINEX file.
+    version: float = float("nan")  #: RINEX version, NaN if the log is not a RINEX file.
     marker: str = ""
     #: Receiver type and antenna type, as written.
     receiver: str = ""
     antenna: str = ""
-    #: APPROX POSITION XYZ; NaN when absent or all zero; shape (3,).
+    #: APPROX POSITION XYZ [m], NaN if absent or all zero; shape (3,).
     approximate_ecef_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
-    #: Antenna height, east and north eccentricity; shape (3,).
+    #: Antenna height, and eccentricities east and north [m]; shape (3,).
     antenna_delta_hen_m: Floats = field(default_factory=lambda: np.zeros(3))
     interval_s: float = float("nan")  #: INTERVAL [s], NaN when absent.
     #: Frequency channels of GLONASS satellites ("R05" -> 1).
@@ -97,11 +96,11 @@ class Observations(NotebookTable):
     doppler_hz: Floats  #: Positive when the satellite approaches, shape (T, M).
     cn0_dbhz: Floats  #: Carrier-to-noise density; NaN where only the RINEX 1-9 digit exists; shape (T, M).
     loss_of_lock: Bytes  #: RINEX loss-of-lock indicator of the phase, 0 where blank or absent; shape (T, M).
-    #: True where epochs must not be differenced with the one before: power failure (epoch flag 1), new site or moving
-    #: antenna (2, 3), start of another file after a gap; shape (T,).
+    #: Whether an epoch must not be differenced with the previous epoch: after a power failure (epoch flag 1), at a new
+    #: site or with a moving antenna (2, 3), or at the start of another file after a gap; shape (T,).
     break_before: Masks
-    #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 without one, or the log has no such
-    #: message; shape (T,).
+    #: Interference indicated by the receiver: 1 jamming, 2 spoofing, 3 both, 0 if none or without such a message;
+    #: shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     #: Front-end gain, in the receiver's unit; NaN where the log does not have it; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
@@ -149,9 +148,9 @@ class Observations(NotebookTable):
     def __getitem__(self, key: slice | tuple[slice, str | Sequence[str]]) -> Observations:
         """Select epochs (a view), or epochs and satellites: ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
 
-        Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day from the log's
-        first epoch on. As with numbers, the upper bound is not included in the range. Satellites are names ("G06") or
-        constellations ("G"), one or several.
+        Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day, which is taken
+        on the day of the first epoch or after midnight. The upper bound is not included. Satellites are names ("G06")
+        or constellations ("G"), one or several.
 
         Raises
         ------
@@ -160,7 +159,7 @@ class Observations(NotebookTable):
         """
         rows, names = key if isinstance(key, tuple) else (key, None)
         if not isinstance(rows, slice):
-            raise KeyError(f"{rows!r} is no range of epochs, such as log[10:20]; satellites are log[:, 'G01']")
+            raise KeyError(f"{rows!r} is not a range of epochs, such as log[10:20]; satellites are log[:, 'G01']")
         start, stop = (
             bound if bound is None or hasattr(bound, "__index__") else self._epoch_at(bound)
             for bound in (rows.start, rows.stop)
@@ -179,7 +178,7 @@ class Observations(NotebookTable):
         return part
 
     def _epoch_at(self, bound: str | datetime | np.datetime64) -> int:
-        """Return the number of the first epoch at or after a time."""
+        """Return the number of the first epoch at or after a time; KeyError: the bound is not a time."""
         text = str(bound).replace(" ", "T")
         try:
             if "-" in text or not len(self):
@@ -189,11 +188,11 @@ class Observations(NotebookTable):
                 time = gps_time(f"{day}T{text}")
                 time += np.timedelta64(1, "D") if time < self.time[0] - np.timedelta64(12, "h") else np.timedelta64(0)
         except ValueError:
-            raise KeyError(f"{bound!r} is no GPS time; expected hh:mm, hh:mm:ss or yyyy-mm-ddThh:mm:ss") from None
+            raise KeyError(f"{bound!r} is not a GPS time; expected hh:mm, hh:mm:ss or yyyy-mm-ddThh:mm:ss") from None
         return int(np.searchsorted(self.time, time))
 
     def _find_channels(self, names: Sequence[str]) -> Indices:
-        """Return the channels of satellites or constellations."""
+        """Return the channels of satellites or constellations; KeyError: one of them is absent."""
         found = np.zeros(len(self.satellite), dtype=np.bool_)
         for name in names:
             own = (self.system if len(name) == 1 else self.satellite) == name
@@ -207,7 +206,7 @@ def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
     """Return which channels have an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
-        used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch shows it for nearly all channels
+        used |= ~np.isnan(array[:1]).all(axis=0)  # nearly all channels have data in the first epoch
         rest = np.flatnonzero(~used)
         used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
     rest = np.flatnonzero(~used)

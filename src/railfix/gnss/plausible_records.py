@@ -1,7 +1,7 @@
-"""Reject navigation records that describe no orbit of their constellation.
+"""Reject navigation records with an orbit that is implausible for their constellation.
 
-A record with another satellite's orbit, with exchanged coordinates or with reference times that do not belong together
-gives ranges that are wrong by hundreds of metres to thousands of kilometres, and looks healthy.
+A record with another satellite's orbit, with exchanged coordinates or with unrelated reference times causes range
+errors of hundreds of metres to thousands of kilometres, although it is marked healthy.
 """
 
 from __future__ import annotations
@@ -17,27 +17,28 @@ from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 
-#: Semi-major axes [m]: medium orbits of GPS, Galileo (E14 and E18 at 27,978 km) and BeiDou; geosynchronous orbits of
-#: BeiDou and QZSS. Of 2,104 broadcast records of ten days from 2005 to 2025 one is outside: a QZSS orbit under the
-#: number of a GPS satellite (`tests/gnss/test_plausible_records.py`).
+#: Limits of semi-major axes [m]: medium orbits of GPS, Galileo (E14 and E18 at 27,978 km) and BeiDou; geosynchronous
+#: orbits of BeiDou and QZSS. Of 2,104 broadcast records of ten days from 2005 to 2025 one is outside: a QZSS orbit
+#: under the number of a GPS satellite (`tests/gnss/test_plausible_records.py`).
 _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "G": ((26.2e6, 26.9e6),),
     "E": ((27.7e6, 28.3e6), (29.3e6, 29.9e6)),
     "C": ((27.5e6, 28.3e6), (41.8e6, 42.5e6)),
     "J": ((41.8e6, 42.5e6),),
 }
-#: Largest eccentricities: GPS by IS-GPS-200 (20.3.3.4.1), E14 and E18 0.17, QZSS 0.075.
+#: Largest eccentricities, for GPS by IS-GPS-200 (20.3.3.4.1). E14 and E18 have 0.17, and QZSS satellites have 0.075.
 _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "J": 0.12}
-#: Radii of GLONASS, and semi-major axes by position and velocity [m]; 25,416 to 25,602 km in those records.
+#: Limits of GLONASS radii, and of semi-major axes from position and velocity [m]; 25,416 to 25,602 km in the 2,104
+#: records.
 _GLONASS_M: Final = (25.3e6, 25.7e6)
-#: Reference times of orbit and clock of one record, equal in all of these 2,104.
+#: Largest difference of the reference times of orbit and clock of a record; they are equal in the 2,104 records.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0
 _EARTH_GM: Final = 3.986004418e14  #: [m^3/s^2].
 _NAMES: Final = {"G": "GPS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "R": "GLONASS"}
 
 
 def plausible_navigation(navigation: Navigation) -> Navigation:
-    """Return the navigation data without implausible records, each kind of them counted and described in a note."""
+    """Return the navigation data without implausible records, which are counted and described in notes."""
     kepler, glonass = navigation.kepler, navigation.glonass
     causes = {
         "toe and toc differ by more than 5 min": (kepler, unrelated_times(kepler)),
@@ -73,12 +74,12 @@ def _notes(satellite: Strings, cause: str) -> list[str]:
 
 
 def unrelated_times(records: KeplerRecords) -> Masks:
-    """Return the records whose toe and toc differ by more than `LARGEST_TIME_DIFFERENCE_S`, shape (n,)."""
+    """Return whether toe and toc of each record differ by more than `LARGEST_TIME_DIFFERENCE_S`, shape (n,)."""
     return np.asarray(np.abs(seconds(records.toe - records.toc)) > LARGEST_TIME_DIFFERENCE_S)
 
 
 def plausible_kepler(records: KeplerRecords) -> Masks:
-    """Return the records whose semi-major axis and eccentricity are plausible for their constellation, shape (n,)."""
+    """Return whether semi-major axis and eccentricity of each record fit its constellation, shape (n,)."""
     axis, letter = records.sqrt_a**2, records.satellite.astype("<U1")
     fine = np.zeros(len(records), dtype=np.bool_)
     for name, limits in _AXES_M.items():
@@ -88,7 +89,7 @@ def plausible_kepler(records: KeplerRecords) -> Masks:
 
 
 def plausible_glonass(records: GlonassRecords) -> Masks:
-    """Return the records with a radius and (energy integral) semi-major axis of GLONASS, shape (n,)."""
+    """Return whether radius and semi-major axis (energy integral) of each record fit GLONASS, shape (n,)."""
     position = records.position_ecef_m
     turning = EARTH_ROTATION_RATE * np.stack([-position[:, 1], position[:, 0], np.zeros(len(position))], axis=1)
     radius = np.linalg.norm(position, axis=1)
@@ -100,7 +101,10 @@ def plausible_glonass(records: GlonassRecords) -> Masks:
 
 
 def plausible_radius(satellite: Strings, position_ecef_m: Floats) -> Masks:
-    """Return the positions, shape (..., N, 3), at a radius of their constellation's orbits, shape (..., N)."""
+    """Return whether the radius of each position (..., N, 3) fits the constellation's orbits, shape (..., N).
+
+    Positions of other constellations are accepted.
+    """
     radius = np.linalg.norm(position_ecef_m, axis=-1)
     fine = np.ones(radius.shape, dtype=np.bool_)
     letter = satellite.astype("<U1")

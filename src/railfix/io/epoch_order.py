@@ -1,6 +1,4 @@
-"""Sort the epochs of one receiver by time: slightly late epochs are sorted in, epochs with equal time tags merged, and
-epochs with wrong time tags rejected.
-"""
+"""Sort the epochs of a receiver by time, merge epochs with equal time tags, and reject epochs with wrong time tags."""
 
 from __future__ import annotations
 
@@ -180,7 +178,7 @@ def _where(path: str, line: int) -> str:
 
 
 def _passed(time: Datetimes) -> tuple[Integers, Integers]:
-    """Return for each epoch the numbers of preceding epochs with later tags and of following ones with earlier tags."""
+    """Return the numbers of preceding epochs with later tags, and of following epochs with earlier tags, per epoch."""
     reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
     passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
     for step in range(1, reach + 1):

@@ -27,7 +27,7 @@ _OTHER_LINES, _UNCHECKED = (
 )
 #: A geoid separation of 0 is reported as doubtful where the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 2.0
-#: RTKLIB's quality (`position_log.PositionLog`) by GGA's quality (NMEA 0183 4.10, field 6); others become 0.
+#: RTKLIB's quality (`position_log.PositionLog`) by GGA's quality (NMEA 0183 4.10, field 6); further qualities become 0.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 
 

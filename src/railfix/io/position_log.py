@@ -102,7 +102,7 @@ def skip_broken(
 
 
 def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> PositionLog:
-    """Parse the positions in a table with named columns; `columns` as in `read_positions`, errors as below."""
+    """Parse the positions in a table with named columns; `columns` are as in `read_positions`."""
     table = rename_columns(parse_named_columns(lines, path), columns, known=(*CSV_COLUMNS, *OTHER_COLUMNS))
     return positions_of_table(table)
 

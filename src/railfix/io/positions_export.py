@@ -55,7 +55,7 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return the path of the QGIS style to write for a file; None if the format has no such style or it exists."""
+    """Return the path of the QGIS style to write for a file; None if the format has none or it is there."""
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
         return None

@@ -94,7 +94,7 @@ def get_times(table: pl.DataFrame) -> Datetimes:
 
 
 def get_column(table: pl.DataFrame, name: str) -> NDArray[Any]:
-    """Return a column of a table; empty cells are 0 in integer columns and NaN in others; NaN if it is absent."""
+    """Return a column of a table; empty cells are 0 in integer columns and NaN otherwise; an absent column is NaN."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     if name in _NAMES:

@@ -1,10 +1,9 @@
-"""Reference positions of one run: fixes are checked and matched to the track, gaps are bridged.
+"""Build the reference positions of a run: check fixes, match them to the track, and bridge gaps.
 
 1. The positions of each antenna are checked separately, in pairs, and against the track (`fixes`).
-2. The Dopplers are solved for the speed along the track at the current positions, which are interpolated between fixes
-   at first, and smoothed in the next rounds. 3. The distance between fixes is compared with the distance travelled;
-   fixes that disagree are rejected.
-4. Everything together is smoothed (`smoother`); 2 and 4 are repeated.
+2. The Dopplers are solved for the speed along the track at positions interpolated between fixes.
+3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
+4. The Dopplers are solved and all measurements are smoothed (`smoother`), repeatedly at the smoothed positions.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Across a longer time between two speeds the distance is unknown [s], with this variance [m2].
+#: Longest interval between speeds across which distance is known [s], and variance across longer intervals [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
 
@@ -54,7 +53,10 @@ class Speeds:
     sigma_mps: Floats
 
     def way(self, time: Datetimes) -> tuple[Floats, Floats]:
-        """Return the distance travelled (trapezoidal rule) [m] and its variance by white noise [m2]; NaN outside."""
+        """Return the distance travelled up to each time (trapezoidal rule) [m] and its variance by white noise [m2].
+
+        Both are NaN outside the time span of the speeds.
+        """
         if len(self.time) < 2:
             return np.full(len(time), np.nan), np.full(len(time), np.nan)
         known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
@@ -72,7 +74,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where missing."""
+    """Return the mean speed of all sources weighted by inverse variances, and its sigma, shapes (N,); NaN if none."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
@@ -86,7 +88,7 @@ def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, 
 
 SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]  #: Doppler speeds and their solution, by antenna.
 
-_ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first assumes constant speed between the fixes.
+_ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first assumes a constant speed between fixes.
 _MOVED: Final = 4.0  #: Fixes determine the direction of travel when they are this many standard deviations apart.
 _TELLING: Final = 2.0  #: Closing errors below this many standard deviations are within the noise.
 
@@ -97,26 +99,24 @@ class ReferenceData:
 
     logs: Mapping[str, PositionLog]  #: Positions by antenna, front, rear or both.
     trajectories: Mapping[str, Trajectory]  #: Trajectories of these antennas, and of the antennas of `dopplers`.
-    dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: By antenna; may be empty.
+    dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: Dopplers by antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
-    facing: int = 1  #: 1 where the vehicle's front points to rising chainage.
-    distance_m: float = float("nan")  #: Between the two antennas on the body; NaN where the body is not known.
+    facing: int = 1  #: 1 if the vehicle's front faces rising chainage, otherwise -1.
+    distance_m: float = float("nan")  #: Distance between the two antennas on the vehicle, NaN if unknown.
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
-    """Return the reference positions of every antenna that has a log of positions.
+    """Return the reference positions of every antenna that has a position log.
 
-    NoPositionError: when there are fewer than two good fixes. MismatchError: when there are two logs of positions
-    without the distance between the antennas, or pulses or accelerations from another time.
+    NoPositionError: an antenna has fewer than two good fixes. MismatchError: there are two position logs without a
+    distance between the antennas, or pulses or accelerations are from another time.
     """
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
     if len(judged) == 2:
         if not np.isfinite(data.distance_m):
-            raise MismatchError(
-                "two logs of positions need the vehicle's antennas to check their distance; name a vehicle"
-            )
+            raise MismatchError("two position logs need the vehicle's antennas to check their distance; name a vehicle")
         others = reversed(list(judged.values()))
         judged = {
             name: judge_pair(fixes, other, data.distance_m, settings)
@@ -126,14 +126,14 @@ def build_references(data: ReferenceData, settings: ReferenceSettings | None = N
 
 
 class _ReferenceBuilder:
-    """Computation of the reference of one antenna."""
+    """Builder of the reference of one antenna."""
 
     def __init__(self, name: str, data: ReferenceData, settings: ReferenceSettings) -> None:
         self.name, self.data, self.settings = name, data, settings
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """From checked fixes to the reference."""
+        """Return the reference from fixes that were checked separately and in pairs."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
@@ -177,7 +177,7 @@ class _ReferenceBuilder:
         fixes: Fixes,
         settings: ReferenceSettings,
     ) -> Floats:
-        """Return the closing error of each gap in standard deviations of the best sensor; 1 where there are too few."""
+        """Return the closing error of each gap in standard deviations of the best sensor, 1 if within the noise."""
         good = fixes.good
         fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])
         variance = np.full(len(moved), np.inf)
@@ -202,7 +202,7 @@ class _ReferenceBuilder:
     def _calibrate(
         self, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes
     ) -> tuple[ReferenceSettings, dict[str, Any]]:
-        """Return the settings with sensor errors estimated from the log's own fixes, and the source of each value."""
+        """Return the settings with sensor errors estimated from the fixes, and the source of each value."""
         settings, sources, good = self.settings, {}, fixes.good
         joined = self._join(speeds)
         if len(joined.time) > 1:
@@ -238,7 +238,7 @@ class _ReferenceBuilder:
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
-        """Dopplers usable on this antenna's path: its own, and the other antenna's on the same vehicle."""
+        """Return the Dopplers usable on this antenna's path, including the other antenna's on the same vehicle."""
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 
@@ -258,7 +258,7 @@ class _ReferenceBuilder:
         return speeds_of
 
     def _join(self, speeds: SolvedSpeeds) -> Speeds:
-        """Return all receivers' speeds as one; empty without any."""
+        """Return the combined speeds of all receivers, empty if there are none."""
         own = [part for part, _ in speeds.values()]
         time = np.unique(np.concatenate([np.empty(0, dtype="datetime64[ns]"), *(part.time for part in own)]))
         if len(own) > 1:
@@ -269,7 +269,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by wheel if available, else by Dopplers."""
+        """Return the distance travelled up to each time and its variance, by wheel if available, else by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
@@ -280,7 +280,7 @@ class _ReferenceBuilder:
         return way, white + lasting
 
     def _hint(self, time: Datetimes, joined: Speeds, fixes: Fixes) -> Floats:
-        """Return speeds that determine the wheel's direction: Dopplers, else close consecutive fixes."""
+        """Return speeds that determine the wheel's direction, from Dopplers, else from close consecutive fixes."""
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))
@@ -336,7 +336,7 @@ class _ReferenceBuilder:
         smoothed: SmoothedReference,
         sources: Mapping[str, Mapping[str, Any]],
     ) -> dict[str, Any]:
-        """Return the estimated parameters as plain values."""
+        """Return the estimated parameters, as plain values for ``reference.json``."""
         facts: dict[str, Any] = {"doppler": None, "pulses": None, "acceleration": None}
         if speeds:
             facts["doppler"] = {
@@ -374,7 +374,7 @@ def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:
     if time[-1] < fix_time[0] or time[0] > fix_time[-1]:
         raise MismatchError(
             f"{path}: from {time[0]} to {time[-1]}, the fixes from {fix_time[0]} to {fix_time[-1]}: no time in common; "
-            "give those of the same run, in GPS time"
+            "give a table of the same run, in GPS time"
         )
 
 

@@ -1,4 +1,4 @@
-"""Inputs of a reference, and its output: ``reference.csv``, ``fixes.csv`` and ``reference.json``."""
+"""Read the inputs of a reference, and write ``reference.csv``, ``fixes.csv`` and ``reference.json``."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ class ReferenceInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Check the input files before anything is read; SettingsError, InputFileError."""
+        """Check the input files before reading; SettingsError or InputFileError: they are incomplete or unusable."""
         if not self.positions:
-            raise SettingsError("no positions are given; name a log of them with --rtk or --rtk-rear")
+            raise SettingsError("no positions are given; name a position log with --rtk or --rtk-rear")
         if bool(self.logs) != bool(self.nav):
             raise SettingsError("Doppler speeds need both observations (--front, --rear) and navigation (--nav)")
         if self.vehicle is None and len(set(self.positions) | set(self.logs)) > 1:
-            raise SettingsError("two antennas need the vehicle that they are on; name its file with --vehicle")
+            raise SettingsError("two antennas need a vehicle; name its file with --vehicle")
         self.check_files()
         options = {"front": "--rtk", "rear": "--rtk-rear"}
         check_given_once((options[name], path) for name, path in self.positions.items())
@@ -103,11 +103,11 @@ class ReferenceOptions(Settings):
     logs: LogReading = Field(default_factory=LogReading)
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)
-    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of positions in CSV.
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of position logs in CSV.
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
-    """Return the rows of fixes.csv of one antenna, rounded to tenths of millimetres."""
+    """Return the rows of ``fixes.csv`` of one antenna, rounded to 0.1 mm."""
     fixes = part.fixes
     words = {int(code): FixRejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
     table = pl.DataFrame(
@@ -129,7 +129,7 @@ def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
 
 
 def antenna_record(part: Built) -> dict[str, Any]:
-    """Return one antenna as plain values."""
+    """Return the record of one antenna in ``reference.json``, as plain values."""
     reference = part.reference
     sigma = reference.sigma_m[reference.source == "bridged"]
     return {
@@ -161,11 +161,11 @@ _NAMED: Final = 5  #: Largest number of gaps named in the notes.
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSummary:
-    """Result of a reference."""
+    """References of a run, with notes and written files."""
 
-    built: Mapping[str, Built]  #: By antenna.
+    built: Mapping[str, Built]  #: Reference by antenna.
     notes: tuple[str, ...]
-    files: Mapping[str, Path]
+    files: Mapping[str, Path]  #: Paths by file name.
 
 
 def reference_files(
@@ -176,7 +176,7 @@ def reference_files(
     options: ReferenceOptions | None = None,
     asked: Mapping[str, Any] | None = None,
 ) -> ReferenceSummary:
-    """Build the reference of a run and write it into the folder `out`.
+    """Build the reference of a run, and write it into the folder `out`.
 
     ================== ======================================================================
     reference.csv      `railfix.io.reference_log`, one row per instant and antenna
@@ -184,8 +184,8 @@ def reference_files(
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
 
-    `asked`: settings that were given explicitly. RailfixError: see `railfix.core.errors`; nothing is left
-    in `out` then.
+    `asked` are the settings that were given explicitly, which are recorded. RailfixError: see `railfix.core.errors`;
+    `out` is then left without new files.
     """
     began = clock.perf_counter()
     settings, options = settings or ReferenceSettings(), options or ReferenceOptions()
@@ -229,7 +229,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
     }
     notes = [note for log in logs.values() for note in log.notes]
     unrated = [log.path for log in logs.values() if not log.has_quality]
-    notes += [f"{path}: has no qualities, every row is taken as fixed" for path in unrated]
+    notes += [f"{path}: has no qualities; every row is taken as fixed" for path in unrated]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
         navigation = read_navigation(inputs.nav, **options.logs.arguments)
@@ -247,7 +247,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
                 raise InputFileError(
                     paths[0], f"{problem}; give a log with D observations and its navigation file, or another sensor"
                 )
-            notes.append(f"{paths[0]}: {problem}, no speed is taken from it")
+            notes.append(f"{paths[0]}: {problem}; no speed is computed from this log")
     vehicle = line.vehicle
     distance, facing = float("nan"), 1
     if vehicle is not None:
@@ -256,7 +256,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
             first, second = (np.array([a.along_m, a.across_m, a.up_m]) for a in vehicle.antennas.values())
             distance = float(np.linalg.norm(first - second))
     elif inputs.acceleration is not None:
-        notes.append("no vehicle file: the accelerometer's front is taken to point to rising chainage")
+        notes.append("no vehicle file: the accelerometer is assumed to face rising chainage")
     data = ReferenceData(
         logs=logs,
         trajectories=line.trajectories,
@@ -270,7 +270,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
 
 
 def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
-    """Return notes on gaps left out, uncertain instants and unchecked positions."""
+    """Return notes on gaps that are left out, uncertain instants and unchecked positions."""
     notes = []
     long = [gap for gap in part.gaps if not gap.bridged]
     if long:
@@ -282,7 +282,7 @@ def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
     if count := part.left_out["uncertain"]:
         notes.append(f"{name}: {count} bridged instants less certain than {settings.max_sigma_m:g} m are left out")
     if alone := part.bridged_by.get("nothing"):
-        notes.append(f"{name}: {alone} instants are bridged by the motion model alone, no sensor measured there")
+        notes.append(f"{name}: {alone} instants are bridged by the motion model alone, without a sensor")
     if np.isnan(part.fixes.travel_m).all():
         notes.append(f"{name}: no sensor measured the distance between fixes, so it was not checked")
     return notes

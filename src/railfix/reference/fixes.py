@@ -1,4 +1,4 @@
-"""Settings of a reference, its positions on the trajectory and selected with reasons (P1 3.1(2), 4.2(2), P2 3.3)."""
+"""Settings of a reference, and checks that accept or reject its fixes (P1 3.1(2), 4.2(2), P2 3.3)."""
 
 from __future__ import annotations
 
@@ -33,53 +33,51 @@ _TRAVEL_SHARE: Final = 0.005
 #: distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
 _FIX_FLOOR_M: Final = 0.01
-#: Standard deviation and correlation time of the train's acceleration (R. A. Singer, 1970): trains accelerate and
-#: brake by 0.5 to 1 m/s2 for some seconds [m/s2] [s].
+#: Standard deviation [m/s2] and correlation time [s] of the train's acceleration (R. A. Singer, 1970). Trains
+#: accelerate and brake by 0.5 to 1 m/s2 for some seconds.
 MOTION_MPS2: Final = 0.5
 MOTION_S: Final = 5.0
 ACCELERATION_BIAS_MPS2: Final = 0.05
 
 
 class ReferenceSettings(Settings):
-    """Limits and noise; all of them are recorded in ``reference.json``."""
+    """Limits and noise of a reference, which are recorded in ``reference.json``."""
 
-    #: Least ratio of the ambiguity test of a fix, where the log has one (RTKLIB's own default is 3).
-    ratio: float = _limit("Least ratio of the ambiguity test, where the log has one.", 3.0, "RATIO", "--ratio")
-    #: Largest difference between the distance of the two antennas' positions and that on the vehicle (P2 3.3: 5 cm).
+    #: Smallest accepted ratio of the ambiguity test of a fix, where the log has the ratio (RTKLIB's default is 3).
+    ratio: float = _limit("Smallest ratio of the ambiguity test, where the log has it.", 3.0, "RATIO", "--ratio")
+    #: Largest deviation of the distance between the two antennas from their distance on the vehicle (P2 3.3: 5 cm).
     spacing_m: float = _limit(
-        "Largest difference of the antennas' distance from that on the vehicle.", 0.05, "M", "--spacing"
+        "Largest deviation of the antennas' distance from their distance on the vehicle.", 0.05, "M", "--spacing"
     )
-    #: Whether a fix is rejected if the other of two logs has none at that time.
+    #: Whether a fix of one antenna is rejected if the other antenna's log has no fix at that time.
     unpaired: Literal["reject", "keep"] = "reject"
     #: Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
     lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
-    height_m: float = _limit("Largest distance above or below it.", 2.0, "M", "--height")
-    #: Largest difference between the distance of two fixes and the distance travelled (P2 3.3): constant part, and
-    #: fraction of the distance [m] [-].
+    height_m: float = _limit("Largest distance above or below the antenna's trajectory.", 2.0, "M", "--height")
+    #: Constant part of the largest difference between the distance of two fixes and the distance travelled (P2 3.3).
     travel_m: float = _positive(0.10)
-    #: Largest speed of a train: where the line passes a point several times, only passes within reach are considered.
+    #: Largest speed of a train; where the line passes a point several times, only passes within reach are considered.
     max_speed_mps: float = _positive(100.0)
-    #: Longer gaps between good fixes are not bridged.
+    #: Longest gap between good fixes that is bridged.
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
-    #: Bridged instants of larger standard deviation are left out.
+    #: Largest standard deviation of a bridged instant; less certain instants are left out.
     max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
-    #: Standard deviation of a fix along the track where the log has none; and the smallest standard deviation that is
-    #: used.
+    #: Standard deviation of a fix along the track where the log has none.
     fix_sigma_m: float = _positive(0.03)
 
     doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
-    #: Standard deviation and correlation time of the time-correlated error of the Doppler speed. The standard deviation
-    #: is estimated from the log's own fixes where there are enough of them; this one is used elsewhere [m/s] [s].
+    #: Standard deviation [m/s] and correlation time [s] of the time-correlated error of the Doppler speed. This
+    #: standard deviation is only used if there are too few fixes to estimate it.
     doppler_bias_mps: float = _positive(0.02)
     doppler_bias_s: float = _positive(10.0)
-    #: Distance of one pulse of the tachometer: wheel circumference over pulses per turn. None: from the fixes.
+    #: Distance per tachometer pulse: wheel circumference over pulses per turn; None to estimate it from the fixes.
     pulse_m: float | None = _limit(
-        "Distance of one tachometer pulse (circumference over pulses per turn); estimated from the fixes without it.",
+        "Distance per tachometer pulse (circumference over pulses per turn); by default estimated from the fixes.",
         None,
         "M",
         "--pulse",
     )
-    wheel_scale: float = _positive(0.01)  #: Relative standard deviation of that distance.
+    wheel_scale: float = _positive(0.01)  #: Relative standard deviation of the distance per pulse.
     slip_m: float = _positive(0.005)  #: Random error of the wheel's distance [m per square root of m].
     #: Noise density of the accelerometer [m/s2 per square root of Hz].
     acceleration_mps2: float = _positive(0.02)
@@ -87,14 +85,14 @@ class ReferenceSettings(Settings):
 
 #: Positions of two antennas with time tags no farther apart than this belong to one instant [ns].
 _PAIR_NS: Final = 5_000_000
-_LOOK_BACK: Final = 60  #: Runs of agreeing fixes that a run may be joined to, back from it.
-#: Largest difference in standard deviations of the travelled distance.
+_LOOK_BACK: Final = 60  #: Number of preceding runs of agreeing fixes to which a run may be joined.
+#: Largest difference from the distance travelled, in standard deviations.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
 
 class FixRejection(IntFlag):
-    """Reasons to reject a position as a reference; 0: accepted."""
+    """Reasons to reject a position as a reference; 0 if it is accepted."""
 
     NONE = 0
     NO_POSITION = 1
@@ -109,23 +107,23 @@ class FixRejection(IntFlag):
 
     @property
     def text(self) -> str:
-        """Names of the bits that are set, as in the output."""
+        """Names of the bits that are set, as in ``fixes.csv``."""
         return " ".join(flag.name.lower() for flag in FixRejection if flag and flag in self and flag.name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fixes:
-    """Positions of one antenna with the reasons for rejection, n rows in order of time."""
+    """Positions of one antenna with reasons for rejection, n rows in order of time."""
 
     time: Datetimes  #: Shape (n,).
     ecef_m: Floats  #: Shape (n, 3).
     quality: Integers  #: Shape (n,).
     ratio: Floats  #: NaN where the log has none, shape (n,).
     sigma_enu_m: Floats  #: East, north, up; NaN where the log has none; shape (n, 3).
-    rejection: Bits  #: `FixRejection` bits; a row that is rejected at one stage is not checked at the next; shape (n,).
-    #: Distance to the other antenna minus their distance on the vehicle; NaN where it was not checked; shape (n,).
+    rejection: Bits  #: `FixRejection` bits; a row rejected in one check is not checked further; shape (n,).
+    #: Distance between the antennas minus their distance on the vehicle; NaN where not checked; shape (n,).
     spacing_m: Floats
-    #: Position on the trajectory, and distance from it; NaN where it was not checked; shape (n,).
+    #: Position on the trajectory, and offsets from it to the right and upward; NaN where not checked; shape (n,).
     arc_m: Floats
     lateral_m: Floats
     height_m: Floats
@@ -138,11 +136,11 @@ class Fixes:
 
     @property
     def good(self) -> Indices:
-        """Rows that are accepted."""
+        """Indices of the accepted rows."""
         return np.flatnonzero(self.rejection == 0)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of rows by reason, the good ones first."""
+        """Return the number of rows by reason for rejection, beginning with the accepted rows ("good")."""
         counted = {"good": int((self.rejection == 0).sum())}
         for flag in FixRejection:
             if flag:
@@ -151,7 +149,7 @@ class Fixes:
 
 
 def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
-    """Check each row of a log separately; without qualities (a CSV without the column) all count as fixed."""
+    """Check each row of a log separately; the rows of a log without qualities count as fixed."""
     timed = np.flatnonzero(~np.isnat(log.time))
     rows = timed[np.argsort(log.time[timed], kind="stable")]
     time, ecef = log.time[rows], log.ecef_m[rows]
@@ -178,12 +176,12 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
 
 
 def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
-    """Give a reason to rows that have none yet."""
+    """Set the reason of the rows in a mask that have no reason yet, in place."""
     rejection[mask & (rejection == 0)] |= reason
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """Check one antenna's rows by their distance to the other's at that instant (P2 3.3: 5 cm)."""
+    """Check one antenna's rows by the distance to the other antenna at the same time (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
@@ -204,7 +202,7 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
-#: The other antenna's row counts in a pair whatever the result of its own check.
+#: Rejections of the other antenna's row that do not prevent its use in a pair.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
@@ -215,10 +213,10 @@ _JITTER_M = 2.0  #: Tolerance for jitter of positions, beyond the distance that 
 def match(
     time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
 ) -> tuple[Floats, Floats, Floats, Indices]:
-    """Match F positions in order of time to a trajectory: the shortest chain of passes within `max_speed_mps`.
+    """Match F positions in order of time to a trajectory by the shortest chain of passes within `max_speed_mps`.
 
-    Returns arc length, NaN where no pass is near enough; distance to the right and above, there or at the nearest
-    point; and segment, shapes (F,).
+    Returns arc lengths (NaN where no pass is within the limits), offsets to the right and upward, and segments, shapes
+    (F,). Offsets and segments without an arc length refer to the nearest point.
     """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)
@@ -243,25 +241,25 @@ def match(
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
-    """Return the components of offsets to the right, and perpendicular to both path and right."""
+    """Return the components of offsets to the right, and upward, perpendicular to path and right."""
     right, along = trajectory.across[section], trajectory.tangent[section]
     return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
 
 
 def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
-    """Return one pass per position: the cheapest chain from the first to the last."""
+    """Return the index of one pass per position, which together form the chain of lowest cost."""
     found, first = np.unique(position, return_index=True)
     if len(found) == len(position):
         return np.arange(len(found))
     reach = max_speed_mps * np.diff(time_s[found]) + _JITTER_M
-    # The shortest distance counts; a second pass of a crossing costs the additional length.
+    # The cost is the distance travelled, so that a second pass of a crossing costs the additional length.
     ways = (np.abs(after[:, None] - before) for before, after in pairwise(np.split(arc_m, first[1:])))
     steps = (way + np.where(way > limit, _OUT_OF_REACH_M, 0.0) for way, limit in zip(ways, reach, strict=True))
     return np.asarray(first + cheapest_path(np.split(np.abs(lateral_m), first[1:]), steps))
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
-    """Check rows by their distance to the trajectory; return reasons, positions along it and their sigmas."""
+    """Check rows by their offsets from the trajectory; return fixes with positions on it and their sigmas."""
     rows = fixes.good
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
@@ -279,7 +277,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)
         _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), FixRejection.OFF_HEIGHT)
-        # The remainder is beyond an end of the line.
+        # The remaining rows are beyond an end of the line.
         _reject(rejection, missed, FixRejection.OFF_TRACK)
     return replace(fixes, rejection=rejection, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
 
@@ -287,7 +285,10 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows whose spacing disagrees with the travelled distance (P2 3.3): the chain of agreeing runs is kept."""
+    """Reject rows whose distances disagree with the distance travelled (P2 3.3), and keep the chain of agreeing runs.
+
+    `travelled` returns the cumulative distance along rising chainage [m] and its variance [m2] at given times.
+    """
     rows = fixes.good
     if len(rows) < 2:
         return fixes
@@ -309,7 +310,7 @@ def judge_travel(
 
 
 def _best_chain(agrees: Callable[[Indices, Indices], Masks], time_s: Floats, hold_s: float) -> Masks:
-    """Return which fixes are in the chain of runs of most seconds, less `hold_s` for each joint that does not agree."""
+    """Return which fixes are in the chain of runs of the longest duration, minus `hold_s` for each disagreement."""
     count = len(time_s)
     worth = np.minimum(np.diff(time_s, append=time_s[-1] + np.median(np.diff(time_s))), 1.0)
     every = np.arange(count)

@@ -1,8 +1,8 @@
-"""Smooth the distance between fixes, all sensors weighted by their variances, and assemble the reference.
+"""Smooth positions between fixes, with all sensors weighted by their variances, and assemble the reference.
 
-The unknowns at each instant are position, speed, and one slowly varying error per kind of sensor: of the Doppler speed,
-the difference and scale of the wheel's distance, the accelerometer's offset. A forward-backward smoother distributes
-the closing error of a gap in proportion to the variance of each contribution.
+The states at each instant are position, speed and acceleration, and slowly varying errors of the sensors: the error of
+the Doppler speed, the difference and scale error of the wheel's distance, and the accelerometer's offset. A
+forward-backward smoother distributes the closing error of a gap in proportion to the variance of each contribution.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from railfix.motion.singer import singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviations of unknown initial values: speed [m/s], difference of the wheel's distance [m].
+#: Standard deviations of unknown initial values: speed [m/s], and position and difference of the wheel's distance [m].
 _ANY_SPEED_MPS: Final = 100.0
 _ANY_DISTANCE_M: Final = 1e4
-#: Doppler speeds beyond this many standard deviations weigh less (P. J. Huber, 1964), in this many rounds.
+#: Residual in standard deviations beyond which Doppler speeds are down-weighted (P. J. Huber, 1964); number of rounds.
 _HUBER: Final = 2.0
 _ROUNDS: Final = 4
 #: Drift of the wheel's scale [1 per square root of s] and of the accelerometer's offset [m/s2 per square root of s].
 _SCALE_DRIFT: Final = 3e-6
 _OFFSET_DRIFT_MPS2: Final = 1e-3
-#: Least standard deviations: of a reading of the wheel [m], of its difference over a step [m].
+#: Smallest standard deviations: of a wheel reading [m], and of process noise over a step [m].
 _LEAST_READING_M: Final = 1e-3
 _LEAST_STEP_M: Final = 1e-4
 
@@ -39,7 +39,7 @@ SAME_INSTANT_NS: Final = 20_000_000  #: Time tags that differ by no more than th
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
-    """Return the instants of a reference: rows of the log, receiver epochs, regular steps elsewhere."""
+    """Return the instants of a reference: rows of the log, receiver epochs, and regular steps in gaps."""
     merged = rows
     for other in others:
         new = other[(other > rows[0]) & (other < rows[-1])]
@@ -56,36 +56,37 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
 class Evidence:
     """Measurements along one antenna's path at N instants; NaN where missing."""
 
-    time: Datetimes  #: Rising, steps of at most some seconds; shape (N,).
-    #: Arc length of good fixes, shape (N,).
+    time: Datetimes  #: Rising, with steps of at most some seconds; shape (N,).
+    #: Arc length of good fixes, and its standard deviation; shape (N,).
     fix_m: Floats
     fix_sigma_m: Floats
-    #: Shape (N,).
+    #: Speed along the path from Dopplers, and its standard deviation; shape (N,).
     doppler_mps: Floats
     doppler_sigma_mps: Floats
     wheel_m: Floats  #: Cumulative wheel distance along rising chainage, from an arbitrary origin; shape (N,).
-    wheel_sigma_m: float  #: Standard deviation of one reading: half a pulse and similar errors.
-    acceleration_mps2: Floats  #: Mean of each step along rising chainage, without gravity; shape (N - 1,).
+    wheel_sigma_m: float  #: Standard deviation of one reading.
+    acceleration_mps2: Floats  #: Mean along rising chainage over each step, without gravity; shape (N - 1,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothedReference:
     """Position and speed at every instant."""
 
-    #: Shape (N,).
+    #: Arc length, and its standard deviation; shape (N,).
     arc_m: Floats
     sigma_m: Floats
-    #: Shape (N,).
+    #: Speed along the path, and its standard deviation; shape (N,).
     speed_mps: Floats
     speed_sigma_mps: Floats
     wheel_scale: Floats  #: Scale error of the wheel's distance, positive if too long; NaN without a wheel; (N,).
 
 
 class _States:
-    """Column of each state that the measurements need; -1 for the others.
+    """Column of each state that the measurements need; -1 for other states.
 
-    Position, speed and acceleration of the train; with an accelerometer its offset and the speed at the previous
-    instant; the time-correlated error of the Doppler speed; difference and scale error of the wheel's distance.
+    The states are position, speed and acceleration of the train; with Dopplers, the time-correlated error of their
+    speed; with a wheel, the difference of its distance from the position, and its scale error; with an accelerometer,
+    its offset and the speed at the previous instant.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -106,8 +107,8 @@ class _States:
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference:
     """Estimate position and speed at every instant from all measurements, which include at least one fix.
 
-    A Kalman filter forward and the smoother of Rauch, Tung and Striebel back (`filterpy.kalman.KalmanFilter`); Doppler
-    speeds are weighed by Huber's function of their residuals, in `_ROUNDS` rounds.
+    A Kalman filter runs forward and a Rauch-Tung-Striebel smoother backward (`filterpy.kalman.KalmanFilter`). Doppler
+    speeds are weighted by Huber's function of their residuals, in `_ROUNDS` rounds.
     """
     states = _States(evidence)
     dt = seconds(np.diff(evidence.time))
@@ -156,7 +157,7 @@ def _filter_and_smooth(
 
 
 def _first_sigmas(states: _States, settings: ReferenceSettings) -> Floats:
-    """Return the standard deviations of the states at the first instant, where all are expected to be 0."""
+    """Return the standard deviations of the states at the first instant, where all states have a mean of 0."""
     sigmas = {
         states.place: _ANY_DISTANCE_M,
         states.speed: _ANY_SPEED_MPS,
@@ -200,7 +201,7 @@ def _motion(states: _States, evidence: Evidence, dt: Floats, settings: Reference
     return transition, noise
 
 
-#: Kinds of measurements, columns of `_measurements`.
+#: Columns of `_measurements` by kind of measurement.
 _FIX, _DOPPLER, _WHEEL, _ACCELERATION = range(4)
 
 
@@ -209,8 +210,8 @@ def _measurements(
 ) -> tuple[Floats, Floats, Floats]:
     """Return values (N, 4), NaN where missing, their variances (N, 4) and design (N, 4, n).
 
-    Fix = position. Doppler speed = speed + error. Wheel = position + difference. The accelerometer's mean over a step
-    times its duration = gain of speed + offset times the duration.
+    Fix = position. Doppler speed = speed + error. Wheel distance = position + difference. Mean acceleration over a step
+    times its duration = increase of speed + offset times the duration.
     """
     count = len(evidence.time)
     value, variance = np.full((count, 4), np.nan), np.ones((count, 4))
@@ -237,10 +238,10 @@ def _measurements(
 class Closings:
     """Closing errors of a measured distance between fixes, over W windows."""
 
-    error_m: Floats  #: Distance measured less distance between the fixes, shape (W,).
-    white_m2: Floats  #: Variance of single readings and of the fixes, shape (W,) [m2].
-    duration_s: Floats  #: Shape (W,).
-    distance_m: Floats  #: Shape (W,).
+    error_m: Floats  #: Measured distance minus distance between the fixes, shape (W,).
+    white_m2: Floats  #: Variance by white noise of the sensor and of the fixes, shape (W,) [m2].
+    duration_s: Floats  #: Duration of the window, shape (W,).
+    distance_m: Floats  #: Distance between the fixes along rising chainage, shape (W,).
 
     def __len__(self) -> int:
         return len(self.error_m)
@@ -253,7 +254,10 @@ class Closings:
 def closings(
     time: Datetimes, distance_m: Floats, variance_m2: Floats, fix_m: Floats, fix_sigma_m: Floats, *, window_s: float
 ) -> Closings:
-    """Compare a measured distance with that between fixes over windows; `distance_m` and variance up to each fix."""
+    """Return the closing errors of a measured distance between fixes, over windows of `window_s`.
+
+    `distance_m` and `variance_m2` are cumulative up to each fix.
+    """
     t = seconds(time - time[0])
     end = np.searchsorted(t, t + window_s - 0.5)
     start = np.flatnonzero(end < len(t))
@@ -272,7 +276,10 @@ def closings(
 
 
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the sigma of the time-correlated Doppler speed error [m/s], from the closing errors less their noise."""
+    """Return the sigma of the time-correlated Doppler speed error [m/s], from the closing errors minus their noise.
+
+    With fewer than `WINDOWS` windows, the setting is returned.
+    """
     if len(misclosures) < WINDOWS:
         return settings.doppler_bias_mps
     tau = settings.doppler_bias_s
@@ -282,7 +289,10 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the wheel's random error from the closing errors, without its scale error [m per square root of m]."""
+    """Return the wheel's random error [m per square root of m] from the closing errors, without its scale error.
+
+    With fewer than `WINDOWS` windows in motion, the setting is returned.
+    """
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -293,7 +303,7 @@ def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
 
 
-WINDOWS: Final = 20  #: Fewest windows for an estimate.
+WINDOWS: Final = 20  #: Smallest number of windows for an estimate.
 #: 80th percentile of a squared standard normal variable.
 _CHI2_80: Final = 1.6424
 _LEAST_LASTING_MPS: Final = 1e-3
@@ -317,9 +327,10 @@ class Built:
     reference: AntennaReference
     fixes: Fixes  #: Every row of the position log with its reasons for rejection.
     gaps: tuple[Gap, ...]
-    #: Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
+    #: Number of instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap`` or
+    #: ``uncertain``.
     left_out: dict[str, int]
-    bridged_by: dict[str, int]  #: Bridged instants by the sensors that measured then.
+    bridged_by: dict[str, int]  #: Number of bridged instants by the sensors with measurements.
     facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
 
 
@@ -333,7 +344,10 @@ def assemble_reference(
     settings: ReferenceSettings,
     facts: dict[str, Any],
 ) -> Built:
-    """Return one antenna's reference trajectory: fixes, smoothed between them; `excess` (G - 1,) in sigmas."""
+    """Return one antenna's reference trajectory: fixes, and smoothed positions between the fixes.
+
+    `excess` is the factor on the standard deviations in each gap between G good fixes, shape (G - 1,).
+    """
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
     is_fix = np.zeros(len(time), dtype=np.bool_)
@@ -383,7 +397,7 @@ def assemble_reference(
 
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Return the bridged instants by the sensors with a measurement then, or about a second away."""
+    """Return the number of bridged instants by the sensors with a measurement at most 1.5 s away."""
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),
@@ -400,4 +414,4 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-_NEAR_NS: Final = 1_500_000_000  #: A 1 Hz sensor counts as continuous, up to one missing epoch [ns].
+_NEAR_NS: Final = 1_500_000_000  #: Largest time to a measurement, for 1 Hz sensors with single missing epochs.

@@ -12,7 +12,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.io.reference_log import Pulses
 
-#: Windows for the estimate of the distance per pulse: length [s], least distance [m], least number.
+#: Windows for the estimate of the distance per pulse: length [s], smallest distance [m], smallest number.
 _WINDOW_S: Final = 10.0
 _LEAST_DISTANCE_M: Final = 30.0
 _LEAST_WINDOWS: Final = 5
@@ -22,15 +22,15 @@ _FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
 
 @dataclass(frozen=True, kw_only=True)
 class Wheel:
-    """A tachometer with its distance per pulse."""
+    """Tachometer with its distance per pulse."""
 
     pulses: Pulses
     pulse_m: float
-    source: str
+    source: str  #: Source of the distance per pulse, in words.
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading [m]: uniform within a pulse for a counter, 0 for a distance."""
+        """Standard deviation of a reading [m]: of a uniform error within one pulse for a counter, otherwise 0."""
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
@@ -43,7 +43,7 @@ class Wheel:
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
         if self.pulses.signed:
-            # A signed counter gives the direction itself; the hints only give the sense of its sign.
+            # A signed counter has the direction; the hints only determine which sign is rising chainage.
             rising = np.sign(np.nansum(np.diff(run) * sign))
             return run if rising >= 0 else -run
         step = np.diff(run) * sign
@@ -51,18 +51,17 @@ class Wheel:
 
 
 def _cumulate(run: Floats, step: Floats) -> Floats:
-    """Return the sum of signed steps; NaN where an unknown step separates an instant from the next."""
+    """Return the cumulative sum of signed steps, NaN without a reading and after an unknown step."""
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
     open_ = np.isnan(run)
-    # An instant between two unknown steps belongs to no stretch; an instant at the edge of a stretch belongs to it. The
-    # first instant after a gap is dropped so that no difference spans the gap.
+    # The first instant after an unknown step is dropped, so that no difference spans a gap.
     open_[1:] |= ~known
     return np.where(open_, np.nan, total)
 
 
 def _direction(run: Floats, hint: Floats) -> Floats:
-    """Direction of each step, 1 or -1, NaN where undetermined, shape (N - 1,)."""
+    """Return the direction of each step, 1 or -1, NaN where undetermined, shape (N - 1,); 1 without hints."""
     known = np.where(np.abs(hint) > _DIRECTION_MPS, np.sign(hint), np.nan)
     at = np.flatnonzero(np.isfinite(known))
     if not len(at):
@@ -80,10 +79,10 @@ def _direction(run: Floats, hint: Floats) -> Floats:
 
 
 def _turn(step: Floats, before: float, after: float) -> Floats:
-    """Return the direction within a stretch in which it changes: at the longest stop, or open."""
+    """Return the direction of each step of a stretch in which it changes at the longest stop; NaN without a stop."""
     standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
     if not standing.any():
-        # Between neighbouring pulses of opposite directions no stop is required.
+        # A train can reverse between two pulses without a step of zero, so that the time of reversal is unknown.
         return np.full(len(step), np.nan)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(np.int8)))
     begin, end = edges[::2], edges[1::2]
@@ -93,7 +92,10 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
 
 
 def estimate_wheel(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
-    """Return the wheel with the given distance per pulse, or the median of estimates from good fixes."""
+    """Return the wheel with the given distance per pulse, or with the median of estimates from good fixes.
+
+    MismatchError: there are too few fixes in motion, or the speed between two rows exceeds 150 m/s.
+    """
     source = "given"
     if pulses.kind == "distance":
         pulse_m, source = 1.0, "metres in the table"
@@ -120,7 +122,7 @@ def _estimate(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
     usable = (distance > _LEAST_DISTANCE_M) & np.isfinite(turned) & (turned > 0)
     if usable.sum() < _LEAST_WINDOWS:
         raise MismatchError(
-            f"{pulses.path}: too few fixes in motion to estimate the distance per pulse; give it (wheel "
+            f"{pulses.path}: too few fixes in motion to estimate the distance per pulse; give it by --pulse (wheel "
             "circumference over pulses per turn)"
         )
     return float(np.median(distance[usable] / turned[usable]))

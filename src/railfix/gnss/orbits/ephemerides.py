@@ -1,6 +1,6 @@
-"""Satellites by broadcast records (Keplerian elements, GLONASS state vectors) and by precise ephemerides.
+"""Satellite states from broadcast records (Keplerian elements, GLONASS state vectors) and from precise ephemerides.
 
-Precise positions are interpolated by a polynomial, clocks linearly.
+Precise positions are interpolated by a polynomial, and precise clocks linearly.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Components = tuple[Floats, Floats, Floats]  #: x, y, z as separate arrays.
 
 #: Inclination of the frame in which BeiDou GEO records are given [rad] (BDS-SIS-ICD-B1I 3.0, 5.2.4.12).
 _GEO_TILT: Final = np.radians(-5.0)
-#: Gravitational constant [m^3/s^2] by constellation.
+#: Geocentric gravitational constant [m^3/s^2] by constellation.
 GM: Final[Mapping[str, float]] = {"G": GM_GPS, "J": GM_GPS, "E": GM_GALILEO, "C": GM_GALILEO}
 #: Earth rotation rate [rad/s] by constellation.
 ROTATION: Final[Mapping[str, float]] = {
@@ -43,14 +43,14 @@ ROTATION: Final[Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Orbits(RowArrays):
-    """Orbit elements and time-independent quantities, shape (n,); others as in `KeplerRecords`."""
+    """Orbit elements and time-independent quantities, shape (n,); further fields are as in `KeplerRecords`."""
 
     a: Floats  #: Semi-major axis [m].
     motion: Floats  #: Corrected mean motion [rad/s].
     eccentricity: Floats
     root: Floats  #: sqrt(1 - e^2).
     m0: Floats
-    #: Rates of the argument of perigee and of the inclination at toe.
+    #: Cosine and sine of the argument of perigee, and of the inclination at toe.
     cos_omega: Floats
     sin_omega: Floats
     cos_i0: Floats
@@ -59,7 +59,7 @@ class Orbits(RowArrays):
     i_dot: Floats
     node: Floats  #: Longitude of the ascending node at toe [rad].
     node_rate: Floats  #: [rad/s].
-    #: BeiDou GEO: rotation rate of the Earth-fixed frame against the tilted frame of toe; 0 elsewhere [rad/s].
+    #: BeiDou GEO: rotation rate of the Earth-fixed frame relative to the tilted frame at toe; otherwise 0 [rad/s].
     tilted_rate: Floats
 
     cuc: Floats
@@ -89,7 +89,7 @@ class Orbits(RowArrays):
             cos_i0=np.cos(records.i0),
             sin_i0=np.sin(records.i0),
             node=records.omega0 - rotation * records.toe_sow_s,
-            # GEO records: node in the inertial frame of toe; the Earth's rotation is applied at the end.
+            # The node of GEO records is in the inertial frame at toe; the Earth's rotation is applied at the end.
             node_rate=records.omega_dot - np.where(geo, 0.0, rotation),
             tilted_rate=np.where(geo, rotation, 0.0),
             relativity=-2.0 * np.sqrt(gm) / SPEED_OF_LIGHT**2 * records.eccentricity * records.sqrt_a,
@@ -130,8 +130,8 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
     """Compute satellite states at times since toe, shape (n,) [s] (IS-GPS-200, tables 20-IV and 30-II).
 
     Harmonic corrections of latitude and inclination are small angles (at most 1.3e-4 rad). Returns position [m] and
-    velocity [m/s] in the Earth-fixed frame of that time, and relativity F e sqrt(A) sin E [s], the same as -2 r.v /
-    c^2.
+    velocity [m/s] in the Earth-fixed frame of the same time, and the relativistic clock correction F e sqrt(A) sin E
+    [s], which equals -2 r.v / c^2.
     """
     el, t = orbits, since_toe_s
     motion = el.motion + el.delta_n_dot * t
@@ -175,7 +175,7 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
 def _out_of_tilted_frame(
     position: Components, velocity: Components, rate: Floats, since_toe_s: Floats
 ) -> tuple[Components, Components]:
-    """BeiDou GEO: R_z(omega t) R_x(-5 deg) (BDS-SIS-ICD-B1I 3.0, 5.2.4.12); rows of rate 0 are unchanged."""
+    """Rotate BeiDou GEO states by R_z(omega t) R_x(-5 deg) (B1I ICD 3.0, 5.2.4.12); rows with rate 0 are unchanged."""
     cos_x, sin_x = np.cos(_GEO_TILT), np.sin(_GEO_TILT)
     angle = rate * since_toe_s
     cos_z, sin_z = np.cos(angle), np.sin(angle)
@@ -192,12 +192,12 @@ def _out_of_tilted_frame(
     return (x, y, z), (vx, vy, vz)
 
 
-STEP_S: Final = 60.0  #: Step of the integration [s]; the ICD's statement of accuracy is for 60 s.
+STEP_S: Final = 60.0  #: Step of the integration [s]; the ICD states the accuracy for 60 s.
 _BLOCK: Final = 8192  #: Rows integrated at once, so that the arrays stay in the cache.
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
-    """Compute the acceleration in the Earth-fixed frame (3, n) [m/s^2]: central, J2, rotation, Moon and Sun."""
+    """Compute the Earth-fixed acceleration (3, n) [m/s^2] by central force, J2, Earth rotation, Moon and Sun."""
     omega = EARTH_ROTATION_RATE_GLONASS
     x, y, z = position
     r2 = x * x + y * y + z * z
@@ -231,7 +231,7 @@ def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: 
 class GlonassStates:
     """States of all records at multiples of the step from their reference times."""
 
-    #: The reference time is the middle column, shape (3, records, 2 steps + 1) [m, m/s].
+    #: States, with the reference time in the middle column, shape (3, records, 2 steps + 1) [m, m/s].
     position: Floats
     velocity: Floats
     luni_solar: Floats  #: Shape (3, records) [m/s^2].
@@ -267,11 +267,11 @@ class GlonassStates:
 
 
 #: Points of the interpolation polynomial (order 12). With positions every 15 minutes the error is within 3 mm for the
-#: two Galileo satellites in elliptic orbits, where the usual 11 points err by 17 mm near perigee, and within a
-#: micrometre for the others; in the first and last interval of a file up to 0.7 m for these two (0.05 mm for the
-#: others).
+#: two Galileo satellites in elliptic orbits, where the usual 11 points cause errors of 17 mm near perigee, and within a
+#: micrometre for other satellites. In the first and last interval of a file it is up to 0.7 m for these two satellites,
+#: and 0.05 mm for others.
 POINTS: Final = 13
-#: Epochs farther apart than this many times the usual interval are a gap, within which there are no states.
+#: An interval longer than this multiple of the usual interval is a gap, within which there are no states.
 _GAP: Final = 1.5
 _STATES: Final = 4096  #: Number of states computed at once, so that the arrays stay in the cache.
 
@@ -290,9 +290,9 @@ def precise_state(
 ) -> tuple[Floats, Floats, Floats]:
     """Compute positions and velocities (3, n), and clocks (n,) of satellites at ``time + offset``.
 
-    `column` is -1 where a satellite is not in the ephemeris of at least `POINTS` epochs; `offset_s` a fraction of a
-    second. NaN where a node is missing or where the time lies outside the file or in a gap. The clock has the
-    relativistic -2 r.v / c^2 that SP3 clocks do not contain.
+    `column` is -1 where the ephemeris lacks a satellite; `offset_s` is a fraction of a second. The result is NaN where
+    a node is missing, and where the time is outside the file or in a gap. The clock includes the relativistic
+    correction -2 r.v / c^2, which SP3 clocks do not contain. ValueError: the ephemeris has fewer than `POINTS` epochs.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
@@ -347,7 +347,7 @@ def _sum(terms: Floats) -> Floats:
 
 
 def _rotate_axes(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
-    """Rotate vectors, components first, about the Earth's axis."""
+    """Rotate vectors, with components in axis 0, about the Earth's axis by an angle [rad]."""
     cos, sin = np.cos(angle), np.sin(angle)
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 

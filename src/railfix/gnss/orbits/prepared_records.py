@@ -1,11 +1,11 @@
-"""Selection of the navigation record of a satellite at an epoch; lookups and orbit elements, computed once and cached.
+"""Select the navigation record of a satellite at an epoch; lookups and orbit elements are computed once and cached.
 
 The newest record transmitted before the epoch is selected. A record without a transmission time counts as transmitted
 half-way between its own and the previous record's reference time. Where the newest record is outside its validity
 (expired while an older one is still valid, or transmitted long before its validity begins), or where all records were
 transmitted after the epoch (a file that begins later than the log), the record with the nearest reference time is
-selected if it is valid, and flagged if it had not been transmitted yet. Health is taken from the selected record: an
-older healthy record does not override it.
+selected if it is valid, and flagged if it had not been transmitted yet. Health is taken from the selected record, and
+not from an older healthy record.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 
-#: Longest distance of an epoch from toe [s]: GPS and QZSS half the broadcast fit interval and
-#: never less than this (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour);
-#: Galileo 4 h (Galileo OS SDD 1.3, 2.4.2: no data older than that are broadcast). BeiDou (renewed every hour) and
-#: GLONASS (renewed every 30 min) do not broadcast a validity: the limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP,
-#: MAXDTOE_GLO of rtklib.h).
+#: Longest time between an epoch and toe [s]. GPS and QZSS records are valid for half the broadcast fit interval, and at
+#: least for this time (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour). Galileo does not broadcast data
+#: older than 4 h (Galileo OS SDD 1.3, 2.4.2). BeiDou (renewed every hour) and GLONASS (renewed every 30 min) do not
+#: broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
 #: A record transmitted earlier than this before its validity begins has a wrong transmission time [s].
@@ -58,7 +57,9 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return row, validity (`limit` by row) and "not yet sent" of the record of each satellite, shapes (M, T)."""
+        """Return the record row of each satellite (-1 without records), whether the record is valid (`limit` by row),
+        and whether it was transmitted after the epoch; shapes (M, T).
+        """
         shape = (len(number), len(time))
         if not len(self.sent_key):
             return np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
@@ -111,19 +112,22 @@ def make_lookup(label: Strings, toe: Datetimes, transmitted: Datetimes, validity
 
 
 def validity_s(records: KeplerRecords) -> Floats:
-    """Compute the longest distance of an epoch from toe for each record, shape (n,) [s]."""
+    """Compute the longest time between an epoch and toe for each record, shape (n,) [s]."""
     base = np.array([VALIDITY_S[s[0]] for s in records.satellite.tolist()], dtype=np.float64)
     return np.fmax(base, records.fit_interval_h * 1800.0)
 
 
-_ISSUES: Final = 1024  #: Number of distinct issues of data: Galileo has 10 bits, the others 8.
+_ISSUES: Final = 1024  #: Number of distinct issues of data; Galileo has 10 bits, and other constellations have 8.
 #: Time span that a lookup key can hold [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 
 
 class _Issues:
-    """Records by satellite and issue, each valid from half-way after the preceding toe; F/NAV before I/NAV."""
+    """Index of records by satellite and issue, each used from half-way between the previous toe and its own toe.
+
+    With the same toe, F/NAV takes precedence over I/NAV.
+    """
 
     def __init__(self, kepler: KeplerRecords) -> None:
         row = np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")).nonzero()[0]
@@ -152,7 +156,10 @@ def _index_issues(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Find the nearest valid row of `navigation.kepler` of an `issue` (T, M), sent or not; -1 without one."""
+    """Return the row of `navigation.kepler` with an `issue` (T, M) and the nearest toe, -1 without a valid record.
+
+    The times of transmission are not considered.
+    """
     table = _index_issues(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
     issue = np.where(np.char.startswith(satellite, "E") | (issue < 0), issue, issue % 256)
@@ -170,21 +177,21 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
 #: Galileo: data validity and signal health by band, E1-B, E5a, E5b (RINEX 3.05, table A8; OS SIS ICD 5.1.9.3).
 GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
 #: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
-#: from the most significant one. 1 (no L1C/B) is broadcast by satellites with L1C/A since 2022.
+#: from the most significant bit. Satellites with L1C/A have broadcast the value 1 (no L1C/B) since 2022.
 QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
 }  # fmt: skip
-#: A record that states a larger accuracy is rejected (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
-#: IS-GPS-200, 20.3.3.3.1.3) [m]; the performance standard of GPS calls such a signal marginal.
+#: Largest accuracy of a healthy record [m]. URA indices of 8 and more exceed it (15 means no prediction; IS-GPS-200,
+#: 20.3.3.3.1.3); such a signal is marginal by the GPS performance standard.
 LARGEST_ACCURACY_M: Final = 48.0
-#: Columns of `KeplerRecords.inter_signal_s` by signal of GPS and QZSS; their mean where data and pilot are one code.
+#: Columns of `KeplerRecords.inter_signal_s` by GPS and QZSS signal; the mean is used for combined data and pilot codes.
 _ISC: Final[Mapping[str, list[int]]] = {
     "1C": [0], "1E": [0], "2S": [1], "2L": [1], "2X": [1], "5I": [2], "5Q": [3], "5X": [2, 3],
     "1S": [4], "1L": [5], "1X": [4, 5],
 }  # fmt: skip
-#: Standard deviation of the delay on L2 and L5 without ISC [m]: over the satellites of GPS whose CNAV has it, on
-#: 2025-02-15, TGD - ISC less the value used instead has 0.24 m on L2C and 0.55 m on L5Q
+#: Standard deviation of the delay on L2 and L5 without ISC [m]. For GPS satellites whose CNAV had ISC on 2025-02-15,
+#: the difference of TGD - ISC and the value used instead has a standard deviation of 0.24 m on L2C and 0.55 m on L5Q
 #: (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 _P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
@@ -194,11 +201,11 @@ _ANY: Final = -1  #: All bits.
 
 
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
-    """Flag the records in which a signal is unhealthy, shape (n,).
+    """Return which records flag a signal as unhealthy, shape (n,).
 
-    GPS: any of the six bits. QZSS and Galileo: the bits of the signal; Galileo also where no
-    accuracy is predicted (SISA "NAPA", written as -1; OS SDD 1.3, 2.3.1.4 calls that marginal).
-    CNAV and CNAV-2: the bit of the band. BeiDou: SatH1 or HS. All constellations: accuracy beyond `LARGEST_ACCURACY_M`.
+    GPS LNAV is unhealthy with any of the six bits, QZSS and Galileo with the bits of the signal, CNAV with the bit of
+    the band, and BeiDou with SatH1 or HS. Galileo is also unhealthy without a predicted accuracy (SISA "NAPA", written
+    as -1, marginal by OS SDD 1.3, 2.3.1.4), and every record with an accuracy above `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
     bits = np.full(len(records), _ANY, dtype=np.int64)
@@ -243,7 +250,7 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of a group delay without ISC (L2C and L5 by LNAV), shape (n,) [m]; otherwise 0."""
+    """Return the sigma of the group delay of L2C and L5 by LNAV, which has no ISC, shape (n,) [m]; otherwise 0."""
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 
@@ -314,7 +321,7 @@ class ChannelRecords:
     #: Channels of the constellations with Keplerian records, and of GLONASS; shape (K,), (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers: the message with clock and delay of the signal, and another; -1 for none; shape (K,).
+    #: Lookup numbers of the message with clock and delay of the signal, and of an alternative; -1 for none; shape (K,).
     preferred: Integers
     other: Integers
 
@@ -368,7 +375,7 @@ class PreparedRecords:
         first, second = zip(*(_labels(name, code) for name, code in names), strict=True) if names else ((), ())
         pairs = [(number.get(a, -1), number.get(b, -1)) for a, b in zip(first, second, strict=True)]
         preferred, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        # A satellite that has only the other message uses it instead of the preferred one.
+        # A satellite with only the alternative message uses it as the preferred message.
         preferred, other = np.where(preferred < 0, other, preferred), np.where(preferred < 0, -1, other)
         clock: ClockReference = "broadcast" if self.navigation.precise is None else "ionosphere_free"
         records = self.navigation.kepler
@@ -396,7 +403,7 @@ _MESSAGE_OF: Final = {
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return the names in the lookup, preferred first: F/NAV has the clock of E1/E5a, I/NAV of E1/E5b."""
+    """Return the preferred and the alternative name in the lookup; F/NAV has the clock of E1/E5a, I/NAV of E1/E5b."""
     if satellite[0] == "E":
         messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
         return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"
@@ -408,5 +415,5 @@ def _labels(satellite: str, signal: str) -> tuple[str, str]:
 
 @lru_cache(maxsize=8)
 def prepared_records(navigation: Navigation) -> PreparedRecords:
-    """Prepare the records of a `Navigation`, once for each object."""
+    """Return the prepared records of a `Navigation`, computed once for each object."""
     return PreparedRecords(navigation)

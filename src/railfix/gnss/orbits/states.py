@@ -16,8 +16,8 @@ from railfix.gnss.navigation import Navigation, PreciseEphemeris
 from railfix.gnss.orbits.ephemerides import kepler_state, precise_clock_s, precise_state
 from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords, prepared_records
 
-#: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
-#: arithmetic on every element, arranged so that single live epochs and complete logs are both fast.
+#: Chunks of fewer epochs are computed with all channels together, longer chunks channel by channel, with the same
+#: arithmetic on every element. Both single live epochs and complete logs are then fast.
 _SHORT: Final = 96
 _BLOCK: Final = 4096  #: Epochs of a channel computed at once, so that the arrays stay in the cache.
 
@@ -37,21 +37,21 @@ class SatelliteStates:
     #: Group delay of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on signals
     #: whose delay is not broadcast (`prepared_records.group_delay_s`); shape (T, M).
     group_delay_m: Floats
-    age_s: Floats  #: Epoch minus the reference time of the record; 0 for a precise ephemeris; shape (T, M).
+    age_s: Floats  #: Epoch minus toe of the record, 0 for a precise ephemeris; shape (T, M).
     accuracy_m: Floats  #: As broadcast; NaN for GLONASS and for a precise ephemeris; shape (T, M).
     #: Row in the record table of the constellation, -1 without a record; set also where the record is too old or the
     #: channel has no code; shape (T, M).
     record: Integers
-    no_record: Masks  #: The satellite has no record, shape (T, M).
-    #: The satellite has records, but none is valid at the epoch (set only where there is a code); shape (T, M).
+    no_record: Masks  #: Whether the satellite has no record, shape (T, M).
+    #: Whether the satellite has records, but no valid record at the epoch (only where there is a code); shape (T, M).
     too_old: Masks
-    unhealthy: Masks  #: The record used flags the signal as unhealthy, shape (T, M).
-    #: The record used was transmitted after the epoch: usable in post-processing, not live; shape (T, M).
+    unhealthy: Masks  #: Whether the record used flags the signal as unhealthy, shape (T, M).
+    #: Whether the record used was transmitted after the epoch, so that it is not available live; shape (T, M).
     future_record: Masks
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> SatelliteStates:
-        """Create writable states without any record."""
+        """Return writable states without records."""
         position, velocity = np.full((2, *shape, 3), np.nan)
         clock, delay, age, accuracy = np.full((4, *shape), np.nan)
         too_old, unhealthy, future = np.zeros((3, *shape), dtype=bool)
@@ -74,11 +74,11 @@ def satellite_states(
 ) -> SatelliteStates:
     """Compute satellite states at the times of transmission ``time - code / c - dt_sv``.
 
-    The receiver clock affects time tag and code equally, so the time of transmission needs no
-    estimate of it. No result depends on the other epochs or channels of the call, to the last bit.
+    The receiver clock error cancels in the time of transmission, because it affects time tag and code equally. The
+    result of an epoch and channel does not depend on other epochs and channels, to the last bit.
 
-    Galileo channels on E5a use F/NAV records, all others I/NAV; where no such record is valid at an epoch, they use a
-    valid record of the other message with its clock and group delay.
+    Galileo channels on E5a use F/NAV records, and other Galileo channels use I/NAV records. Where no such record is
+    valid at an epoch, a valid record of the other message is used, with its clock and group delay.
 
     Parameters
     ----------
@@ -92,11 +92,11 @@ def satellite_states(
         absent from it has no record; health and group delays come from the nearest broadcast
         record of any age, and a satellite without a broadcast record has no record either.
     max_age_s : float, optional
-        Tighter limit on the distance from toe than the records' own validity [s].
+        Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
-        Rows of `navigation.kepler` to use, -1 for the usual selection: corrections refer to one issue
-        of data (`issue_records`). A satellite is unhealthy also where the record of the usual
-        selection flags it. Ignored for GLONASS.
+        Rows of `navigation.kepler` to use, because corrections refer to one issue of data (`issue_records`); -1 for the
+        usual selection. A satellite is also unhealthy where the record of the usual selection flags it. Ignored for
+        GLONASS.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def _fill_kepler(
         states.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
         states.unhealthy[t, m] = plan.unhealthy[signal, row]
     if record is not None:
-        # The newest record decides on health, also where a correction refers to an older one.
+        # Health is also taken from the newest record, where a correction refers to an older record.
         newest_unhealthy = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
         states.unhealthy[:, channels] |= newest_unhealthy.T
 
@@ -244,7 +244,7 @@ def _fill_precise(
     observed: Masks,
     states: SatelliteStates,
 ) -> None:
-    """Replace broadcast positions and clocks by precise ones."""
+    """Replace broadcast positions and clocks by the positions and clocks of a precise ephemeris."""
     known = {str(s): i for i, s in enumerate(precise.satellite)}
     column = np.array([known.get(s, -1) for s in satellite.tolist()], dtype=np.intp)
     glonass = np.char.startswith(satellite, "R")

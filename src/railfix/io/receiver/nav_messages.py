@@ -177,7 +177,12 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "tow_s": (16, 18.0, "u"),
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
-BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health; others are unknown.
+BCNAV1_WITH_HEALTH: Final = (
+    1,
+    2,
+    3,
+    4,
+)  #: Page types of subframe 3 that begin with the health; further types are unknown.
 #: A B-CNAV1 frame is passed on as three pages. Subframe, first bit and end of the bits of each page, which follow PRN,
 #: page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
@@ -357,7 +362,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Return the bits of pages, and which pages of `here` have a valid preamble and CRC; invalid ones are counted."""
+    """Return the bits of pages, and which pages of `here` have a valid preamble and CRC; count invalid pages."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here

@@ -179,7 +179,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, in
 
 
 def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
-    """Decode sub-blocks; those of type 1 have absolute values, those of type 2 are relative to their `master`."""
+    """Decode sub-blocks; type 1 has absolute values, and type 2 has values relative to the sub-block `master`."""
     own = place == master
     first = gather_structures(frames.data, master, _FIRST)
     other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first

@@ -22,7 +22,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_co
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
 ALL: Final = ""  #: Key of the types of a RINEX 2 file, which apply to all constellations.
-#: Longest accepted header; a file without END OF HEADER up to there is not RINEX.
+#: Longest accepted header.
 _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
 #: Alternative names of time systems written by some programs.

@@ -296,7 +296,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
 
 
 def _instant(text: str, digits: int) -> np.datetime64:
-    """Parse a time whose year takes `digits` characters (RINEX 2: 3, with decimals of seconds); ValueError if wrong."""
+    """Parse a time whose year has `digits` characters (RINEX 2: 3, later versions: 4); ValueError: not a time."""
     year, rest = int(text[:digits]), text[digits:]
     if digits < 4:
         year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0

@@ -123,7 +123,7 @@ class BlockReader:
             first, count = int(table.line[k]) + 1, int(table.count[k])
             after = self._event(lines[first : first + count], after)
             if after.reading != header.reading:
-                taken = first + count  # the lines after it have other types: decode the lines before it again
+                taken = first + count  # lines after a change have other types, so decode the lines before it again
                 trial = self._log.fresh()
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
                 break
@@ -305,7 +305,7 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Yield pieces of `epochs` epochs from runs; the first piece has a fifth of these, so that processing begins early.
+    """Yield pieces of `epochs` epochs from runs; the first piece is a fifth as long, so that processing begins early.
 
     Problems are reported in the piece during whose collection they were found.
     """

@@ -168,7 +168,7 @@ def _rows(lines: Lines, epochs: EpochHeads, header: RinexHeader) -> DecodedRows:
 def _select(
     lines: Lines, rows: DecodedRows, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> DecodedRows:
-    """Select the rows with a valid satellite name and a known, selected and declared constellation; record others."""
+    """Select the rows with a valid satellite name and a known, selected and declared constellation; count others."""
     broken = rows.number < 0
     log.faults(
         SATELLITES,

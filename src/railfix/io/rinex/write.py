@@ -41,7 +41,7 @@ def detect_packing(path: FilePath) -> Packing:
 
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
-    """Open a stream to a file, packed as requested or by the file name; the file is created only without an error.
+    """Open a stream to a file, packed as requested or by the file name; the file is created only if there is no error.
 
     ValueError: the packing is unknown. OutputError: the text cannot be compressed.
     """
