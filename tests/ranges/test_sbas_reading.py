@@ -167,7 +167,7 @@ def test_a_cut_message_says_that_it_has_no_parity(tmp_path: Path) -> None:
     read = read_sbas(path)
     assert set(read.parity_bits.tolist()) == {0}
     assert (read.bits[:, :28] == log.bits[:, :28]).all()
-    assert read.notes == (f"{path}: 5 messages carry no parity; errors of reception cannot be seen",)
+    assert read.notes == (f"{path}: 5 messages have no parity; reception errors cannot be detected",)
 
 
 def test_six_bits_that_are_no_parity_are_not_taken_for_one(tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_preambles_out_of_turn_are_told(tmp_path: Path) -> None:
     rows = [f"2353 {s} 137 63 : {digits(cases.message(63, s + (s > 7)), 64)}" for s in range(10)]
     path = tmp_path / "turn.sbs"
     path.write_text("\n".join(rows))
-    assert "2 of 10 messages are out of turn" in " ".join(read_sbas(path).notes)
+    assert "2 of 10 messages are not those" in " ".join(read_sbas(path).notes)
 
 
 def test_the_same_message_from_two_files_counts_once(tmp_path: Path) -> None:
@@ -218,11 +218,11 @@ def test_the_same_message_from_two_files_counts_once(tmp_path: Path) -> None:
 
 
 BROKEN = {
-    "letters": ("2353 3 137 63 : 53FCxx", "no 'week tow prn type"),
+    "letters": ("2353 3 137 63 : 53FCxx", "not of the form 'week tow prn type"),
     "length": ("2353 3 137 63 : 53FC00", "6 hexadecimal digits"),
-    "prn": (f"2353 3 12 63 : {digits(cases.message(63, 0), 64)}", "PRN 12 sends no SBAS"),
-    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "type 62 is written, the message on L1 says 63"),
-    "time": (f"2353 604800 137 63 : {digits(cases.message(63, 0), 64)}", "no GPS time"),
+    "prn": (f"2353 3 12 63 : {digits(cases.message(63, 0), 64)}", "PRN 12 is not an SBAS PRN"),
+    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "type 62 is stated, the message on L1 has 63"),
+    "time": (f"2353 604800 137 63 : {digits(cases.message(63, 0), 64)}", "not a GPS time"),
 }
 
 
@@ -243,13 +243,13 @@ def test_a_broken_line_is_named(tmp_path: Path, fault: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("nothing of the kind\n", "begins no SBAS file"),
-        ("# only a comment\n", "holds no SBAS message"),
+        ("nothing of the kind\n", "does not begin an SBAS file"),
+        ("# only a comment\n", "contains no SBAS message"),
         (f"{2.10:9.2f}           {'N: GPS NAV DATA':40s}RINEX VERSION / TYPE\n", "is a RINEX navigation file"),
         (as_rinex(a_log()).replace("END OF HEADER", "COMMENT"), "no END OF HEADER"),
         (as_rinex(a_log()).rsplit("\n", 2)[0], "no 32 bytes"),
         (as_rinex(a_log()).replace("L1", "L5", 1), "band L5"),
-        (as_ems(a_log()).replace("25 02 15", "25 02 31", 1), "no date and time"),
+        (as_ems(a_log()).replace("25 02 15", "25 02 31", 1), "not a date and time"),
     ],
 )
 def test_a_file_of_another_kind_is_refused(tmp_path: Path, text: str, words: str) -> None:

@@ -73,7 +73,7 @@ def test_a_sky_that_is_not_open_is_noted_and_one_that_is_too_good_is_not(away_db
     samples = Cn0Samples()
     samples.add(cn0, elevation, np.array(["G01"]), np.array(["1C"]))
     notes = _notes(fit_cn0_curve(samples), samples, 86_400.0)
-    assert [("of this open sky lie" in note) for note in notes] == ([True] if noted else [])
+    assert [("of the open-sky samples lie" in note) for note in notes] == ([True] if noted else [])
 
 
 def test_pieces_give_the_same_curve() -> None:

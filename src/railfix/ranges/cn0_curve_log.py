@@ -131,7 +131,7 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
         if rejected > _REJECTED_SHARE * np.count_nonzero(high):
             share = 100.0 * rejected / np.count_nonzero(high)
             notes.append(
-                f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of this open sky lie "
+                f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of the open-sky samples lie "
                 f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; its satellites differ, or the sky is not open"
             )
     return tuple(notes)

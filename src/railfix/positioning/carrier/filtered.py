@@ -191,7 +191,7 @@ def _ambiguities(
     # An extra row and column collects channels without a phase.
     index = np.where(arc_id == NO_ARC, count, np.searchsorted(memory.arc_id, arc_id))
     if (np.append(memory.arc_id, NO_ARC)[index] != arc_id).any():
-        raise ValueError("the phases of an arc go on after a newer arc of their channel; number arcs with number_arcs")
+        raise ValueError("an arc has phases after a newer arc of its channel; number arcs with number_arcs")
     own = np.zeros((len(arc_id), count + 1, count + 4))
     own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
     own[row, index, count + 1 :] = right

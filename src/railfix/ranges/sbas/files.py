@@ -68,11 +68,11 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
             return "ems"
         raise InputFileError(
             path,
-            f"{line[:40]!r} begins no SBAS file; '1481 108093 129 26 : 5369C4...' (RTKLIB), "
+            f"{line[:40]!r} does not begin an SBAS file; '1481 108093 129 26 : 5369C4...' (RTKLIB), "
             "'120 08 05 26 06 01 33 26 5369C4...' (EMS) or a RINEX header of type B was expected",
             line=number,
         )
-    raise InputFileError(path, "holds no SBAS message")
+    raise InputFileError(path, "contains no SBAS message")
 
 
 def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iterator[RawMessage | InputFileError]:
@@ -89,11 +89,13 @@ def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iter
 def _rtklib(path: str, number: int, line: str, band: Band) -> RawMessage | InputFileError:
     fields = _RTKLIB.fullmatch(line)
     if fields is None:
-        return InputFileError(path, f"{line[:40]!r} is no 'week tow prn type : hexadecimal message'", line=number)
+        return InputFileError(
+            path, f"{line[:40]!r} is not of the form 'week tow prn type : hexadecimal message'", line=number
+        )
     week, tow, prn, kind, digits = fields.groups()
     seconds = float(tow)
     if not (0 < int(week) < 10_000 and 0.0 <= seconds < SECONDS_PER_WEEK):
-        return InputFileError(path, f"week {week}, time of week {tow} is no GPS time", line=number)
+        return InputFileError(path, f"week {week}, time of week {tow} is not a GPS time", line=number)
     time = int(week) * SECONDS_PER_WEEK * 10**9 + round(seconds * 1e9)
     return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits), band)
 
@@ -102,13 +104,13 @@ def _ems(path: str, number: int, line: str, band: Band) -> RawMessage | InputFil
     fields = _EMS.fullmatch(line)
     if fields is None:
         return InputFileError(
-            path, f"{line[:40]!r} is no 'prn yy mm dd hh mm ss type hexadecimal message'", line=number
+            path, f"{line[:40]!r} is not of the form 'prn yy mm dd hh mm ss type hexadecimal message'", line=number
         )
     prn, date, second, kind, digits = fields.groups()
     try:
         time = _instant(date, second)
     except ValueError:
-        return InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
+        return InputFileError(path, f"{date.strip()} {second} is not a date and time", line=number)
     return _check_line(path, RawMessage(number, time, int(prn), int(kind), digits), band)
 
 
@@ -116,7 +118,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
     """Yield the records of RINEX type B: PRN and epoch, then lines of up to 18 bytes, the type before the first."""
     end = next((i for i, text in enumerate(lines) if text[60:].startswith("END OF HEADER")), None)
     if end is None:
-        raise InputFileError(path, "the header has no END OF HEADER; the file is cut, give the whole one")
+        raise InputFileError(path, "the header has no END OF HEADER; the file is incomplete; give the complete file")
     rest = [(i, text) for i, text in enumerate(lines[end + 1 :], start=end + 2) if text.strip()]
     at, broken = 0, False  # after a broken record or line, all lines up to the next header are skipped
     while at < len(rest):
@@ -125,7 +127,9 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
         fields = _RINEX_HEAD.fullmatch(text.strip())
         if fields is None:
             if not broken:
-                yield InputFileError(path, f"{text.strip()[:40]!r} is no 'prn yy mm dd hh mm ss'", line=number)
+                yield InputFileError(
+                    path, f"{text.strip()[:40]!r} is not of the form 'prn yy mm dd hh mm ss'", line=number
+                )
             broken = True
             continue
         prn, date, second, sent_on, length = fields.groups()
@@ -144,7 +148,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
         try:
             time = _instant(date, second) + round(_RINEX_SHIFT_S * 1e9)
         except ValueError:
-            yield InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
+            yield InputFileError(path, f"{date.strip()} {second} is not a date and time", line=number)
             continue
         # Before 2004 the satellite number was the PRN less 100.
         number_of_geo = int(prn) + (100 if int(prn) < 100 else 0)
@@ -154,7 +158,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
 def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFileError:
     if raw.prn not in GEO_PRNS:
         return InputFileError(
-            path, f"PRN {raw.prn} sends no SBAS; 120 to 158 or 183 to 202 was expected", line=raw.line
+            path, f"PRN {raw.prn} is not an SBAS PRN; 120 to 158 or 183 to 202 was expected", line=raw.line
         )
     if len(raw.digits) == 250 and set(raw.digits) <= {"0", "1"}:
         digits = f"{int(raw.digits, 2) << 6:064X}"
@@ -167,7 +171,7 @@ def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFil
     kind = (int(raw.digits[:4], 16) >> (2 if band == "L1" else 6)) & 0x3F
     if raw.kind not in (-1, kind):
         return InputFileError(
-            path, f"type {raw.kind} is written, the message on {band} says {kind} (setting sbas_band)", line=raw.line
+            path, f"type {raw.kind} is stated, the message on {band} has {kind} (setting sbas_band)", line=raw.line
         )
     return raw
 
@@ -230,7 +234,7 @@ def read_sbas(
         _read_file(path, number, broken_lines, gathered, band)
     if not gathered.raw:
         raise InputFileError(
-            ", ".join(sources), f"holds no SBAS message of {band} that can be read (setting sbas_band)"
+            ", ".join(sources), f"contains no SBAS message of {band} that can be read (setting sbas_band)"
         )
     log = _check(gathered, sources, band)
     if not len(log):
@@ -341,8 +345,8 @@ def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers)
             messages = int((of_file == count).sum())
             if messages:
                 notes.append(
-                    f"{path}: {messages} messages carry {words}; "
-                    + ("errors of reception cannot be seen" if count == 0 else "1 damaged message in 64 passes")
+                    f"{path}: {messages} messages have {words}; "
+                    + ("reception errors cannot be detected" if count == 0 else "1 damaged message in 64 passes")
                 )
     return notes
 
@@ -359,6 +363,6 @@ def _order_notes(log: SbasMessages) -> list[str]:
         if counts.max() < counts.sum():
             notes.append(
                 f"PRN {prn}: the preambles of {int(counts.sum() - counts.max())} of {int(counts.sum())} messages are "
-                "out of turn with their seconds"
+                "not those of their seconds"
             )
     return notes
