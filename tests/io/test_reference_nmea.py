@@ -124,7 +124,7 @@ def test_a_separation_of_zero_is_doubted_where_the_geoid_is_elsewhere(tmp_path: 
         ([*GOOD, gga("010001.00")[:-2] + "00", LAST], r"line 3: the checksum is 00, \w\w was expected; --lenient"),
         ([*GOOD, signed("GNGGA,010001.00,3521,N"), LAST], "line 3: a field of GGA is invalid; --lenient"),
         ([*GOOD, gga("010001.00", latitude="9921.0,N"), LAST], "line 3: a field of GGA is invalid"),
-        ([gga("010000.00")], "no RMC or ZDA sentence, the date is unknown"),
+        ([gga("010000.00")], "no RMC or ZDA sentence, so the date is unknown"),
         (GOOD[:1], "there is no GGA sentence"),
     ],
 )

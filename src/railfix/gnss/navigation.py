@@ -44,7 +44,7 @@ class _NavigationRecords(FrozenArrays, NotebookTable):
 class KeplerRecords(_NavigationRecords):
     """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows."""
 
-    satellite: Strings  #: Shape (n,).
+    satellite: Strings  #: Name of the satellite, such as "G01"; shape (n,).
     #: "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou); shape (n,).
     message: Strings
     #: Clock and ephemeris reference times, GPS time. The week is resolved from toc; shape (n,).
@@ -101,7 +101,7 @@ class KeplerRecords(_NavigationRecords):
 class GlonassRecords(_NavigationRecords):
     """State-vector records of GLONASS, n rows."""
 
-    satellite: Strings  #: Shape (n,).
+    satellite: Strings  #: Name of the satellite, such as "R01"; shape (n,).
     toe: Datetimes  #: Reference time, converted from UTC to GPS time; shape (n,).
     transmitted: Datetimes  #: Message frame time, GPS time; NaT when absent; shape (n,).
     clock_bias_s: Floats  #: -tau_n, the correction to be added, as in RINEX; shape (n,).
@@ -111,8 +111,8 @@ class GlonassRecords(_NavigationRecords):
     velocity_ecef_mps: Floats
     acceleration_ecef_mps2: Floats
     health: Integers  #: 0 is healthy, shape (n,).
-    frequency_channel: Integers  #: Shape (n,).
-    age_days: Floats  #: Shape (n,).
+    frequency_channel: Integers  #: Number of the frequency channel, -7 to 6; shape (n,).
+    age_days: Floats  #: Age of the immediate data (E_n), shape (n,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +120,7 @@ class PreciseEphemeris(NotebookTable):
     """Positions and clocks from SP3, E epochs by N satellites."""
 
     time: Datetimes  #: GPS time (files in another time system are converted), shape (E,).
-    satellite: Strings  #: Shape (N,).
+    satellite: Strings  #: Name of the satellite, shape (N,).
     position_ecef_m: Floats  #: NaN where the file has none (0.000000), shape (E, N, 3).
     clock_s: Floats  #: NaN where the file has none (999999.999999), shape (E, N).
     source: str = ""  #: Names of the files.

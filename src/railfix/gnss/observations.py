@@ -92,8 +92,8 @@ class Observations(NotebookTable):
     #: mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
     signal: Strings
     code_m: Floats  #: Pseudorange, shape (T, M).
-    phase_cycles: Floats  #: Shape (T, M).
-    doppler_hz: Floats  #: Positive when the satellite approaches, shape (T, M).
+    phase_cycles: Floats  #: Carrier phase, shape (T, M).
+    doppler_hz: Floats  #: Doppler shift, positive when the satellite approaches; shape (T, M).
     cn0_dbhz: Floats  #: Carrier-to-noise density; NaN where only the RINEX 1-9 digit exists; shape (T, M).
     loss_of_lock: Bytes  #: RINEX loss-of-lock indicator of the phase, 0 where blank or absent; shape (T, M).
     #: Whether an epoch must not be differenced with the previous epoch: after a power failure (epoch flag 1), at a new
@@ -102,7 +102,7 @@ class Observations(NotebookTable):
     #: Interference indicated by the receiver: 1 jamming, 2 spoofing, 3 both, 0 if none or without such a message;
     #: shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
-    #: Front-end gain, in the receiver's unit; NaN where the log does not have it; shape (T,).
+    #: Front-end gain, in the receiver's unit, NaN where unknown; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
     #: Messages about skipped faults (file, line, fault); at most `MAX_PROBLEMS`, then a message with the number of

@@ -148,7 +148,7 @@ def scan_observations(
         )  # fmt: skip
     if not all(receiver):
         raise MismatchError(
-            f"{paths[receiver.index(False)]} is RINEX and {paths[receiver.index(True)]} a receiver's log; "
+            f"{paths[receiver.index(False)]} is a RINEX file and {paths[receiver.index(True)]} a receiver log; "
             "give files of one kind for one antenna"
         )
     return in_pieces(_receiver_runs(paths, letters, (start, end, date), progress), epochs)

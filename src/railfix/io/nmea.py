@@ -99,7 +99,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
         dates = [_Date(fixes[0].line, fixes[0].of_day_s, date.astype("datetime64[D]"))]
     if not dates:
         raise InputFileError(
-            path, "there is no RMC or ZDA sentence, the date is unknown; log one of them, or give the date (--date)"
+            path, "there is no RMC or ZDA sentence, so the date is unknown; log RMC or ZDA, or give the date (--date)"
         )
     geodetic = np.array([fix.geodetic for fix in fixes])
     flat = np.isfinite(geodetic[:, 0]) & np.isnan(geodetic[:, 2])

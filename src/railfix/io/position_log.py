@@ -35,7 +35,7 @@ _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PositionLog(NotebookTable):
-    """Positions of a log, n rows in the order of the file."""
+    """Positions of a log, n rows in the order of the file, or of time (`railfix.io.positions.read_positions`)."""
 
     path: str
     time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).

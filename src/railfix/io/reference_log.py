@@ -41,10 +41,10 @@ class AntennaReference(NotebookTable):
 
     time: Datetimes  #: GPS time, strictly rising, shape (R,).
     ecef_m: Floats  #: Position in ECEF, shape (R, 3).
-    chainage_m: Floats  #: NaN where the file has none, shape (R,).
+    chainage_m: Floats  #: Chainage, NaN where the file has none; shape (R,).
     speed_mps: Floats  #: Along the line, positive toward rising chainage; NaN where unknown; shape (R,).
     sigma_m: Floats  #: Standard deviation along the track; NaN where the file has none; shape (R,).
-    source: Strings  #: One of `SOURCES`, shape (R,).
+    source: Strings  #: Source of the position, one of `SOURCES`; shape (R,).
     environment: Strings  #: Environment such as "open", blank where the file has none, shape (R,).
 
     def __post_init__(self) -> None:

@@ -56,12 +56,12 @@ class ReferenceInputs(InputFiles):
     track: tuple[Path, ...] = input_option(TRACK, metavar="TRACK")
     vehicle: Path | None = input_option(VEHICLE, None, metavar="TOML")
     front: tuple[Path, ...] = input_option(
-        "RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
+        "RINEX observation file of the front antenna, for Doppler speeds; may be repeated.", (), metavar="OBS"
     )
     rear: tuple[Path, ...] = input_option(
-        "RINEX observation file of the rear antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
+        "RINEX observation file of the rear antenna, for Doppler speeds; may be repeated.", (), metavar="OBS"
     )
-    nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; repeat it for several.", ())
+    nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; may be repeated.", ())
 
     pulses: Path | None = input_option(
         "Tachometer: time_gpst with count, distance_m, or one row per pulse; direction if known.", None, metavar="CSV"

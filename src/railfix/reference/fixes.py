@@ -28,16 +28,16 @@ def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
     return option(text, default, name=name, metavar=metavar, panel="Limits", gt=0.0, allow_inf_nan=False)
 
 
-_TRAVEL_SHARE: Final = 0.005
+_TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance that is added to `ReferenceSettings.travel_m`.
 #: Fixes that disagree with their neighbours are rejected up to twice this long; if they disagree for longer, the
 #: distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
-_FIX_FLOOR_M: Final = 0.01
+_FIX_FLOOR_M: Final = 0.01  #: Smallest standard deviation of a fix along the track.
 #: Standard deviation [m/s2] and correlation time [s] of the train's acceleration (R. A. Singer, 1970). Trains
 #: accelerate and brake by 0.5 to 1 m/s2 for some seconds.
 MOTION_MPS2: Final = 0.5
 MOTION_S: Final = 5.0
-ACCELERATION_BIAS_MPS2: Final = 0.05
+ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer's initial offset.
 
 
 class ReferenceSettings(Settings):
@@ -115,11 +115,11 @@ class FixRejection(IntFlag):
 class Fixes:
     """Positions of one antenna with reasons for rejection, n rows in order of time."""
 
-    time: Datetimes  #: Shape (n,).
-    ecef_m: Floats  #: Shape (n, 3).
-    quality: Integers  #: Shape (n,).
-    ratio: Floats  #: NaN where the log has none, shape (n,).
-    sigma_enu_m: Floats  #: East, north, up; NaN where the log has none; shape (n, 3).
+    time: Datetimes  #: GPS time, shape (n,).
+    ecef_m: Floats  #: Position in ECEF, shape (n, 3).
+    quality: Integers  #: Quality as in `PositionLog`, shape (n,).
+    ratio: Floats  #: Ratio of the ambiguity test, NaN where the log has none; shape (n,).
+    sigma_enu_m: Floats  #: Standard deviations east, north, up; NaN where the log has none; shape (n, 3).
     rejection: Bits  #: `FixRejection` bits; a row rejected in one check is not checked further; shape (n,).
     #: Distance between the antennas minus their distance on the vehicle; NaN where not checked; shape (n,).
     spacing_m: Floats
@@ -127,7 +127,7 @@ class Fixes:
     arc_m: Floats
     lateral_m: Floats
     height_m: Floats
-    sigma_m: Floats  #: Along the track, shape (n,).
+    sigma_m: Floats  #: Standard deviation along the track, shape (n,).
     #: Distance from the previous good fix minus the distance travelled; NaN where no sensor measured it; shape (n,).
     travel_m: Floats
 

@@ -65,7 +65,7 @@ class Evidence:
     doppler_sigma_mps: Floats
     wheel_m: Floats  #: Cumulative wheel distance along rising chainage, from an arbitrary origin; shape (N,).
     wheel_sigma_m: float  #: Standard deviation of one reading.
-    acceleration_mps2: Floats  #: Mean along rising chainage over each step, without gravity; shape (N - 1,).
+    acceleration_mps2: Floats  #: Mean acceleration over each step along the path, without gravity; shape (N - 1,).
 
 
 @dataclass(frozen=True, kw_only=True)

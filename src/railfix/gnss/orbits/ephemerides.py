@@ -58,7 +58,7 @@ class Orbits(RowArrays):
 
     i_dot: Floats
     node: Floats  #: Longitude of the ascending node at toe [rad].
-    node_rate: Floats  #: [rad/s].
+    node_rate: Floats  #: Rate of `node` [rad/s].
     #: BeiDou GEO: rotation rate of the Earth-fixed frame relative to the tilted frame at toe; otherwise 0 [rad/s].
     tilted_rate: Floats
 
@@ -234,7 +234,7 @@ class GlonassStates:
     #: States, with the reference time in the middle column, shape (3, records, 2 steps + 1) [m, m/s].
     position: Floats
     velocity: Floats
-    luni_solar: Floats  #: Shape (3, records) [m/s^2].
+    luni_solar: Floats  #: Acceleration by Moon and Sun, shape (3, records) [m/s^2].
 
     @classmethod
     def from_records(cls, records: GlonassRecords, reach_s: float) -> GlonassStates:

@@ -327,9 +327,9 @@ class ChannelRecords:
 
     any_other: bool
     signal: Integers  #: Row of `group_delay_s` and `unhealthy`, shape (K,).
-    group_delay_s: Floats  #: Shape (signals, records).
-    unhealthy: Masks  #: Shape (signals, records).
-    glonass_number: Integers  #: Shape (R,).
+    group_delay_s: Floats  #: Group delay by signal and record, shape (signals, records).
+    unhealthy: Masks  #: Whether a signal is unhealthy by record, shape (signals, records).
+    glonass_number: Integers  #: Lookup number of GLONASS channels, -1 for none; shape (R,).
 
 
 class PreparedRecords:
