@@ -110,7 +110,7 @@ class GlonassRecords(_NavigationRecords):
     position_ecef_m: Floats
     velocity_ecef_mps: Floats
     acceleration_ecef_mps2: Floats
-    health: Integers  #: 0 is healthy, shape (n,).
+    health: Integers  #: Broadcast health, 0 if healthy; shape (n,).
     frequency_channel: Integers  #: Number of the frequency channel, -7 to 6; shape (n,).
     age_days: Floats  #: Age of the immediate data (E_n), shape (n,).
 

@@ -177,12 +177,7 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "tow_s": (16, 18.0, "u"),
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
-BCNAV1_WITH_HEALTH: Final = (
-    1,
-    2,
-    3,
-    4,
-)  #: Page types of subframe 3 that begin with the health; further types are unknown.
+BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 known to begin with the health.
 #: A B-CNAV1 frame is passed on as three pages. Subframe, first bit and end of the bits of each page, which follow PRN,
 #: page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))

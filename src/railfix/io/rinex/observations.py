@@ -35,7 +35,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, spli
 
 #: Bytes of text in a block: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: Longest accepted line, which is longer than lines that a failing recorder fills with zeros.
+#: Longest accepted line. Failing recorders fill lines with zeros, but these lines are shorter.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
 _TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems equal GPS time.
