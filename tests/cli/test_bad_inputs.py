@@ -111,7 +111,7 @@ def feet(match: re.Match[str]) -> str:
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (("line.csv", r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$", feet), "are the heights of the map in feet?"),
+        (("line.csv", r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$", feet), "the heights of the map may be in feet"),
         (("front.obs", "GPS(?= +TIME OF FIRST)", "GLO"), "with time tags 18 s earlier"),
     ],
     ids=["heights_in_feet", "time_tags_of_glonass"],

@@ -299,7 +299,7 @@ def _notes_of_sensors(
 
 
 #: Last clause of a note on positions off the map whose cause was not found.
-_TRACK: Final = "is this the right track?"
+_TRACK: Final = "check whether this is the right track"
 #: Largest number of excluded satellites that are named in notes.
 _NAMED: Final = 3
 
@@ -381,8 +381,8 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     size = f"between {low:+.2f} and {high:+.2f} s" if drifting else f"{abs(middle):.2f} s"
     which = "off (+ late)" if drifting else "early" if middle < 0.0 else "late"
     scale = next((text for off, text in _SCALES.items() if not drifting and abs(middle - off) < _STEADY_S), None)
-    guess = "do they drift" if drifting else f"are they {scale}, not GPS time" if scale else "are they GPS time"
-    return f"the time tags are {size} {which}, so that no position has a level ({guess}?)"
+    guess = "they may drift" if drifting else f"they may be {scale}, not GPS time" if scale else "expected GPS time"
+    return f"the time tags are {size} {which}, so that no position has a level ({guess})"
 
 
 #: Largest spread of a constant time-tag error [s].

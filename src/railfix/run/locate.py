@@ -72,7 +72,7 @@ def locate_files(
     reasons = reasons_text(located)
     if not np.isfinite(located.ecef_m).any():
         if (located.no_position == int(NoPosition.NO_RECORD)).any():
-            reasons += "; are the navigation files from the day of the log?"
+            reasons += "; check that the navigation files are from the day of the log"
         message = f"{inputs.log[0]}: no epoch has a position: {reasons}"
         raise NoPositionError("; ".join([message, *navigation.notes]))
     write_whole(out, solution_text(located))
@@ -153,11 +153,11 @@ def likely_cause(observations: Observations, received: Received, config: Config,
         if offset is not None and offset[0] < _ON_LINE_M:
             return (
                 f"with time tags {_duration(abs(shift_s))} {'later' if shift_s > 0 else 'earlier'} its positions lie "
-                "on the line: are the tags UTC or local time, or is the time system in its header wrong?"
+                "on the line; the tags may be UTC or local time, or the time system in its header may be wrong"
             )
     if as_tagged is None:
         return ""
-    return f"its positions lie {as_tagged[0]:,.0f} m from the line: is this the right track?"
+    return f"its positions lie {as_tagged[0]:,.0f} m from the line; check whether this is the right track"
 
 
 def _shifts_s() -> Iterator[int]:
@@ -192,8 +192,8 @@ def _cause_in_height(above_m: float, of_line_m: float) -> str:
     """Return a clause on a height offset from the line, and on the unit or datum that may explain it."""
     height = of_line_m + above_m
     feet = abs(of_line_m * _FEET - height) < abs(above_m) / 4.0
-    hint = "are the heights of the map in feet?" if feet else "is the height datum of the map the right one?"
-    return f"its positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line: {hint}"
+    hint = "the heights of the map may be in feet" if feet else "check the height datum of the map"
+    return f"its positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line; {hint}"
 
 
 def _duration(seconds: int) -> str:

@@ -155,7 +155,7 @@ def _check_extent(files: tuple[Path, ...], track: Track) -> None:
     if low < HEIGHTS_M[0] or high > HEIGHTS_M[1]:
         raise MismatchError(
             f"{', '.join(map(str, files))}: has heights from {low:,.0f} to {high:,.0f} m; expected metres between "
-            f"{HEIGHTS_M[0]:,.0f} and {HEIGHTS_M[1]:,.0f}: are they in millimetres?"
+            f"{HEIGHTS_M[0]:,.0f} and {HEIGHTS_M[1]:,.0f}; they may be in millimetres"
         )
 
 

@@ -89,7 +89,7 @@ def standstill_codes(
     places = locate(obs, received, config, book).ecef_m
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
-        raise NoPositionError("the log has no position; are the navigation files from the day of the log?")
+        raise NoPositionError("the log has no position; check that the navigation files are from the day of the log")
     # three parts, because a train that returns has the same position at the beginning and the end of the log
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
