@@ -141,7 +141,7 @@ def test_a_train_without_a_place_runs_on_for_a_time_only() -> None:
     train.note_position(100.0, 20.0, now_s=0.0)
     for now_s in (1.0, 4.9, 5.1):
         train.note_position(None, None, now_s=now_s)
-        assert train.brake_reason(now_s) == (None if now_s < 5.0 else "no place")
+        assert train.brake_reason(now_s) == (None if now_s < 5.0 else "no position")
 
 
 def test_gradients_of_the_line_come_on_board_in_both_directions() -> None:

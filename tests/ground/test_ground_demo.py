@@ -330,7 +330,7 @@ def test_a_page_without_news_says_within_two_seconds_that_it_is_old(
         page.clock.run_for(1400)
         assert not page.is_visible("#stale")
         page.clock.run_for(600)
-        assert page.inner_text("#stale").startswith("OLD: the centre has been silent for 2 s.")
+        assert page.inner_text("#stale").startswith("OUT OF DATE: no data from the centre for 2 s.")
         assert page.get_attribute("body", "class") == "stale"
 
 

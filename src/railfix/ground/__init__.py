@@ -1,8 +1,9 @@
-"""Ground side: reference triangle, control centre, running intervals and routes, redundant links.
+"""Ground side: reference triangle, control centre, intervals and routes of trains, redundant links.
 
-Here are the pure parts: verdicts of the triangle and their monitor, states of trains, intervals, routes and points,
-supervision, and the on-board end of authorities. The centre at work (`railfix.ground.control`, `railfix.ground.serve`),
-its store, page and links need the extra ``railfix[ground]`` and are imported from their modules.
+This module exports the parts without input or output: verdicts of the triangle and their monitor, states of trains,
+intervals, routes and points, supervision by the centre, and supervision on board. The running centre
+(`railfix.ground.control`, `railfix.ground.serve`), its store, page and links need the extra ``railfix[ground]`` and are
+imported from their modules.
 """
 
 import lazy_loader

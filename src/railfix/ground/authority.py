@@ -1,6 +1,6 @@
 """Messages from the centre to a train: movement authority with speed limits, and order to brake.
 
-Each message is a canonical CBOR array: kind and version, then the fields.
+Each message is a canonical CBOR array of its kind, version and fields.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from railfix.core.settings import Message
 from railfix.ground.layout import MOST_PARTS
 from railfix.io.train_message import MessageError, cbor, validate_message
 
-#: Version of the messages; a receiver rejects others.
+#: Version of the messages; a receiver rejects other versions.
 VERSION: Final = 3
 
 Number = Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -23,18 +23,18 @@ GradientPart = tuple[Chainage, Annotated[int, Field(ge=-1000, le=1000)]]
 
 
 class Authority(Message):
-    """One authority message, sent after each report of the train, at a stop, and at least every second."""
+    """Movement authority, sent after each report of the train, at a stop, and at least every second."""
 
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
-    number: Number  #: Rises with every message of the centre, also over its restarts.
-    #: Sequence number of the train's newest report that the centre has stored, 0 without one: it acknowledges the
-    #: report, and the train derives the age of this message from it by its own clock.
+    number: Number  #: Number that rises with every authority sent to the train, also over restarts of the centre.
+    #: Sequence number of the train's newest report that the centre has stored, 0 without one. It acknowledges the
+    #: report, and the age of the authority on board is the time since the train sent this report.
     report: Number
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
     stopped: bool  #: Whether the train is ordered to stop.
-    #: The train is requested to accept this end instead of a farther end, if it can stop before it.
+    #: Whether the train is requested to accept this end instead of a farther end, if it can stop before this end.
     shortens: bool = False
     session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Identifier of the on-board start that `report` belongs to.
     overlap_cm: Number = 0  #: Distance kept free beyond the end for a train that passes the end at release speed.
@@ -75,9 +75,9 @@ class Authority(Message):
 
 
 class BrakeOrder(Authority):
-    """Order to brake to a stop; it needs no store, grants nothing, and is repeated until a report names its number.
+    """Order to brake to a stop, which is sent without a commit and repeated until a report names its number.
 
-    `number` is the latest authority's number; any later authority without `stopped` ends the order.
+    It extends no authority. `number` is the latest authority's number; a later authority without `stopped` ends it.
     """
 
     kind: ClassVar[int] = 2

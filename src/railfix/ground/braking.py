@@ -1,7 +1,7 @@
-"""Braking curves: permitted speed of a train that has to stop before an end, on a line with gradients.
+"""Braking curves: permitted speed of a train that approaches the end of its authority, on a line with gradients.
 
 This is a simplified form of SUBSET-026 chapter 3.13, with one deceleration, a safety factor, and stepwise gradients.
-Rotating mass, adhesion, service brake and display are not modelled. Positions are distances in running direction.
+Rotating mass, adhesion, service brake and display are not modelled. Positions are distances in running direction [m].
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class Steps(NamedTuple):
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed from which full braking at a position reaches a target at its speed [m2/s2].
+    """Return the square of the speed from which braking at a position reaches the target at its speed [m2/s2].
 
-    ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target negative.
+    ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target it is below ``v_target^2``.
     """
     if at_m >= target.at_m:
         return target.speed_mps**2 - (at_m - target.at_m)
@@ -88,7 +88,7 @@ def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits)
 
 
 def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple[float, float]:
-    """Return position and speed at which the brakes act."""
+    """Return the position [m] and speed [m/s] at which the brakes act."""
     cut = min(brakes.cut_s, brakes.build_up_s)
     faster = speed_mps + brakes.traction_mps2 * cut
     way = speed_mps * cut + 0.5 * brakes.traction_mps2 * cut**2 + faster * (brakes.build_up_s - cut)
@@ -99,8 +99,8 @@ def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLim
     """Return the speed above which the train is braked, now or after a given time [m/s].
 
     It is the largest speed at which the train is on the curve of `braking_speed` when its brakes act. Between two
-    changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed. Each
-    such interval gives a quadratic equation; they are solved from the target backward.
+    changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed, which
+    gives a quadratic equation. The equations are solved from the target backward.
     """
     if at_m >= target.at_m:
         return 0.0
@@ -120,7 +120,7 @@ def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLim
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Return the largest speed for which `fits` is true, if it is true for all smaller speeds; 0 if for none."""
+    """Return the largest speed for which `fits` is true [m/s], 0 without one; `fits` is true for all lower speeds."""
     low, high = 0.0, _TOP_MPS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -155,9 +155,9 @@ def supervise(
     steps: Steps | None = None,
     brakes: BrakeLimits,
 ) -> Supervised:
-    """Return the speeds of a train by its safe rear and front ends, the lowest over all its targets.
+    """Return the supervised speeds of a train at its safe front and rear ends, the lowest over all targets.
 
-    Each restriction has its start, end and speed, and applies to the whole train.
+    Each restriction has its start [m], end [m] and speed [m/s], and applies to the whole train.
     """
     steps = steps or Steps()
     release = release_mps(overlap_m, end_m, steps, brakes)

@@ -26,9 +26,9 @@ _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceCurve:
-    """Reference run of one direction."""
+    """Reference run curve of one running direction."""
 
-    direction: int  #: Direction against chainage.
+    direction: int  #: Running direction: 1 toward rising chainage, -1 toward falling.
     running_s: Floats  #: Running time without the dwell times at stations, strictly rising; shape (N,).
     chainage_m: Floats  #: Front of the train, strictly rising or, with direction -1, falling; shape (N,).
     stations_m: Floats  #: Stopping positions of the front, in the order of the run; shape (K,).
@@ -45,8 +45,8 @@ class ReferenceCurve:
     def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
         """Return the curve of a run that starts and stops at each station with constant acceleration.
 
-        Stations, shape (K,) [m], are in the order of the run; where they are near each other the train does not reach
-        its highest speed [m/s].
+        `stations_m`, shape (K,), are in the order of the run. Between stations that are near each other the train does
+        not reach `speed_mps`.
         """
         direction = 1 if stations_m[-1] > stations_m[0] else -1
         time, place, start = [np.zeros(1)], [stations_m[:1]], 0.0
@@ -68,7 +68,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position after a running time, at most at the next station, regardless of any timetable."""
+        """Return the position after a running time, at most at the next station, regardless of any timetable [m]."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -99,20 +99,20 @@ class TrainState(Enum):
 
     #: No report with a position since the centre was started.
     UNKNOWN = "unknown"
-    #: Reports arrive.
+    #: Reports are accepted.
     TRACKED = "tracked"
-    #: No report: shown by simulated running on the reference run curve.
+    #: No report for `lost_s`: the train is shown by simulated running on the reference run curve.
     SIMULATED = "simulated"
     #: No report for too long, or the simulated position has reached the end of the authority.
     ERROR = "error"
 
 
 class CentreLimits(Settings):
-    """Times of the centre."""
+    """Limits for the reports of trains."""
 
-    #: After this time without a report the train is shown by simulated running.
+    #: Time without an accepted report after which a train is shown by simulated running.
     lost_s: float = Field(default=3.0, gt=0)
-    error_s: float = Field(default=120.0, gt=0)  #: After this time without a report the train is in error.
+    error_s: float = Field(default=120.0, gt=0)  #: Time without an accepted report after which a train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
     #: Largest delay of a train's clock behind the instants of its positions, and largest undetected variation of its
     #: delays.
@@ -135,13 +135,13 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 before the first.
-    session: int = 0  #: On-board start that the number belongs to.
-    retired: tuple[int, ...] = ()  #: Earlier on-board starts, whose late messages are ignored.
-    counted_s: float | None = None  #: Centre's clock at the arrival of this number.
+    session: int = 0  #: Identifier of the on-board start that the number belongs to.
+    retired: tuple[int, ...] = ()  #: Identifiers of earlier on-board starts, whose late messages are rejected.
+    counted_s: float | None = None  #: Centre's clock at the arrival of the newest sequence number [s].
     rejected: str | None = None  #: Reason why the newest report was rejected.
     message: TrainMessage | None = None  #: Newest report with a position.
-    heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of this report.
-    measured_s: float = 0.0  #: Centre's clock at the instant for which its position is valid.
+    heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of `message` [s].
+    measured_s: float = 0.0  #: Centre's clock at the instant for which the position of `message` is valid [s].
     shown_m: float | None = None  #: Displayed position of the front.
     #: Reported less simulated position at the last resynchronisation, positive in running direction.
     jump_m: float | None = None
@@ -156,7 +156,7 @@ class Rejection(Enum):
     EARLIER_START = "of an earlier start on board"
     FAR_AHEAD = "number further ahead than a train can have counted; start its unit again"
     NO_PLACE = "without a position"
-    NO_FACING = "the direction in which the front end looks is unknown"
+    NO_FACING = "the direction of the front end is unknown"
     NO_FRONT_END = "the position of the front end is unknown"
     TOO_OLD = "position too old when it was sent, or later than the train's clock; set that clock"
 
@@ -170,8 +170,8 @@ def report_received(
 ) -> tuple[TrainRecord, Rejection | None]:
     """Return the record after a report, and the reason if the report is rejected.
 
-    The instant of the measurement follows from the age that the train gives (both times by its own clock), so that
-    clocks of train and centre need not agree; the delay of the link, which is unknown, is neglected.
+    The instant of the measurement is computed from the age of the position by the train's own clock, so that the clocks
+    of train and centre need not agree. The delay of the link, which is unknown, is neglected.
     """
     if message.train != record.train:
         return record, Rejection.OTHER_TRAIN
@@ -220,7 +220,7 @@ def time_passed(
     authority_m: float | None = None,
     limits: CentreLimits,
 ) -> TrainRecord:
-    """Return the record at a later instant.
+    """Return the record at a later instant, with the state and displayed position after a time without reports.
 
     Parameters
     ----------
@@ -228,9 +228,9 @@ def time_passed(
     now_s : float [s]
         Centre's clock.
     curves : dict of int to ReferenceCurve
-        By direction.
+        Reference run curves by running direction.
     authority_m : float, optional [m]
-        End of the train's authority: the simulated position stops there.
+        End of the train's authority, where the simulated position stops and the train is in error.
     limits : CentreLimits
     """
     if record.message is None or record.state is TrainState.UNKNOWN or record.message.chainage_cm is None:

@@ -33,7 +33,7 @@ def _placed(
         return "the interval reaches beyond the line"
     stations = layout.stations_between(low, high)
     tracks = dict.fromkeys(stations, track)
-    # between stations the route ends where it began: in the station behind the train
+    # between stations the route ends where it began, in the station behind the train
     behind = [k for k, s in enumerate(layout.stations) if direction * (s.begin_m - front_m) < 0.0]
     station = max(behind) if direction > 0 else min(k for k, s in enumerate(layout.stations) if s.end_m > front_m)
     if station not in tracks:
@@ -56,10 +56,10 @@ def correct_interval(
     track: int,
     lapsed: bool = False,
 ) -> Changed:
-    """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
+    """Return the state with the interval of a stopped train set by hand, and the reason for a refusal.
 
-    Its routes and its authority end, and points no longer under it are free. The train must therefore report that it
-    obeys an order to brake that no authority in transit can end, unless all authorities have `lapsed` on board.
+    Its route and its authority end, and its locks on points are removed. The train must therefore report that it obeys
+    an order to brake which no authority in transit can end, unless all authorities have `lapsed` on board.
     """
     known = state.trains.get(train)
     if known is None:
@@ -76,7 +76,7 @@ def correct_interval(
 
 
 def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
-    """Return a refusal if a train may still run by an authority in transit, None if it cannot."""
+    """Return the reason for a refusal if a train may still run by an authority in transit, otherwise None."""
     if known.runs_by is None or lapsed:
         return None
     return (
@@ -96,7 +96,7 @@ def enter_train(
     front_m: float,
     track: int,
 ) -> Changed:
-    """Return the state with a train added anywhere on the line, even without reports, and the reason of a refusal."""
+    """Return the state with a train added anywhere on the line, even without reports, and the reason for a refusal."""
     if train in state.trains:
         return state, f"train {train} exists already"
     if not 0 < train < 1 << 32 or not length_m > 0.0:
@@ -112,7 +112,7 @@ def enter_train(
 def _refused_overlap(
     state: Interlocking, train: TrainInterval, layout: Layout, points: Mapping[PointName, PointState]
 ) -> Changed:
-    """Return the state with a train added, unless another train overlaps its interval."""
+    """Return the state with a train added, or the reason for a refusal if another train's interval overlaps."""
     pieces = pieces_of(train, layout)
     for other in state.trains.values():
         if other.train != train.train and overlap(pieces, pieces_of(other, layout)):
@@ -133,8 +133,8 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
     """Return the state without a train; its sections are then occupied by vehicles that report nothing.
 
-    The sections are freed by their detection, or by the order of a person who has seen that they are free. Therefore,
-    as in `correct_interval`, no authority in transit may let the train run.
+    The sections are freed by their detection, or by the order of a person who has seen that they are free. As in
+    `correct_interval`, no authority in transit may permit the train to run.
     """
     known = state.trains.get(train)
     if known is None:
@@ -154,7 +154,10 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
 
 
 def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
-    """Return the state in which one train joins the train in front of it, with both lengths and one interval."""
+    """Return the state in which train `other` is joined to train `lead` ahead of it, and the reason for a refusal.
+
+    The joined train has the number `lead`, the sum of both lengths, and the interval of both trains.
+    """
     first, second = state.trains.get(lead), state.trains.get(other)
     if first is None or second is None or lead == other:
         return state, "two trains of the line were expected"
@@ -183,9 +186,10 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
 
 
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
-    """Return the state in which the rear of a train, behind its first `length_m`, is another train.
+    """Return the state in which the rear part of a train, behind its first `length_m`, is the new train `other`.
 
-    Until the parts are apart, their intervals overlap by the uncertainty of the position.
+    Until the parts are apart, their intervals overlap by the uncertainty of the position. The second value is the
+    reason for a refusal.
     """
     known = state.trains.get(train)
     if known is None:

@@ -1,7 +1,7 @@
 """Running control centre: supervision with its store, the monitor of satellite positioning, log, and page values.
 
-Acknowledged and granted changes are committed before they are sent: a centre that is killed at any moment restarts with
-everything its trains have received.
+Authorities, which also acknowledge reports, are committed before they are sent: a centre that is killed at any moment
+restarts with every authority that its trains may have received.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from railfix.ground.web import Order
 from railfix.ground.writer import Commits
 from railfix.io.train_message import MessageError, SuspectedInterference, TrainMessage, decode
 
-#: Name of the stored document.
+#: Name of the stored document that contains the cause of a stop.
 _CAUSE = "cause of the stop"
 
 
@@ -41,7 +41,7 @@ def _severity(verdict: TriangleVerdict) -> int:
 
 @dataclass(kw_only=True)
 class StopOrder:
-    """A train's order to stop, with the times until its acknowledgement and until standstill [s]."""
+    """Order to stop sent to a train, with the times until its acknowledgement and until standstill [s]."""
 
     number: int
     sent_s: float
@@ -49,7 +49,7 @@ class StopOrder:
     rest_s: float | None = None
 
     def take_report(self, message: TrainMessage, now_s: float) -> bool:
-        """Process a report; return whether it is the first to show the train at rest."""
+        """Process a report; return whether it is the first report of the train at rest."""
         taken = is_obeyed(message, self.number)
         if taken and self.acknowledged_s is None:
             self.acknowledged_s = now_s - self.sent_s
@@ -66,12 +66,12 @@ class StopOrder:
 
 @dataclass(kw_only=True)
 class ControlCentre:
-    """Control centre."""
+    """Control centre: supervision of trains, store, monitor of satellite positioning, log and orders."""
 
     supervision: Supervision
     store: Store
-    curves: dict[int, ReferenceCurve]  #: By direction.
-    send: Callable[[int, bytes], None]  #: Sends bytes to a train.
+    curves: dict[int, ReferenceCurve]  #: Reference run curves by running direction.
+    send: Callable[[int, bytes], None]  #: Function that sends bytes to a train.
     clock: Callable[[], float]  #: Centre's clock, which never runs backwards [s].
     wall_ns: Callable[[], int]  #: Time for the log [ns].
     monitor: MonitorState | None = None  #: State of the monitor of satellite positioning; None without a triangle.
@@ -80,12 +80,12 @@ class ControlCentre:
     reports: int = 0
     rejected: Counter[str] = field(default_factory=Counter)  #: Number of rejected reports, by reason.
     stop_s: float | None = None
-    stops: dict[int, StopOrder] = field(default_factory=dict)  #: Trains that are ordered to stop.
-    #: Access to the store; in a thread where the centre is a process.
+    stops: dict[int, StopOrder] = field(default_factory=dict)  #: Orders to stop, by train.
+    #: Commits to the store, which a centre that runs as a process carries out in a thread.
     commits: Commits = field(default_factory=Commits)
-    #: Requests the detection of points from the field; `Supervision.set_detected` processes the answer.
+    #: Function that requests the detection of points; `Supervision.set_detected` processes the answer.
     ask: Callable[[PointName], None] = lambda _: None
-    #: Suspicions in the newest report of each train.
+    #: Interference suspected in the newest report of each train.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
 
     _routes: dict[int, int] = field(init=False)
@@ -100,7 +100,7 @@ class ControlCentre:
 
     @classmethod
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
-        """Return the centre with the state stored by an earlier process; at the first start as in `supervision`.
+        """Return the centre with the state stored by an earlier process; at the first start the state is unchanged.
 
         Trains are unknown until they report; the detection of all points is requested from the field. Where a triangle
         monitors satellite positioning, the first start is a stop, to be released by hand; an earlier stop remains.
@@ -132,7 +132,7 @@ class ControlCentre:
         return self.commits.alarm
 
     def log(self, text: str, *, train: int | None = None) -> None:
-        """Write a line of the log."""
+        """Write a line to the log."""
         self.lines.append(f"{self.clock():.0f} s: {text}")
         del self.lines[:-200]
         self.store.note(self.wall_ns(), text, train=train)
@@ -171,7 +171,7 @@ class ControlCentre:
             self.log(f"train {number}: heard", train=number)
 
     def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
-        """Count and log contradictions of a report, and its answers."""
+        """Count and log contradictions of a report, and its answer to a request for the route."""
         number = known.train
         if known.contradiction is not None:
             self.rejected["contradicts the record of the train"] += 1
@@ -197,7 +197,7 @@ class ControlCentre:
 
     @property
     def alarms(self) -> list[str]:
-        """Sentences on reports awaited after a start, and on interference that trains suspect."""
+        """Alarms on reports awaited after a start, and on interference that trains suspect."""
         awaited = self.supervision.awaited_text
         waits = (
             [f"nothing is granted until these trains have reported since the start: {awaited} (confirm-start)"]
@@ -209,7 +209,7 @@ class ControlCentre:
         ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Process a verdict on satellite positioning from fixes of a given age; the worst between two steps is used.
+        """Process a verdict on satellite positioning from fixes of a given age; the worst since the last step is used.
 
         Fixes older than `MonitorLimits.late_s`, or further in the future than this, give no verdict.
         """
@@ -222,8 +222,8 @@ class ControlCentre:
     def step(self) -> None:
         """Order braking, release points, set routes, extend authorities, and commit; then send the committed messages.
 
-        It is to be called several times per second. Orders to brake need no store. Authorities, and commands to points,
-        are sent once their state is committed.
+        It must be called several times per second. Orders to brake do not wait for a commit. Authorities, and commands
+        to points, are sent once their state is committed.
         """
         now = self.clock()
         self._monitor(now)
@@ -290,8 +290,8 @@ class ControlCentre:
         state, limits = self.supervision.state, self.supervision.centre
         for number, record in self.supervision.records.items():
             if now - record.heard_s <= limits.lost_s:
-                continue  # it stays as it is
-            rests = number in self.stops and state.trains[number].standstill  # it is not shown as running on
+                continue  # the record is unchanged
+            rests = number in self.stops and state.trains[number].standstill  # a train at rest is not simulated
             curves = {} if rests else self.curves
             after = time_passed(record, now, curves=curves, authority_m=state.trains[number].end_m, limits=limits)
             if after.state is not record.state:
@@ -299,7 +299,7 @@ class ControlCentre:
             self.supervision.records[number] = after
 
     def release(self) -> str | None:
-        """Release a stop by hand; return the reason of a refusal."""
+        """Release a stop by hand; return the reason for a refusal."""
         if self.monitor is None:
             if not self.supervision.state.stopped:
                 return "there is no stop to release"
@@ -313,7 +313,7 @@ class ControlCentre:
         return reason
 
     def stop(self, train: int | None) -> str | None:
-        """Stop a train, or every train with None, by hand; return the reason of a refusal."""
+        """Stop a train, or every train with None, by hand; return the reason for a refusal."""
         state = self.supervision.state
         if train is not None and train not in state.trains:
             return f"no such train: {train}"
@@ -322,7 +322,7 @@ class ControlCentre:
         return None
 
     def set_route(self, train: int) -> str | None:
-        """Set a train's route to the next station by hand; return the reason of a refusal."""
+        """Set a train's route to the next station by hand; return the reason for a refusal."""
         return self.supervision.set_route(train)
 
     def _monitor(self, now: float) -> None:
@@ -330,7 +330,7 @@ class ControlCentre:
             return
         verdict, receiver = self._verdict or (None, -1)
         if verdict is None and now - self.monitor.complete_s <= self.times.late_s:
-            return  # not late yet
+            return  # fixes are not late yet
         self._verdict, self._judged = None, verdict
         self.monitor, orders = advance(self.monitor, now, verdict, receiver=receiver, limits=self.times)
         for order in orders:
@@ -386,12 +386,12 @@ class ControlCentre:
         return f"{names[section]} to {names[section + 1]}, {progress:.0f} %"
 
     def point_name(self, point: PointName) -> str:
-        """Return the name of points for people."""
+        """Return the displayed name of points: the station, and its lower or upper end by chainage."""
         return f"{self.supervision.layout.stations[point[0]].name} {'lower' if point[1] < 0 else 'upper'}"
 
     def _monitor_values(self) -> dict[str, Any]:
         if self.monitor is None:
-            return {"verdict": "judged by nothing", "stopped": False, "cause": None}
+            return {"verdict": "not monitored", "stopped": False, "cause": None}
         cause, verdict = (
             absent if value is None else value.name.lower().replace("_", " ")
             for value, absent in ((self.monitor.cause, "not yet released"), (self._judged, "no verdict"))

@@ -37,7 +37,7 @@ from railfix.positioning.range_arrays import Ranges
 
 
 class RelaySettings(Settings):
-    """Disturbances of a relay."""
+    """Settings of a relay's disturbances."""
 
     loss: float = Field(default=0.0, ge=0, le=1)  #: Probability that a datagram is lost.
     #: Delay of each datagram, and the largest additional random delay, by which datagrams overtake each other.
@@ -135,8 +135,8 @@ def draw_fixes(
 ) -> StationFixes:
     """Return fixes, one per second, from simulated ranges of fixed satellites.
 
-    `common_m`, shape (T, 9): errors of the satellites, common to the receivers. `moved_m`, shape (T, 3, 2): east and
-    north by which the fix of a receiver moves; NaN for a receiver without a fix, whose C/N0 has fallen.
+    `common_m`, shape (T, 9), are satellite errors common to the receivers. `moved_m`, shape (T, 3, 2), are the east and
+    north displacements of each receiver's fix; NaN gives a receiver without a fix, whose C/N0 has fallen.
     """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
@@ -175,15 +175,15 @@ _TIME_NS: Final = 1_400_000_000_000_000_000
 
 @dataclass(kw_only=True)
 class LinkedTraffic(Traffic):
-    """Traffic whose messages use the links, with the real centre."""
+    """Traffic whose messages are sent over the links to a `ControlCentre`."""
 
     links: dict[int, TrainLinks]
     control: ControlCentre
     verdicts: list[tuple[TriangleVerdict, int]]  #: Verdicts of the triangle, one per second.
-    rest_s: float | None = None  #: Time when all trains had stopped.
+    rest_s: float | None = None  #: Time at which all trains had stopped [s]; None before.
 
     def step(self) -> None:
-        """Run a step and note the time when all trains are at rest."""
+        """Run a step, and record the time at which all trains are at rest after a stop."""
         super().step()
         stopped = self.centre.state.stopped and all(t.speed_mps == 0.0 for t in self.trains.values())
         if stopped and self.rest_s is None:
@@ -215,7 +215,7 @@ def _verdicts(seed: int) -> list[tuple[TriangleVerdict, int]]:
 def _traffic(
     seed: int, store: Store, links: dict[int, TrainLinks], send: Callable[[int, bytes], None]
 ) -> LinkedTraffic:
-    """Return the line with a train at each end."""
+    """Return the traffic of a line with a train at each end."""
     layout = line_with_loops(3)
     trains, supervised = {}, []
     for number, direction, station, track, front in ((1, 1, 0, 1, 400.0), (2, -1, 2, 2, 3100.0)):
@@ -252,9 +252,9 @@ async def run_demo(
 ) -> dict[str, Any]:
     """Run the demonstration and return its figures.
 
-    `speed` is in simulated seconds per second; the page, on the loopback address, is at the port (0 takes a free port),
-    and its password releases a stop. `announce` is called with its address, `keep` awaited with it at the end, before
-    the page closes; `picture` is the path of the picture of response rates along the line.
+    `speed` is in simulated seconds per second. The page is served on the loopback address at `port` (0 takes a free
+    port), and `password` permits the release of a stop. `announce` is called with the page's address, and `keep` is
+    awaited with it before the page closes. `picture` is the path of the picture of response rates along the line.
     """
     async with contextlib.AsyncExitStack() as held:
         folder, done = Path(held.enter_context(tempfile.TemporaryDirectory())), False
@@ -291,7 +291,7 @@ async def run_demo(
                     {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"},
                 ),
                 received=lambda payload: traffic.authority(Authority.decode(payload)),
-                limits=LinkLimits(idle_s=10.0),  # its outages are short in real time
+                limits=LinkLimits(idle_s=10.0),  # the outages are short in real time
             )
             await links.start()
             held.push_async_callback(links.stop)
@@ -339,7 +339,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        # Time lost on a busy machine is not caught up: the links would have less time than they simulate.
+        # Time lost on a busy machine is not recovered, as the links would have less than the simulated time.
         start = max(start, loop.time() - traffic.now_s / speed)
         await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 

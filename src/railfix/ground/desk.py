@@ -28,13 +28,13 @@ Values = dict[str, Any]
 
 
 def number_of(values: Values, name: str) -> int | str:
-    """Return an integer of an order, or a sentence on what is wrong with it."""
+    """Return a value of an order if it is an integer, otherwise the reason for a refusal."""
     value = values.get(name)
     return value if type(value) is int else f"{name}: a number was expected"
 
 
 def metres_of(values: Values, *names: str) -> list[float] | str:
-    """Return numbers of an order, or the sentence on the first that is not a number."""
+    """Return values of an order if they are numbers below 1e7, otherwise the reason for a refusal."""
     found = [values.get(name) for name in names]
     for name, value in zip(names, found, strict=True):
         if type(value) not in (int, float) or not abs(value) < 1e7:  # type: ignore[arg-type]
@@ -48,14 +48,14 @@ class OrderDesk:
 
     supervision: Supervision
     clock: Callable[[], float]  #: Centre's clock [s].
-    log: Callable[..., None]  #: Writes a line of the log.
-    release: Callable[[], str | None]  #: Releases a stop of all trains.
-    stop: Callable[[int | None], str | None]  #: Stops a train, or every train with None.
+    log: Callable[..., None]  #: Function that writes a line to the log.
+    release: Callable[[], str | None]  #: Function that releases a stop of all trains.
+    stop: Callable[[int | None], str | None]  #: Function that stops a train, or every train with None.
     #: Orders that have been given once, by name and values: time and author.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
-        """Carry an order out, with a line in the log; return the reason of a refusal."""
+        """Carry out an order, with a line in the log; return the reason for a refusal, None if it is done."""
         reason = order(values, by)
         shown = json.dumps({key: value for key, value in values.items() if key != "password"})
         outcome = "done" if reason is None else f"refused: {reason}"
@@ -65,7 +65,7 @@ class OrderDesk:
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
-        """Return None if an order confirms the first order in time, otherwise the next step."""
+        """Return None if an order confirms the first order in time, otherwise a sentence on the next step."""
         key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
@@ -85,7 +85,7 @@ class OrderDesk:
         return self._asked.get(key, (self.clock(), ""))[0]
 
     def release_train(self, values: Values, by: str) -> str | None:
-        """Release the stop of a train; for a train that does not report (unconfirmed position) it is ordered twice."""
+        """Release the stop of a train; the release of a train that does not report must be ordered twice."""
         train = number_of(values, "train")
         if isinstance(train, str):
             return train
@@ -103,7 +103,7 @@ class OrderDesk:
     def twice(
         self, name: str, change: Callable[[Values], tuple[Interlocking, str | None]], what: str, values: Values, by: str
     ) -> str | None:
-        """Change trains at the second order, which must contain a reason in words."""
+        """Change trains at the second order; both orders must contain the same reason in words."""
         reason = values.get("reason")
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
             return (
@@ -120,7 +120,7 @@ class OrderDesk:
         return refused
 
     def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
-        """Return the train whose position, reported since the first order, is outside its new interval."""
+        """Return a sentence on a train whose position, reported since the first order, is outside its new interval."""
         for number, train in after.trains.items():
             known, record = before.trains.get(number), self.supervision.records.get(number)
             if known is None or known is train or known.reported_m is None or record is None:
@@ -133,7 +133,7 @@ class OrderDesk:
         return None
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
-        """Return the state after a change of trains, and the reason of a refusal."""
+        """Return the state after a change of trains, and the reason for a refusal."""
         state, layout = self.supervision.state, self.supervision.layout
         train = number_of(values, "train")
         if isinstance(train, str):
@@ -165,7 +165,7 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Continue after a start without the trains that have not reported since, if the database is no older copy."""
+        """Continue at the second order without the trains that have not reported since the start of the centre."""
         if not self.supervision.awaited:
             return "every train has reported since the start"
         what = f"the database is not an older copy, and these trains do not report: {self.supervision.awaited_text}"
@@ -174,7 +174,7 @@ class OrderDesk:
         return reason
 
     def section(self, values: Values, by: str, *, of: str) -> str | None:
-        """Bar a section, or remove its bar; an occupied section is freed at the second order."""
+        """Bar a section, or remove its bar; an occupied section is freed only at the second order."""
         supervision, name = self.supervision, str(values.get("section", ""))
         layout, state = supervision.layout, supervision.state
         if name not in layout.sections:
@@ -191,7 +191,7 @@ class OrderDesk:
         return None
 
     def detect(self, values: Values, by: str = "") -> str | None:
-        """Process the detection of a section: occupied, free, or null where it is unknown; a change is logged."""
+        """Process the detection of a section, which is occupied, free, or null where unknown; a change is logged."""
         name, occupied = str(values.get("section", "")), values.get("occupied")
         if name not in self.supervision.layout.sections:
             return f"no such section: {name!r}"
@@ -231,7 +231,7 @@ class OrderDesk:
         return None
 
     def orders(self) -> dict[str, Order]:
-        """Return the orders by name; each is called with its values and its author."""
+        """Return the functions of the orders by name; they are called with the values and the author of an order."""
         supervision = self.supervision
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:

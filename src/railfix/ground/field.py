@@ -1,4 +1,4 @@
-"""Simulated points: railfix has no interface to real ones."""
+"""Simulated points, as railfix has no interface to real points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from railfix.ground.layout import PointName
 
 @dataclass(kw_only=True)
 class SimulatedPoints:
-    """Points that lose their detection at a command, and are detected in their new position some seconds later."""
+    """Points that lose their detection at a command, and are detected in their new position after `move_s`."""
 
     move_s: float
     clock: Callable[[], float]
@@ -24,11 +24,14 @@ class SimulatedPoints:
         self._answers[point] = None
 
     def ask(self, point: PointName) -> None:
-        """Request the detection of points; `take_detected` returns it."""
+        """Request the detection of points, which `take_detected` returns."""
         self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
 
     def take_detected(self) -> Mapping[PointName, int | None]:
-        """Return points whose detection has changed since the last call."""
+        """Return the detected track of points that have changed or were requested since the last call.
+
+        The track is None while points move.
+        """
         answers, self._answers = self._answers, {}
         for point, (until, track) in list(self._moving.items()):
             if until <= self.clock():

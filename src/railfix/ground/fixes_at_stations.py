@@ -1,4 +1,4 @@
-"""Fixes of three reference receivers from the same satellites, from their logs."""
+"""Fixes of three reference receivers from the same satellites, computed from logs or streams."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor_setup import parse_position
 
-#: Smallest drop of the mean C/N0 over satellites, below its median over preceding epochs, that is taken as a fall
+#: Smallest drop of the mean C/N0 over satellites, below the median of the mean over preceding epochs, that is a fall
 #: [dB-Hz].
 FALLEN_DBHZ = 6.0
-#: Number of epochs of this median.
+#: Number of epochs in the median of the mean C/N0.
 USUAL_EPOCHS: Final = 600
 #: Time tags of different receivers that round to the same multiple of this interval are one epoch.
 SAME_EPOCH = np.timedelta64(100, "ms")
@@ -48,10 +48,11 @@ class StationFixes(FrozenArrays):
     """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
     time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
-    points_m: Floats  #: Known points, east and north of the first; shape (N, 2).
-    fixes_m: Floats  #: NaN where there are too few common satellites; shape (T, N, 2).
-    n_satellites: Integers  #: Shape (T,).
-    cn0_fallen: Masks  #: Shape (T, N).
+    points_m: Floats  #: Known points, east and north of the first point; shape (N, 2).
+    #: Fixes, east and north of the first point; NaN where there are too few common satellites; shape (T, N, 2).
+    fixes_m: Floats
+    n_satellites: Integers  #: Number of common satellites, 0 where unknown; shape (T,).
+    cn0_fallen: Masks  #: Whether the mean C/N0 of a receiver has fallen; shape (T, N).
 
 
 def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: Navigation) -> StationFixes:
@@ -100,7 +101,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         usable[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k])
         states_of.append(states)
     shared = usable.all(axis=0)
-    # with the same weights too, as otherwise a common error moves each fix differently
+    # the weights are also the same, as otherwise a common error would move each fix differently
     square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])
@@ -160,7 +161,8 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
     """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
 
-    It is unknown whether they are from the same satellites: `n_satellites` is 0. MismatchError: no epoch in common.
+    `n_satellites` is 0, as it is unknown whether the fixes are from the same satellites. MismatchError: the logs have
+    no epoch in common.
     """
     known = [np.flatnonzero(np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time)) for log in logs]
     time, rows_of = _common_epochs([log.time[rows] for log, rows in zip(logs, known, strict=True)])
@@ -180,7 +182,7 @@ def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]
 
 
 def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:
-    """Return epochs without a fix of any receiver."""
+    """Return epochs in which no receiver has a fix."""
     shape = (len(time), len(points_ecef_m))
     return StationFixes(
         time=time,
@@ -207,14 +209,14 @@ def mean_cn0(log: Observations) -> Floats:
 def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
     """Return where the mean C/N0 of a receiver has fallen by `FALLEN_DBHZ`, shape (T, N).
 
-    The reference is its median over the `USUAL_EPOCHS` before each epoch, including `earlier_dbhz`, shape (M, N).
+    The reference is the median over the `USUAL_EPOCHS` before each epoch, including `earlier_dbhz`, shape (M, N).
     """
     table = pl.DataFrame(np.vstack([earlier_dbhz, level_dbhz])).fill_nan(None)
     usual = table.select(pl.all().rolling_median(USUAL_EPOCHS, min_samples=1).shift(1)).to_numpy()
     return np.asarray(level_dbhz < usual[len(earlier_dbhz) :] - FALLEN_DBHZ)
 
 
-#: Number of epochs that may wait for the other receivers.
+#: Largest number of epochs that wait for the epochs of other receivers.
 _LONGEST_QUEUE: Final = 1000
 
 
@@ -222,9 +224,9 @@ class StationStreams:
     """Fixes of receivers at known points, computed from epochs as they arrive.
 
     An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver sends nothing
-    there are therefore no fixes at all, and the monitor detects that they are late. Records from the streams are added
-    to the navigation known from the start; epochs at whole seconds are used. `counts` has the numbers of epochs "used",
-    "incomplete", and "without common satellites".
+    there are no fixes, and the monitor detects that fixes are late. Records from the streams are added to `navigation`.
+    Only epochs at whole seconds are used. `counts` has the numbers of epochs "used", "incomplete", and "without common
+    satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:
@@ -240,7 +242,7 @@ class StationStreams:
         self._known = receive(self._known, self._config, np.datetime64("NaT", "ns"), navigation=navigation)
 
     def push(self, receiver: int, epoch: Observations) -> StationFixes | None:
-        """Process one epoch of a receiver; return the fixes once all receivers have sent the epoch."""
+        """Process one epoch of a receiver; return the fixes once all receivers have sent the epoch, None before."""
         tag = round_tags(epoch.time)[0]
         tag_ns = int(tag.astype(np.int64))
         if tag_ns % 1_000_000_000 or tag <= self._done:
@@ -277,10 +279,10 @@ class StationStreams:
 async def stream_fixes(
     sources: Sequence[str], points_ecef_m: Floats, *, navigation: Navigation | None = None
 ) -> AsyncIterator[StationFixes]:
-    """Yield the fixes of one epoch at a time, until every source has ended.
+    """Yield the fixes of single epochs until every source has ended.
 
-    The sources are as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files), and
-    RINEX files too. InputFileError: when a source cannot be opened, or breaks and is not opened again.
+    The sources are those of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files and
+    RINEX files). InputFileError: a source cannot be opened, or breaks and is not opened again.
     """
     stations = StationStreams(points_ecef_m, navigation=navigation)
     queue: asyncio.Queue[tuple[int, ReceivedData | None]] = asyncio.Queue(2 * len(sources))

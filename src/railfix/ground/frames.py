@@ -1,8 +1,8 @@
 """Redundancy layer above two links: frames with sequence number and time stamp, and the defences of EN 50159.
 
-The links below encrypt and authenticate (QUIC, TLS 1.3); the CRC is a check against faults of the layers between,
-not cryptography. A receiver uses each frame once, whichever link delivers it first, and no frame that is older than a
-used frame.
+The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults of the layers between, and
+is not cryptographic. A receiver uses each frame once, from the link that delivers it first, and no frame that is older
+than a used frame.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from railfix.core.settings import Settings
 _HEAD: Final = struct.Struct("!BIQQq")
 _ECHO: Final = struct.Struct("!Qqqq")
 _CHECK: Final = struct.Struct("!I")
-#: Longest payload [bytes]: with the header it fits a QUIC datagram.
+#: Longest payload, which fits a QUIC datagram together with the header [bytes].
 LONGEST_PAYLOAD: Final = 1100
-#: Number of recent sequence numbers that are stored individually, and of earlier starts of the sender.
+#: Number of recent sequence numbers, and number of earlier starts of the sender, that are stored.
 REMEMBERED: Final = 4096
 RETIRED: Final = 64
 
 
 def draw_session() -> int:
-    """Return a random number that identifies a start: no clock decides which of two starts is newer."""
+    """Return a random number that identifies a start of a program, independent of any clock."""
     return secrets.randbits(62)
 
 
@@ -59,13 +59,13 @@ class Threat(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """One frame."""
+    """Frame of the redundancy layer."""
 
     kind: FrameKind
     sender: int
     session: int  #: Random number that identifies the sender's start.
     sequence: int
-    time_ns: int  #: Sender's monotonic clock when it was sent.
+    time_ns: int  #: Sender's monotonic clock at the time of sending [ns].
     payload: bytes = b""
 
     def encode(self) -> bytes:
@@ -77,7 +77,7 @@ class Frame:
 
 
 class Echo(NamedTuple):
-    """Answer to a frame: its number, and times of sending (sender's clock), reception and answer (answerer's clock)."""
+    """Answer to a frame: its number, time of sending (sender's clock), and times of reception and answer."""
 
     sequence: int
     sent_ns: int
@@ -111,7 +111,7 @@ class ReceiverLimits(Settings):
 
 @dataclass(kw_only=True)
 class _Seen:
-    """Received sequence numbers: the newest with its time, and the most recent ones as bits."""
+    """Received sequence numbers: the newest with its time of arrival, and the most recent numbers as bits."""
 
     newest: int = -1
     at_ns: int = 0
@@ -140,9 +140,9 @@ class _Seen:
 class FrameReceiver:
     """Receiver of the frames of one sender over any number of links."""
 
-    sender: int  #: Only sender whose frames are accepted; the certificate of the connection names it.
+    sender: int  #: Only sender whose frames are accepted, as named by the connection's certificate.
     limits: ReceiverLimits = field(default_factory=ReceiverLimits)
-    #: Frames that were rejected, by threat; deletions are the skipped sequence numbers.
+    #: Number of rejected frames by threat; deletions are skipped sequence numbers.
     threats: Counter[Threat] = field(default_factory=Counter)
     _session: int | None = None
     _retired: deque[int] = field(default_factory=lambda: deque(maxlen=RETIRED))
@@ -152,9 +152,9 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return a frame to be answered and the frame to be used; each None where it does not apply.
+        """Return the frame if it is to be answered, and the frame if it is to be used, otherwise None.
 
-        A second copy is answered, so that both links are measured, but not used.
+        A second copy of a frame is answered but not used, so that both links are measured.
         """
         frame = self._decode(data)
         if frame is None:
@@ -182,7 +182,7 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Reset for a new start of the sender, with new origins of numbers and clock; late frames are rejected."""
+        """Reset after a new start of the sender, whose numbers and clock have new origins."""
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None
@@ -208,7 +208,7 @@ class FrameReceiver:
         )
 
     def _late(self, frame: Frame, now_ns: int) -> bool:
-        """Return whether a frame took too long; clocks of both ends need not agree."""
+        """Return whether a frame is too late relative to the shortest delay; the clocks of both ends need not agree."""
         took = now_ns - frame.time_ns
         if self._shortest_ns is None:
             self._shortest_ns = float(took)

@@ -1,10 +1,11 @@
-"""Authorities, routes and points of a single line with passing loops.
+"""Authorities, routes and points of a single-track line with passing loops.
 
 A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority.
 Authorities are extended, less a margin, to the nearest of these limits: another train's interval, a section that is
-closed or occupied, points that are not locked and detected for the train, the end of its route. They are
-shortened by agreement only (`railfix.ground.stops`); reports move the intervals (`railfix.ground.reports`). It is not a
-national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by hand.
+closed or occupied, points that are not locked and detected for the train, the end of its route. Authorities are
+shortened only by agreement with the train (`railfix.ground.stops`); reports move the intervals
+(`railfix.ground.reports`). Shunting, overlaps behind signals, level crossings and degraded working by hand are not
+modelled.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from railfix.ground.state import Interlocking, InterlockingLimits, PointState, T
 
 
 class NearbyTrains:
-    """Trains by the location of their intervals and routes, with one more route included.
+    """Index of trains by the blocks of the line that their interval, route and next route include.
 
-    The cost of a step grows with the number of trains, not of pairs. `update` locates only the trains again that are
-    elsewhere, or have another route.
+    With it the cost of a step grows with the number of trains, not with the number of pairs of trains. `update` locates
+    only trains whose interval or route has changed.
     """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
         self._blocks: dict[int, set[int]] = defaultdict(set)
-        self._located: dict[int, tuple[TrainInterval, range]] = {}  #: Records as located, and their blocks.
+        self._located: dict[int, tuple[TrainInterval, range]] = {}  #: Records when they were located, and their blocks.
         self.update(state)
 
     def update(self, state: Interlocking) -> None:
@@ -57,7 +58,7 @@ class NearbyTrains:
         return self._layout.blocks_between(min(low, furthest), max(high, furthest))
 
     def _move(self, blocks: range, number: int, before: range) -> None:
-        """Enter a train in its blocks, and take it out of those that it had before."""
+        """Enter a train in its blocks, and remove it from its previous blocks."""
         if blocks == before:
             return
         for block in before:
@@ -72,12 +73,12 @@ class NearbyTrains:
 
 
 def _place(train: TrainInterval) -> tuple[object, ...]:
-    """Return what the blocks of a train follow from."""
+    """Return the values that determine the blocks of a train."""
     return train.span_m, train.station, train.direction
 
 
 def stop_orders(state: Interlocking) -> dict[int, str]:
-    """Return the trains ordered to stop, with reasons: stopped trains, and the nearest train on either side of each."""
+    """Return the reasons of trains to stop, by train: stopped trains, and the nearest trains on either side of each."""
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not found:
         return {}
@@ -101,8 +102,8 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
 def points_reported(state: Interlocking, point: PointName, detected: int | None, layout: Layout) -> Interlocking:
     """Return the state after a detection of points.
 
-    Where detection is lost under a route, or differs from the interval after a start, the trains concerned are stopped.
-    After a start, points that no train locks keep their detected position.
+    Trains that lock points are stopped if the detection of the points is lost. After a start, trains over the points
+    are stopped if another position than theirs is detected; points that no train locks keep their detected position.
     """
     before = state.points[point]
     after = replace(before, detected=detected)
@@ -128,9 +129,9 @@ def route_requested(
     nearby: NearbyTrains | None = None,
     stopped: Mapping[int, str] | None = None,
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
-    """Return the state with a route to the next station, the points to be moved, and the reason of a refusal.
+    """Return the state with a route to the next station, the points to be moved, and the reason for a refusal.
 
-    `NearbyTrains` and `stop_orders` of the step are used where given.
+    `nearby` and `stopped` (`stop_orders`) are computed if they are not given.
     """
     here = state.trains[train]
     begin, direction = here.station, here.direction
@@ -158,7 +159,7 @@ def route_requested(
 
 
 def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: Mapping[int, str]) -> str | None:
-    """Return the reason why a train gets no route, regardless of other trains."""
+    """Return the reason for refusing a route that does not depend on other trains' intervals, None without one."""
     target = here.station + here.direction
     if here.asked_m is not None:
         return "a shorter authority is being agreed with the train"
@@ -182,7 +183,7 @@ def reached(train: TrainInterval, station: int, layout: Layout) -> bool:
 
 
 def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: NearbyTrains) -> str | None:
-    """Return the obstacle between a train and the next station, or on its track there."""
+    """Return the obstacle between a train and the next station, or on its track there; None without one."""
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
@@ -210,9 +211,9 @@ def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str,
 
 
 def comes_the_other_way(other: TrainInterval, direction: int, section: int, layout: Layout) -> bool:
-    """Return whether an opposing train has its route or interval between a station and the next.
+    """Return whether a train in the opposite direction has its route or interval between a station and the next.
 
-    The points of both stations are omitted.
+    The points of both stations are not considered.
     """
     if other.direction == direction:
         return False
@@ -222,12 +223,12 @@ def comes_the_other_way(other: TrainInterval, direction: int, section: int, layo
 
 
 def is_free(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether points may be moved: not locked, and under no interval and no barred section."""
+    """Return whether points may be moved, as they are not locked, and under no interval and no barred section."""
     return not (state.points[point].locked or under_interval(state, point, layout, nearby))
 
 
 def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether an interval, or a barred section, lies over points."""
+    """Return whether an interval, or a barred section, includes points."""
     zone: Piece = (0, *layout.zone_m(point))
     if barred(state, [zone], layout) is not None:
         return True
@@ -240,7 +241,7 @@ def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby
 def due_commands(
     state: Interlocking, layout: Layout, stored: Interlocking, nearby: NearbyTrains | None = None
 ) -> tuple[Interlocking, dict[PointName, int]]:
-    """Return the state after all due commands to points, and these commands: tracks by points.
+    """Return the state after all due commands to points, and the commanded tracks by points.
 
     Only stored commands are due. Points whose detection is awaited, or that are under an interval, get no command.
     """
@@ -262,7 +263,7 @@ def due_commands(
 
 
 def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
-    """Return the state with the points released that safe rear ends have passed long enough ago."""
+    """Return the state with points released `InterlockingLimits.release_s` after the safe rear end has passed them."""
     points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
         if not point.locked:
@@ -288,9 +289,9 @@ def extend_authorities(
     nearby: NearbyTrains | None = None,
     stopped: Mapping[int, str] | None = None,
 ) -> Interlocking:
-    """Return the state with the authorities of trains, by default of all, extended as far as possible.
+    """Return the state with the authorities of trains, by default of all trains, extended as far as possible.
 
-    `NearbyTrains` and `stop_orders` of the step are used where given.
+    `nearby` and `stopped` (`stop_orders`) are computed if they are not given.
     """
     if state.stopped:
         return state
@@ -339,5 +340,5 @@ def bars_ahead(state: Interlocking, layout: Layout) -> list[Piece]:
 
 
 def leads(point: PointState, train: TrainInterval, station: int) -> bool:
-    """Return whether points are locked for a train, and detected where they lead it to its track in their station."""
+    """Return whether points are locked for a train, and detected in the position for the train's track there."""
     return train.train in point.locked and point.lies and point.wanted == train.tracks.get(station)

@@ -1,7 +1,7 @@
 """Keys and certificates of the links: creation, renewal with overlap, revocation, and warning before expiry.
 
-One authority signs the certificates of the centre and of the trains. Its key stays in the folder where keys are
-created, and is not distributed.
+One certificate authority signs the certificates of the centre and of the trains. The authority's key stays in the
+folder where keys are created, and is not distributed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ with needs_extra():
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
-#: Validity of the certificates, of the authority's certificate, and remaining validity that raises an alarm [days].
+#: Validity of certificates and of the authority's certificate, and remaining validity that causes an alarm [days].
 VALID_DAYS: Final = 365
 AUTHORITY_DAYS: Final = 3650
 WARNING_DAYS: Final = 30
@@ -35,7 +35,7 @@ def check_keys(folder: Path, name: str) -> None:
 
 
 class Peer(NamedTuple):
-    """Verified certificate of the other end of a connection: common name, serial number and end."""
+    """Verified certificate of the other end of a connection: common name, serial number and end of validity."""
 
     name: str
     serial: int
@@ -43,7 +43,7 @@ class Peer(NamedTuple):
 
     @classmethod
     def of(cls, certificate: x509.Certificate) -> Peer:
-        """Return the values of a certificate, which are slow to read; ValueError where it has no name."""
+        """Return the values of a certificate, which are slow to read; ValueError: it has no common name."""
         names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
         if not names:
             raise ValueError("no name")
@@ -51,7 +51,7 @@ class Peer(NamedTuple):
 
     @property
     def valid_s(self) -> float:
-        """Time until the certificate ends [s]."""
+        """Time until the certificate expires [s], negative afterwards."""
         return (self.ends - datetime.now(UTC)).total_seconds()
 
 
@@ -67,11 +67,11 @@ class Revoked(NamedTuple):
 
 
 def read_revoked(folder: Path) -> Revoked:
-    """Return the revoked certificates, listed as words in ``revoked.txt``.
+    """Return the revoked certificates, listed as words in ``revoked.txt``; none without this file.
 
-    A name (``train-7``) revokes all its certificates, including later ones; a serial number (``0x5a1f...``, as
-    `railfix ground keys` prints it) revokes one certificate, so that a train whose key was lost can get a new one.
-    InputFileError: when the file is there and cannot be read.
+    A name (``train-7``) revokes all certificates of that name, including later certificates. A serial number
+    (``0x5a1f...``, as printed by `railfix ground keys`) revokes one certificate, so that a train whose key was lost can
+    get a new certificate. InputFileError: the file exists and cannot be read.
     """
     path = folder / "revoked.txt"
     try:
@@ -94,7 +94,7 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):
-        # of a renewed authority the newest certificate is checked
+        # a renewed authority has several certificates, of which the newest is checked
         newest = max(x509.load_pem_x509_certificates((folder / file).read_bytes()), key=lambda c: c.not_valid_after_utc)
         if newest.not_valid_after_utc <= limit:
             found.append(ending_sentence(file, newest.not_valid_after_utc))
@@ -102,11 +102,11 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
 
 
 def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write keys and certificates of the authority, of ``centre`` and of each ``train-N``; return the files.
+    """Write keys and certificates of a certificate authority, of ``centre`` and of each ``train-N``; return the files.
 
     In a folder with an authority only missing files are written, which adds trains. ``authority.key`` stays in this
-    folder and is never given to a train or a centre. Only their owner can read the keys. OutputError: when there is
-    nothing to write, or a file cannot be written. InputFileError: when a file of the authority cannot be read.
+    folder and is never given to a train or a centre. Key files can be read only by their owner. OutputError: there is
+    nothing to write, or a file cannot be written. InputFileError: a file of the authority cannot be read.
     """
     names = ["centre", *(f"train-{number}" for number in trains)]
     if (folder / "authority.key").exists():
@@ -126,12 +126,12 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
 
 
 def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Replace keys and certificates of the centre and of trains by new ones; return the files.
+    """Replace the keys and certificates of the centre and of trains; return the new files.
 
     The previous certificates stay valid until they expire, so that each end can change to its new files at its next
-    start or connection. An authority that would expire before the new certificates is renewed as well:
-    ``authority.pem`` then has the old and the new certificate, and is given to every end before the new files.
-    InputFileError, OutputError: as `write_keys`.
+    start or connection. An authority that would expire before the new certificates is renewed as well. In this case
+    ``authority.pem`` has the old and the new certificate, and must be given to every end before the new files.
+    InputFileError, OutputError: as for `write_keys`.
     """
     signing, issuer = _read_authority(folder)
     parts: dict[str, bytes] = {}
@@ -200,7 +200,11 @@ def _signed(
 
 
 def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path]:
-    """Write each file atomically, keys readable by their owner alone; return their paths."""
+    """Write each file, keys readable only by their owner; return the paths.
+
+    With `replace` existing files are replaced once all new files are complete. OutputError: a file exists already, or
+    cannot be written.
+    """
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)

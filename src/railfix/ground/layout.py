@@ -1,4 +1,4 @@
-"""Single line with passing loops: stations with two tracks, points at both ends, sections between."""
+"""Single-track line with passing loops: stations with two tracks and points at both ends, and sections between."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from railfix.core.errors import MismatchError
 from railfix.core.settings import Settings
 from railfix.track.network import Network
 
-#: Points: station and side, -1 at the end of lower chainage, 1 at the end of higher chainage.
+#: Name of points: number of the station, and side, -1 at the end of lower chainage, 1 at the end of higher chainage.
 PointName = tuple[int, int]
-#: Largest number of gradients in one authority.
+#: Largest number of gradients, and of speed restrictions, in one authority.
 MOST_PARTS: Final = 16
 #: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single line with the points,
 #: 2 k + t is track t of station k.
@@ -32,10 +32,10 @@ class LoopStation(Settings):
     """Station with two tracks."""
 
     name: str
-    #: Outer ends of the points.
+    #: Chainages of the outer ends of the points.
     begin_m: float
     end_m: float
-    #: Length from the outer end of the points to where the tracks are clear of each other.
+    #: Length from the outer end of the points to the position at which the tracks are clear of each other.
     points_m: float = Field(default=60.0, gt=0)
 
     @model_validator(mode="after")
@@ -51,10 +51,10 @@ class LoopStation(Settings):
 
 
 class Gradient(Settings):
-    """Gradient from a chainage to the next gradient's chainage; before the first the line is level."""
+    """Gradient from a chainage to the next gradient's chainage; before the first gradient the line is level."""
 
     from_m: float
-    permille: float = Field(ge=-1000, le=1000)  #: Uphill with rising chainage positive.
+    permille: float = Field(ge=-1000, le=1000)  #: Gradient in thousandths, positive uphill with rising chainage.
 
 
 class Layout(Settings):
@@ -117,7 +117,7 @@ class Layout(Settings):
     def gradients_between(self, low_m: float, high_m: float, direction: int) -> tuple[tuple[int, int], ...]:
         """Return chainages [cm] and gradients [1/1000] between two positions, rounded downhill for a running direction.
 
-        Beyond `MOST_PARTS` parts, the rest is represented by its steepest descent.
+        Of more than `MOST_PARTS` parts only the nearest are returned, all with the steepest descent of the whole range.
         """
         ends = [gradient.from_m for gradient in self.gradients[1:]] + [math.inf] * bool(self.gradients)
         parts = [
@@ -149,7 +149,7 @@ class Layout(Settings):
         return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
-        """Return the pieces of an interval, given the track in each station (1 where none is given)."""
+        """Return the pieces of an interval; `tracks` has the track in each station, 1 where it has none."""
         low, high = min(from_m, to_m), max(from_m, to_m)
         pieces, at = [], low
         for k in self.stations_between(low, high):
@@ -206,11 +206,11 @@ _STEP_M: Final = 2.0
 def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
     """Return the layout of a network that is one single line with passing loops.
 
-    Its chainage begins at one end and follows the single line and track 1 of each station. A station is a pair of
-    tracks between the same two switches; the line is single between stations and beyond the outer stations. Points
-    reach from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the
-    side on which they drive: their track is track 1. MismatchError: the network is not such a line: several lines,
-    branches, stations of three tracks, loops of unequal length.
+    Its chainage begins at one end and follows the single track and track 1 of each station. A station is a pair of
+    tracks between the same two switches; the line has one track between stations and beyond the outer stations. Points
+    extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Track 1 of a station is on the
+    side on which trains drive, for trains that run toward rising chainage. MismatchError: the network is of another
+    kind, with several lines, branches, stations of three tracks, or loops of unequal length.
     """
     ends = network.joints.tolist()
     at: dict[int, list[int]] = defaultdict(list)
@@ -247,7 +247,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
 
 
 def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats], begin_m: float) -> LoopStation:
-    """Return the station of two tracks, track 1 first, from a chainage on."""
+    """Return the station of two tracks, track 1 first, that begins at a chainage."""
     if abs(lengths_m[0] - lengths_m[1]) > LENGTHS_M:
         raise MismatchError(
             f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; a "
@@ -276,7 +276,10 @@ def _side(first: Floats, second: Floats) -> float:
 
 
 def _clear_after_m(first: Floats, second: Floats) -> float:
-    """Return the length from the common end to where the lines are `CLEAR_M` apart [m]; MismatchError when nowhere."""
+    """Return the length from the common end to the position at which lines are `CLEAR_M` apart [m].
+
+    MismatchError: the lines are nowhere `CLEAR_M` apart.
+    """
     distance, _ = cKDTree(second).query(first)
     clear = np.flatnonzero(np.asarray(distance) >= CLEAR_M)
     if not len(clear):

@@ -1,4 +1,4 @@
-"""Ends of the redundant links: a train with two bearers, and a centre; quality of and choice between the links."""
+"""Redundant links between a train and a centre over two bearers: both ends, link quality, and choice of the link."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LinkResult(NamedTuple):
 class LinkLimits(Settings):
     """Limits of the links."""
 
-    #: A longer time to the echo is a miss (T); a centre delays an echo by up to 0.2 s to send it with an authority.
+    #: Time to the echo above which a frame is missed (T); a centre delays an echo by up to 0.2 s to add an authority.
     answer_s: float = Field(default=1.0, gt=0)
     misses: int = Field(default=3, ge=1)  #: Consecutive misses after which the spare link is used.
     good: int = Field(default=10, ge=1)  #: Consecutive answers before the normal link is used again.
@@ -67,7 +67,7 @@ class LinkMeter:
     _open: dict[int, tuple[float, float | None, int]] = field(default_factory=dict)
 
     def note_sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
-        """Count a sent frame; without a known position it is not in the coverage."""
+        """Count a sent frame; a frame without a known position is not in the coverage."""
         self._open[sequence] = (now_s, chainage_m, direction)
 
     def note_answer(self, sequence: int, now_s: float, round_trip_s: float) -> None:
@@ -79,7 +79,7 @@ class LinkMeter:
         self._note(waiting, round_trip_s)
 
     def settle(self, now_s: float) -> None:
-        """Count the frames whose time has passed as misses."""
+        """Count frames that were not answered within `LinkLimits.answer_s` as misses."""
         for sequence, waiting in list(self._open.items()):
             if now_s - waiting[0] <= self.limits.answer_s:
                 break
@@ -147,7 +147,7 @@ MISSED: Final = "#e5989b"
 
 
 def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]]]:
-    """Return answered and sent frames by direction and position, summed over meters of one bearer."""
+    """Return the numbers of answered and sent frames by direction and cell, summed over meters of one bearer."""
     total: dict[int, dict[int, tuple[int, int]]] = defaultdict(dict)
     for meter in meters:
         for (place, direction), (answered, sent) in meter.coverage.items():
@@ -164,7 +164,7 @@ def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
 
 
 def draw_coverage(path: Path, bearers: Mapping[LinkName, list[LinkMeter]]) -> None:
-    """Draw the links of trains, by bearer.
+    """Draw the response rates and round-trip times of the links, by bearer.
 
     One row per bearer and direction has the response rate along the line (P5, figure 7); one row per bearer has the
     round trips over time and position (P5, figures 9 and 10), unanswered frames at the bottom.
@@ -211,14 +211,14 @@ RETRY_S = 1.0
 
 
 class Bearer(NamedTuple):
-    """A bearer of the links: the centre's address on it, and the train's own."""
+    """Bearer of a link: address of the centre, and local address of the train."""
 
     centre: tuple[str, int]
     local: str
 
 
 def create_bearers(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName, str]) -> dict[LinkName, Bearer]:
-    """Return the bearers by the centre's addresses and the train's own."""
+    """Return the bearers from the centre's addresses and the train's local addresses."""
     return {name: Bearer(addresses[name], local[name]) for name in BEARERS}
 
 
@@ -249,7 +249,7 @@ class TrainLinks:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
-        """Start to connect; connections that end are reopened."""
+        """Start to open both connections; a connection that ends is reopened."""
         self._tasks = [asyncio.create_task(self._keep(name)) for name in BEARERS]
 
     async def stop(self) -> None:
@@ -262,7 +262,7 @@ class TrainLinks:
         idle_s = self.meters[name].limits.idle_s
         while True:
             try:
-                # read each time, so that the next connection uses new certificates
+                # files are read for each connection, so that new certificates are used
                 settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
                 async with connection(
                     self._bearers[name].centre,
@@ -321,12 +321,12 @@ class TrainLinks:
 
 
 class CentreLinks:
-    """The centre's end: listens at one address per bearer, answers every frame, and delivers each payload once.
+    """The centre's end: it listens at one address per bearer, answers every frame, and delivers each payload once.
 
-    `received` is called with the train's number and the payload; by default any free ports are used, listed in
-    `addresses` by bearer. Answers are delayed by up to `wait_s` to be sent with a payload. `masquerades` counts
+    `received` is called with the train's number and the payload. By default free ports are used; `addresses` has them
+    by bearer. Answers are delayed by up to `wait_s` to be sent with a payload. `masquerades` is the number of
     connections that were rejected for their certificate, `heard_s` has the monotonic time of the last frame received,
-    by train and bearer, and `alarm` the fault of the list of revoked certificates.
+    by train and bearer, and `alarm` is the fault of the list of revoked certificates.
     """
 
     def __init__(
@@ -354,9 +354,9 @@ class CentreLinks:
         self._ending: list[str] = []  #: Certificates that expire soon, one sentence each.
 
     async def start(self) -> None:
-        """Listen.
+        """Open the server of each bearer.
 
-        InputFileError: when the list of revoked certificates cannot be read.
+        InputFileError: the list of revoked certificates cannot be read. OSError: an address is not available.
         """
         self._revoked = read_revoked(self._keys)
         watch = asyncio.create_task(self._watch())
@@ -377,18 +377,18 @@ class CentreLinks:
         await self._stack.aclose()
 
     def alarms(self) -> list[str]:
-        """Return the faults of the certificates, one sentence each."""
+        """Return sentences on a faulty list of revoked certificates, and on certificates that expire soon."""
         return [*([] if self.alarm is None else [self.alarm]), *self._ending]
 
     def threats(self) -> Counter[Threat]:
-        """Return the number of rejected frames of all trains."""
+        """Return the number of rejected frames of all trains, and of rejected connections, by threat."""
         total: Counter[Threat] = Counter({Threat.MASQUERADE: self.masquerades})
         for receiver in self.receivers.values():
             total += receiver.threats
         return total
 
     def send(self, train: int, payload: bytes) -> None:
-        """Send a payload to a train on every link it has."""
+        """Send a payload to a train on each of its links."""
         data = self._encode(train, FrameKind.DATA, payload)
         for name in BEARERS:
             if (protocol := self._peers.get((train, name))) is not None:

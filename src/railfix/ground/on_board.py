@@ -1,4 +1,4 @@
-"""A train's supervision by the newest authority: its age, the end, the braking curve, and orders to brake."""
+"""On-board supervision of a train: age and end of its movement authority, braking curve, and orders to brake."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, s
 from railfix.ground.links import LinkMode
 from railfix.ground.positions import Clock
 
-#: Backward distance of the safe front end that is not an error of two positions [m].
+#: Backward movement of the safe front end that exceeds the errors of two positions: the train has rolled back [m].
 ROLLED_M: Final = 50.0
 #: Number of reports whose time of sending is stored.
 REMEMBERED: Final = 600
@@ -29,18 +29,18 @@ class OnBoardLimits(BrakeLimits):
 
     #: Time limit of authorities: the train brakes if the newest authority answers a report sent longer ago.
     fresh_s: float = option(
-        "Time limit of authorities: older ones brake the train.",
+        "Time limit of authorities; an older authority brakes the train.",
         15.0,
         name="--fresh",
         metavar="S",
         gt=0,
         le=LONGEST_FRESH_S,
     )
-    #: A train without a position is extrapolated from its last position for this time, at its highest speed; then it
+    #: Time for which a train without a position is extrapolated from its last position at its highest speed; it then
     #: brakes.
     placeless_s: float = Field(default=5.0, ge=0)
     clock: Clock = option(
-        "Positions are of a recording: report each as of now, at the recording's own pace.", "live", name="--replay"
+        "Report positions from a recording with the present time, at the recorded pace.", "live", name="--replay"
     )
     mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
 
@@ -57,30 +57,30 @@ class Motion:
 
 @dataclass(kw_only=True)
 class OnBoard:
-    """On-board authority of a train.
+    """On-board supervision of a train by its movement authority.
 
-    The age of an authority is counted from the sending of the report that it answers, on the train's monotonic clock.
-    It is never too small, whatever the links do, and the clocks of train and centre need not agree.
+    The age of an authority is the time since the train sent the report that the authority answers, on the train's
+    monotonic clock. Delays on the links cannot make it too small, and the clocks of train and centre need not agree.
     """
 
     direction: int
-    #: End of the authority, initially the front end; it is extended, and shortened where the centre requests it and the
-    #: train can stop before it.
+    #: End of the authority, initially the front end. Authorities extend it, and shorten it at a request of the centre
+    #: if the train can stop before the shorter end.
     end_m: float
 
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
-    session: int = 0  #: Start number of the reports: answers to another start are rejected.
+    session: int = 0  #: Identifier of this start in the reports; authorities that answer another start are rejected.
     number: int = -1  #: Number of the newest authority, -1 before the first.
-    stopped: bool = False  #: The newest authority is an order to stop.
+    stopped: bool = False  #: Whether the newest authority is an order to stop.
     order: BrakeOrder | None = None  #: Order to brake that the train obeys.
     authority: Authority | None = None  #: Newest authority.
-    #: Stopping position of the train's safe front end if it braked now, the farther of the last two positions; None:
-    #: the train accepts no shorter end.
+    #: Stopping position of the train's safe front end if it braked now, the farther of the last two stopping positions;
+    #: with None the train accepts no shorter end.
     stops_at_m: float | None = None
     #: Time of sending of the newest report that an authority has answered; None before the first.
     answered_s: float | None = None
-    #: Newest report from before the last change of ends, or from before this start: answers to this or an older report
-    #: are rejected.
+    #: Number of the newest report from before the last change of ends, or before rolling back; answers to this or an
+    #: older report are rejected.
     before_turn: int = -1
 
     _newest: int = -1
@@ -110,8 +110,8 @@ class OnBoard:
         Whether the train can stop before a shorter end is decided by the farther of its last two stopping positions, so
         that a single wrong position cannot cause the acceptance of that end.
 
-        A train that has rolled back brakes: earlier grants of the centre do not include it. Without a position or a
-        speed it continues from the previous position (`OnBoardLimits.placeless_s`).
+        A train that has rolled back brakes until it gets a new authority, as earlier authorities do not include its
+        position. Without a position or a speed the train is extrapolated (`OnBoardLimits.placeless_s`).
         """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
         if safe_front_m is None:
@@ -137,12 +137,12 @@ class OnBoard:
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:
-        """End the authority at the front: a train that was stopped by order gets a new authority with its release."""
+        """End the authority at the front, as a train that was stopped by order gets a new authority at its release."""
         self.end_m = self.direction * min(self.direction * self.end_m, self.direction * front_m)
         self._granted = False
 
     def receive(self, authority: Authority) -> bool:
-        """Process an authority; return whether it is accepted: newer, for this direction, and from after the last turn.
+        """Process an authority; return whether it is accepted, as newer, for this direction and this end of the train.
 
         An authority that answers a report from before the last change of ends may have been granted for the present
         direction two changes ago. An authority that has lapsed in transit is rejected. An order to brake is always
@@ -190,18 +190,18 @@ class OnBoard:
         return self._sent.get(self._newest, -math.inf) - sent_s <= LONGEST_FRESH_S
 
     def _begins(self) -> bool:
-        """Return whether an authority is the first since the start, the last turn or an order to brake."""
+        """Return whether an authority is the first since the start, a change of ends or an order to brake."""
         return not self._granted
 
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
-        """Return whether a shorter end may be accepted: the train does not know authorities from before its start.
+        """Return whether an authority may be accepted; a shorter end only if `agrees`, or after an earlier authority.
 
-        The train brakes until it can accept the end.
+        Without an earlier authority since its start the train brakes until it can accept the shorter end.
         """
         return not authority.shortens or agrees or self._granted
 
     def acknowledgement(self) -> dict[str, int]:
-        """Return the fields of a report on the train's orders; no fields before the first order."""
+        """Return the fields of a report on the newest authority and order to brake; no fields before the first."""
         order = {} if self.order is None else {"brake_order": self.order.number}
         if self.number < 0:
             return order
@@ -209,7 +209,7 @@ class OnBoard:
         return {"authority": self.number, "authority_end_cm": end_cm, **order}
 
     def age_s(self, now_s: float) -> float:
-        """Largest possible age of the newest authority [s]; infinite before the first."""
+        """Return the largest possible age of the newest authority [s]; infinite before the first."""
         return float("inf") if self.answered_s is None else now_s - self.answered_s
 
     def _steps(self) -> Steps:
@@ -217,13 +217,13 @@ class OnBoard:
         parts = () if self.authority is None else self.authority.gradients
         if self.direction > 0:
             return Steps([c / 100.0 for c, _ in parts], [p / 1000.0 for _, p in parts])
-        # backward: a gradient applies from the start of the next part down to its own start, and before the first it is
-        # level
+        # toward falling chainage a gradient applies from the start of the next part to its own start, and the line is
+        # level before the first part
         ends = [-c / 100.0 for c, _ in parts[::-1]]
         return Steps([-math.inf, *ends], [*(-p / 1000.0 for _, p in parts[::-1]), 0.0])
 
     def supervised(self, now_s: float | None = None) -> Supervised | None:
-        """Return the permitted speeds of the train, None before its first position.
+        """Return the supervised speeds of the train, None before its first position.
 
         The front end is extrapolated from the newest position to `now_s`, where both instants are known.
         """
@@ -260,14 +260,14 @@ class OnBoard:
         return self.stale_reason(now_s) or self.curve_reason(now_s)
 
     def stale_reason(self, now_s: float) -> str | None:
-        """Return the input that is too old, the authority or the position; None if neither is too old."""
+        """Return the reason why the train brakes if the authority or the position is too old, otherwise None."""
         if self.age_s(now_s) > self.limits.fresh_s:
             return "no fresh authority"
         at_s = None if self._motion is None else self._motion.at_s
-        return "no place" if at_s is not None and now_s - at_s > self.limits.placeless_s else None
+        return "no position" if at_s is not None and now_s - at_s > self.limits.placeless_s else None
 
     def curve_reason(self, now_s: float) -> str | None:
-        """Return the reason why the curve brakes the train: speed, permitted speed, and overrun."""
+        """Return the reason if the train exceeds its braking curve, with speed, limit and overrun; otherwise None."""
         found, motion = self.supervised(now_s), self._motion
         if found is None or motion is None or motion.speed_mps <= found.intervention_mps:
             return None
@@ -279,7 +279,7 @@ class OnBoard:
         return f"{motion.speed_mps:.1f} m/s, above the {found.intervention_mps:.1f} m/s that lead to {target}{overruns}"
 
     def turn(self, direction: int, front_m: float) -> None:
-        """Change to a running direction, without an authority."""
+        """Change ends to a running direction; the train then has no authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
         self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
         self._motion, self.authority = None, None

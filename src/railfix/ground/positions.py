@@ -1,4 +1,4 @@
-"""Position messages of a train from JSON lines: as they are measured, or from a recording at its own pace."""
+"""Position messages of a train from JSON lines, received as they are measured or replayed from a recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.io.train_message import MessageError, TrainMessage, from_json
 
 #: Longest line of a position message [bytes].
 LONGEST_LINE: Final = 100_000
-#: Bytes that are read at once.
+#: Largest number of bytes in one read.
 _READ: Final = 1 << 16
 
 #: Whether positions are live, or from a recording.
@@ -26,7 +26,7 @@ async def read_positions(
 ) -> AsyncIterator[TrainMessage]:
     """Yield the position messages in lines; other lines are rejected with a message and skipped.
 
-    With the clock "replay" messages are delayed as their positions were recorded. Their times are then replaced by the
+    With the clock "replay" messages are delayed to the pace of the recording, and their times are replaced by the
     present time, so that the centre accepts the positions as new.
     """
     first: tuple[int, int] | None = None
@@ -51,9 +51,9 @@ async def read_positions(
 
 
 async def standard_input() -> AsyncIterator[str]:
-    """Yield lines as they arrive; a waiting reader does not delay the end of the program.
+    """Yield lines of the standard input as they arrive; a waiting reader does not delay the end of the program.
 
-    A line longer than `LONGEST_LINE` is cut to its beginning, which is no message.
+    A line longer than `LONGEST_LINE` is cut to its beginning, which is not a valid message.
     """
     kind = os.fstat(sys.stdin.fileno()).st_mode
     if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file has all its lines

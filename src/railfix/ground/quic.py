@@ -38,28 +38,28 @@ IDLE_S: Final = 10.0
 WAIT_S: Final = 0.2
 #: Longest delay of QUIC acknowledgements, to be sent with a frame [s].
 ACKNOWLEDGE_S: Final = 1.5
-#: Largest numbers of handshakes in progress, of one peer and of all; further ones wait.
+#: Largest numbers of handshakes in progress, of one peer and of all peers; further handshakes wait.
 MOST_OF_PEER: Final = 16
 MOST_HANDSHAKES: Final = 64
-#: A handshake in progress for this time ends where another one waits: its peer has given up [s].
+#: Time after which a handshake in progress is ended if another handshake waits, as its peer has given up [s].
 HANDSHAKE_S: Final = 5.0
-#: Time in which peers begin the handshakes that they were invited to by a Retry, and between looks for room [s].
+#: Time in which peers begin a handshake after a Retry, and interval at which waiting first packets are checked [s].
 INVITED_S: Final = 0.25
 ASKING_S: Final = 0.01
 #: Receive buffer for packets that arrive while the centre is busy; the default buffer overflows with a thousand trains
 #: after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
-#: Packets of connected peers that are processed for one packet of a handshake.
+#: Number of packets of connected peers that are processed for one packet of a handshake.
 TURN: Final = 16
-#: A packet of a connected peer that has waited so long is dropped: the peer has sent a newer message since [s].
+#: Time after which a waiting packet of a connected peer is dropped, as the peer has sent a newer message [s].
 LATE_S: Final = 1.0
-#: Largest number of packets of handshakes that wait, and of packets that are read in a turn.
+#: Largest number of handshake packets that wait, and of packets that are read in a turn.
 MOST_WAITING: Final = 1024
 _REJECTED: Final = 0x101
 
 
 def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = IDLE_S) -> QuicConfiguration:
-    """Return the settings of an end from the files that `railfix.ground.keys.write_keys` wrote."""
+    """Return the QUIC configuration of an end from the files of `railfix.ground.keys.write_keys`."""
     settings = QuicConfiguration(
         is_client=is_client,
         alpn_protocols=[PROTOCOL],
@@ -74,14 +74,14 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
 
 
 class Handshakes:
-    """Handshakes in progress: a bounded number, so that each is done before its peer gives up."""
+    """Handshakes in progress, limited in number so that each is completed before its peer gives up."""
 
     def __init__(self) -> None:
-        self._open: dict[LinkProtocol, tuple[str, float]] = {}  #: Peer, and begin [s].
+        self._open: dict[LinkProtocol, tuple[str, float]] = {}  #: Peer's address, and time of the first packet [s].
         self._invited, self._since_s = 0, float("-inf")
 
     def invites(self, now_s: float) -> bool:
-        """Return whether a peer may prove its address: as many at a time as may begin a handshake then."""
+        """Return whether a peer may be invited to prove its address, as there is room for its handshake."""
         if now_s - self._since_s > INVITED_S:
             self._invited, self._since_s = 0, now_s
         room = MOST_HANDSHAKES - self._invited
@@ -96,7 +96,7 @@ class Handshakes:
         return self._has_room(mine, MOST_OF_PEER, now_s) and self._has_room(list(self._open), MOST_HANDSHAKES, now_s)
 
     def _has_room(self, handshakes: list[LinkProtocol], most: int, now_s: float) -> bool:
-        """Return whether there are fewer handshakes; the oldest is ended where it takes too long."""
+        """Return whether another handshake fits, if necessary after ending the oldest if it takes `HANDSHAKE_S`."""
         if len(handshakes) < most:
             return True
         oldest = handshakes[0]
@@ -107,18 +107,18 @@ class Handshakes:
         return True
 
     def begin(self, protocol: LinkProtocol, peer: str, now_s: float) -> None:
-        """Note the first packet of a connection."""
+        """Record the first packet of a connection."""
         self._open[protocol] = peer, now_s
 
     def end(self, protocol: LinkProtocol) -> None:
-        """Note that a handshake is done, or its connection has ended."""
+        """Record that a handshake is complete, or that its connection has ended."""
         self._open.pop(protocol, None)
 
 
 class LinkProtocol(QuicConnectionProtocol):
     """One end of a connection that carries datagrams.
 
-    `peer` has the certificate of the other end, None before it was verified.
+    `peer` has the certificate of the other end, None before the certificate is verified.
     """
 
     def __init__(
@@ -138,8 +138,8 @@ class LinkProtocol(QuicConnectionProtocol):
         self._received = received
         self._rejected = rejected
         self._wait_s = wait_s
-        self.patience: Callable[[], None] | None = None  #: Called once, with the first packet of the other end.
-        self.unanswered_s: float | None = None  #: Time of the first message since the newest packet [s].
+        self.patience: Callable[[], None] | None = None  #: Called once, at the first packet from the other end.
+        self.unanswered_s: float | None = None  #: Time of the first message sent since the newest packet [s].
         self._answers: list[Callable[[], bytes]] = []
         self._waiting: asyncio.TimerHandle | None = None
         if not quic.configuration.is_client:
@@ -183,7 +183,7 @@ class LinkProtocol(QuicConnectionProtocol):
         self.close(error_code=_REJECTED, reason_phrase="certificate")
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
-        """Process a packet; delayed acknowledgements to a verified peer halve packets and work."""
+        """Process a packet; acknowledgements to a verified peer are delayed, which halves packets and work."""
         self.unanswered_s = None
         if self.patience is not None:
             self.patience()
@@ -204,7 +204,7 @@ class LinkProtocol(QuicConnectionProtocol):
         self._answers.append(made)
 
     def transmit(self) -> None:
-        """Send due messages with the delayed answers."""
+        """Send due messages together with the delayed answers."""
         if self._waiting is not None:
             self._waiting.cancel()
             self._waiting = None
@@ -227,9 +227,9 @@ class LinkProtocol(QuicConnectionProtocol):
         self.transmit()
 
     async def wait_silent(self, idle_s: float) -> None:
-        """Wait until the connection is closed, or no packet has come for a time since a message was sent.
+        """Wait until the connection is closed, or no packet has arrived for `idle_s` since a message was sent.
 
-        QUIC itself waits for three times its probe time-out at least, which grows with the variation of round trips.
+        The time-out of QUIC is at least three times the probe time-out, which grows with the variation of round trips.
         """
         while not self.ended:
             now_s = self._loop.time()
@@ -255,7 +255,7 @@ def address_errors(host: str, port: int) -> Iterator[None]:
 
 
 class _Socket:
-    """Sending end of a server: a packet that the system does not take is lost."""
+    """Sending end of a server; a packet that the system does not accept is lost."""
 
     def __init__(self, bound: socket.socket) -> None:
         self._bound = bound
@@ -269,10 +269,10 @@ class _Socket:
 
 
 class LinkServer(QuicServer):
-    """Server that reads all packets that have arrived, and takes turns between handshakes and connected peers.
+    """Server that reads all packets that have arrived, and processes handshakes and connected peers in turns.
 
-    Neither waits for more than a turn of the others: `TURN` packets of connected peers, and one of a handshake; those
-    in progress come before new ones, which wait here. `late` counts packets that had waited for too long.
+    A turn has one packet of a handshake and up to `TURN` packets of connected peers. Handshakes in progress precede new
+    handshakes, which wait. `late` is the number of packets that were dropped because they had waited for `LATE_S`.
     """
 
     def __init__(self, bound: socket.socket, handshakes: Handshakes, **settings: Any) -> None:
@@ -281,13 +281,13 @@ class LinkServer(QuicServer):
         self._bound, self._handshakes = bound, handshakes
         self._connected: deque[tuple[bytes, Any, LinkProtocol, float]] = deque()
         self._opening: deque[tuple[bytes, Any, bool]] = deque(maxlen=MOST_WAITING)
-        self._asking: dict[bytes, tuple[bytes, Any, float]] = {}  #: First packets, by the identifier of a connection.
+        self._asking: dict[bytes, tuple[bytes, Any, float]] = {}  #: Waiting first packets, by connection identifier.
         self._next: asyncio.Handle | None = None
         self.connection_made(_Socket(bound))  # type: ignore[arg-type]
         self._loop.add_reader(bound, self._read)
 
     def close(self) -> None:
-        """End all connections, and do not listen any more."""
+        """End all connections, and close the server."""
         self._loop.remove_reader(self._bound)
         if self._next is not None:
             self._next.cancel()
@@ -309,8 +309,8 @@ class LinkServer(QuicServer):
         self._turn()
 
     def _sort(self, data: bytes, addr: Any, now_s: float) -> None:
-        """Enter a packet of a peer that is not connected."""
-        with suppress(ValueError):  # no packet of QUIC
+        """Queue a packet of a peer that is not connected; other data than QUIC packets are dropped."""
+        with suppress(ValueError):  # not a QUIC packet
             header = pull_quic_header(Buffer(data=data), host_cid_length=self._configuration.connection_id_length)
             first = header.packet_type == QuicPacketType.INITIAL and header.destination_cid not in self._protocols
             if not first or header.token:
@@ -319,7 +319,7 @@ class LinkServer(QuicServer):
                 self._asking[header.destination_cid] = data, addr, now_s
 
     def _turn(self) -> None:
-        """Process packets, as many as a turn has."""
+        """Process the packets of one turn, and schedule the next turn."""
         now_s, self._next = self._loop.time(), None
         if self._opening:
             data, addr, first = self._opening.popleft()
@@ -350,7 +350,7 @@ async def listen(
     rejected: Callable[[], None],
     wait_s: float = WAIT_S,
 ) -> tuple[LinkServer, tuple[str, int]]:
-    """Listen for connections at an address; port 0 takes a free port. Return the server and its address.
+    """Open a server at an address, where port 0 takes a free port; return the server and its address.
 
     Answers and acknowledgements to a verified peer are delayed up to `wait_s`, to be sent with a message. A peer must
     prove its address before more than its first packet is stored (Retry, RFC 9000, 8.1.2).
@@ -387,9 +387,10 @@ async def connection(
     received: Callable[[LinkProtocol, bytes], None],
     timeout_s: float = 5.0,
 ) -> AsyncIterator[LinkProtocol]:
-    """Connect from the local address of the bearer's interface, in three times `timeout_s` from the first answer on.
+    """Connect from a bearer's local address; a first packet must arrive within `timeout_s`.
 
-    ConnectionError, TimeoutError: the other end rejects the certificate, has another name, or does not answer.
+    The connection must then be established within three times `timeout_s`. ConnectionError, TimeoutError: the other end
+    rejects the certificate, has another name, or does not answer.
     """
     loop = asyncio.get_running_loop()
     transport, protocol = await loop.create_datagram_endpoint(

@@ -1,7 +1,7 @@
-"""Effect of a position report on the interval of its train: pure functions.
+"""Effect of a position report on the interval of its train, as pure functions.
 
 No check proves a report correct: `CHECKS` detect reports that contradict earlier reports. Undetected errors (within the
-train's own bounds) are excluded by an assumption in ``docs/ground.md``.
+train's own bounds) are excluded by condition C12 of ``docs/safety.md``.
 
 The safe rear end moves to the position confirmed by two consecutive reports of a complete train of its configured
 length. A report that contradicts the record of its train stops that train and its neighbours. Whatever the
@@ -21,12 +21,12 @@ from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Largest rounding difference between a reported and the configured length [m].
 LENGTH_ROUNDING_M: Final = 0.02
-#: Largest speed of a standing train, and largest speed against the facing that is not rolling back [m/s].
+#: Largest speed of a train at standstill, and largest backward speed that is not rolling back [m/s].
 STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
-#: Largest sum of over- and under-reading amount of an accepted report.
+#: Largest sum of over- and under-reading amount of an accepted report [m].
 WIDEST_M: Final = 1000.0
-#: Uncertainty of the instants of positions for intervals: the largest age of a position when it is sent [s].
+#: Least time between two positions for the extension of intervals: the largest age of a position when it is sent [s].
 INSTANT_S: Final = 5.0
 
 
@@ -38,12 +38,12 @@ def is_placed(message: TrainMessage) -> bool:
 
 
 def is_newer(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report is newer than all known reports: from a later on-board start, or of a higher number."""
+    """Return whether a report is from another on-board start than the newest report, or has a higher number."""
     return (message.session or 0) != known.session or message.sequence > known.sequence
 
 
 def stands(message: TrainMessage) -> bool:
-    """Return whether a report states standstill with a speed that agrees."""
+    """Return whether a report states standstill, with a speed of at most `STANDING_MPS`."""
     return message.standstill and abs(message.speed_cmps or 0) / 100.0 <= STANDING_MPS
 
 
@@ -60,7 +60,7 @@ class PlacedReport:
     message: TrainMessage
     layout: Layout
     limits: InterlockingLimits
-    granted: int  #: Number of the last authorities.
+    granted: int  #: Number of the newest authorities.
     skipped: tuple[int, int]  #: `Interlocking.skipped`.
     #: Longest time since the previous position [s]: negative where the report's clock is behind the previous report's,
     #: None where unknown, as at the first report.
@@ -88,23 +88,23 @@ class PlacedReport:
 
     @property
     def rear_m(self) -> float:
-        """Safe rear end by this report alone [m]."""
+        """Safe rear end according to this report alone [m]."""
         return self.front_m - self.message.facing * (self.over_m + self.known.length_m)
 
     @property
     def ahead_m(self) -> float:
-        """Safe front end by this report alone [m]."""
+        """Safe front end according to this report alone [m]."""
         return self.front_m + self.message.facing * self.under_m
 
     @property
     def held_m(self) -> float | None:
-        """End of the authority that the train has, at most the end of the line; None if the report names none [m]."""
+        """End of the authority that the report names, limited to the line [m]; None without one."""
         end_cm, stations = self.message.authority_end_cm, self.layout.stations
         return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
 
     @property
     def turns(self) -> bool:
-        """Whether the train faces the other way than before."""
+        """Whether the direction of the train's front end has changed."""
         return self.message.facing != self.known.direction
 
 
@@ -126,7 +126,7 @@ def wide_bounds(report: PlacedReport) -> str | None:
 
 
 def off_line(report: PlacedReport) -> str | None:
-    """Return the reason for rejecting a position off the line."""
+    """Return the reason if a position is off the line."""
     first, last = report.layout.stations[0].begin_m, report.layout.stations[-1].end_m
     on_line = first - report.over_m <= report.front_m <= last + report.under_m
     return None if on_line else f"the position is not on the line: {report.front_m:.0f} m"
@@ -148,7 +148,7 @@ def unknown_authority(report: PlacedReport) -> str | None:
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
-    """Return the contradiction of a change of ends: position unchanged, with the rear end as the new front end."""
+    """Return the reason if ends are changed while the train runs, or with the new front end outside its interval."""
     if not report.turns:
         return None
     if not report.message.standstill:
@@ -180,26 +180,26 @@ def too_fast(report: PlacedReport) -> str | None:
 
 
 def older_place(report: PlacedReport) -> str | None:
-    """Return the reason if a position is older than the previous position."""
+    """Return the reason if a position is older than the previously reported position."""
     older = report.elapsed_s is not None and report.elapsed_s < 0.0
     return "the position is older than in the previous report" if older else None
 
 
 def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
-    """Return the longest distance that a train can have run, by its speeds at both reports where known [m]."""
+    """Return the longest distance that a train can have run in a time, by its speeds at both ends where known [m]."""
     top = limits.speed_mps
     if before is not None and now is not None:
-        # speeds in between exceed both ends by at most this much
+        # the speed in between exceeds the speeds at both ends by at most these terms
         top = min(top, max(before, now) + SPEED_ERROR_MPS + 0.5 * limits.acceleration_mps2 * elapsed_s)
     return top * elapsed_s
 
 
 def impossible_way(report: PlacedReport) -> str | None:
-    """Return the reason if no train can cover the distance in the time."""
+    """Return the reason if no train can have run the distance since the previous position."""
     known, elapsed = report.known, report.elapsed_s
     if report.turns:
         return None
-    # At its first report the train is at rest; after a start on board it may be anywhere in its interval.
+    # Before its first report the train is at rest; after a start on board it may be anywhere in its interval.
     if elapsed is None:
         end = known.front_m if known.reported_m is None else known.interval_m[1]
         way = known.direction * (report.front_m - end) - report.over_m
@@ -223,14 +223,14 @@ def rolled_back(report: PlacedReport) -> str | None:
 
 
 def runs_backward(report: PlacedReport) -> str | None:
-    """Return the reason if a train runs against its facing."""
+    """Return the reason if a train runs in the direction of its rear end."""
     message, speed = report.message, report.speed_mps
     backward = message.direction == -report.known.direction and (speed is None or speed > STANDING_MPS)
     return "the train runs backward" if backward and not message.standstill and not report.turns else None
 
 
 Check = Callable[[PlacedReport], str | None]
-#: Contradictions of a report, in the order in which they are reported.
+#: Checks of a report for contradictions, in the order in which they are made.
 CHECKS: tuple[Check, ...] = (
     no_length, other_line, wide_bounds, off_line, moving_standstill, unknown_authority, wrong_turn, holds_more,
     too_fast, older_place, impossible_way, beyond_authority, rolled_back, runs_backward,
@@ -238,12 +238,12 @@ CHECKS: tuple[Check, ...] = (
 
 
 def compute_contradiction(report: PlacedReport) -> str | None:
-    """Return the contradiction of a report with a position, None without one."""
+    """Return the first contradiction of a report with a position, None without a contradiction."""
     return next((reason for check in CHECKS if (reason := check(report)) is not None), None)
 
 
 def covered_m(report: PlacedReport) -> tuple[float, float]:
-    """Return the rear and the front end of an interval that is extended to the reported position.
+    """Return the rear and front ends of the interval extended to the reported position [m].
 
     The extension is limited by the distance that the train can have run, and by the line.
     """
@@ -259,7 +259,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
-    """Return the train with the data of a report with a position, contradicted or not, and changes of its interval."""
+    """Return the train's record with the data of a report, contradicted or not, and changes of its interval."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     noted: dict[str, Any] = {
@@ -285,7 +285,7 @@ def _runs_by(report: PlacedReport) -> int | None:
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
-    """Return a train that is stopped, its interval extended to the reported position and to its authority."""
+    """Return the record of a stopped train, with its interval extended to the reported position and authority."""
     (rear, front), d, noted = covered_m(report), report.known.direction, _noted(report)
     held = noted.end_m if report.held_m is None else report.held_m
     end, rear = d * max(d * noted.end_m, d * held), d * min(d * rear, d * held) if report.turns else rear
@@ -302,10 +302,10 @@ def report_received(
 ) -> Interlocking:
     """Return the state after a position report.
 
-    A train that faces the other way than before has changed ends. This is accepted only at standstill inside its
-    station, and the interval still covers the earlier position. A report that contradicts the record stops the train
-    and moves its interval outward only. `elapsed_s` is the longest time since the previous position, by the centre's
-    own clock, where known.
+    A change of ends is accepted only at standstill inside the train's station, and the interval still includes the
+    earlier position. A report that contradicts the record stops the train, and only extends its interval. Reports
+    without a position, and older reports, have no effect. `elapsed_s` is the longest time since the previous position
+    by the centre's clock, where known.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):
@@ -338,12 +338,12 @@ def report_received(
 
 
 def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:
-    """Return the rear end confirmed by two consecutive reports, along the facing [m]; one report cannot move it."""
+    """Return the rear end that two consecutive reports confirm, as a distance in running direction [m]."""
     return min(facing * rear_m, facing * claimed_m)
 
 
 def furthest(facing: int, agreed_m: float, known_m: float) -> float:
-    """Return the further of two rear ends along the facing: a wider bound does not move it back [m]."""
+    """Return the further of two rear ends in running direction, which a wider bound does not move back [m]."""
     return max(agreed_m, facing * known_m)
 
 
@@ -367,7 +367,7 @@ def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
-    """Return a train that has changed ends: no new authority; its earlier position and authority remain occupied."""
+    """Return the record of a train that has changed ends; its earlier position and authority remain occupied."""
     held = ahead if known.held_end_m is None else known.held_end_m
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m, facing * held)

@@ -51,8 +51,8 @@ _BELONGS_TO = "stations and trains"
 
 
 def parse_address(text: object) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``; ValueError when the text has another form."""
-    if isinstance(text, tuple):  # read before: settings that are replaced are checked again
+    """Return host and port of ``HOST:PORT``; ValueError: the text has another form."""
+    if isinstance(text, tuple):  # already parsed, as settings that are replaced are checked again
         text = ":".join(map(str, text))
     host, _, port = str(text).rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
@@ -71,10 +71,10 @@ class TrainPlace(Settings):
     station: str
     track: Literal[1, 2]
     direction: Literal[-1, 1]  #: Direction of the front along the chainage.
-    #: Front end and length.
+    #: Chainage of the front end, and length of the train.
     front_m: float
     length_m: float = Field(gt=0)
-    bound_m: float = Field(default=10.0, ge=0)  #: Largest distance of the front from `front_m`.
+    bound_m: float = Field(default=10.0, ge=0)  #: Largest distance of the front end from `front_m`.
 
 
 class TriangleInputs(Settings):
@@ -82,7 +82,7 @@ class TriangleInputs(Settings):
 
     sources: tuple[str, str, str]  #: Streams of the three receivers, as in ``railfix live``.
     points: tuple[Place, Place, Place]  #: Latitude, longitude and height of the known points; length 3 [deg, deg, m].
-    nav: tuple[Path, ...] = ()  #: Navigation known from the start; records from the streams are added.
+    nav: tuple[Path, ...] = ()  #: Navigation files; records from the streams are added.
     limits: TriangleLimits = TriangleLimits()
 
     def points_ecef_m(self) -> Floats:
@@ -91,7 +91,7 @@ class TriangleInputs(Settings):
 
 
 class CentreFile(Settings):
-    """File of a centre; paths are relative to it."""
+    """Configuration file of a centre; its paths are relative to the folder of the file."""
 
     keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key`` of ``railfix ground keys``.
     listen: dict[LinkName, Address]  #: Address of each bearer.
@@ -99,7 +99,7 @@ class CentreFile(Settings):
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Gradients of the line, in order of chainage.
-    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection. The detection answers by the order
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection system, which sends the order
     #: ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise the section is unknown.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
@@ -109,13 +109,13 @@ class CentreFile(Settings):
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
     #: Whether a train that nears the end of its track is given the route to the next station.
     routes: Literal["automatic", "by hand"] = "automatic"
-    speed_mps: float = Field(default=20.0, gt=0)  #: Speeds of the reference run curve, for simulated running.
-    #: Time in which simulated points move: railfix has no interface to real ones.
+    speed_mps: float = Field(default=20.0, gt=0)  #: Highest speed of the reference run curve, for simulated running.
+    #: Time in which simulated points move; railfix has no interface to real points.
     points_s: float = Field(default=5.0, ge=0)
     #: Reference triangle that monitors satellite positioning; the first start is then a stop, to be released by hand.
     #: Without it satellite positioning is not monitored.
     triangle: TriangleInputs | None = None
-    #: `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
+    #: Limits of reports, of the interlocking and of the monitor.
     centre: CentreLimits = CentreLimits()
     interlocking: InterlockingLimits = InterlockingLimits()
     monitor: MonitorLimits = MonitorLimits()
@@ -127,7 +127,7 @@ class CentreFile(Settings):
         if bool(self.stations) == bool(self.network):
             raise ValueError("give the line either by stations or by network")
         if self.network:
-            return self  # checked again with its stations
+            return self  # the settings are checked again once the stations are known
         layout, numbers = self.layout, [train.number for train in self.trains]
         for name in self.detected_sections:
             if name not in layout.sections:
@@ -165,7 +165,7 @@ class CentreFile(Settings):
 
     @property
     def layout(self) -> Layout:
-        """Line."""
+        """Layout of the line."""
         return Layout(stations=self.stations, gradients=self.gradients)
 
     def intervals(self) -> list[TrainInterval]:
@@ -197,13 +197,13 @@ async def run_centre(
 ) -> tuple[bool, dict[str, Any]]:
     """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time.
 
-    Returns whether SIGTERM ended it, and figures of the session.
+    Returns whether SIGTERM ended the centre, and figures of the session.
 
-    The page is at a host and port, port 0 takes a free port; beyond loopback addresses it is served by TLS with the
-    centre's certificate. `password` permits orders, and `people` has personal passwords by name. Orders have a separate
-    address where one is given, otherwise the page's address. `announce` is called with each address once trains can
-    connect. InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an
-    address cannot be listened at.
+    `page` is the host and port of the page, where port 0 takes a free port; at other than loopback addresses the page
+    is served by TLS with the centre's certificate. `password` permits orders, and `people` has personal passwords by
+    name. `orders` is a separate address for orders, by default the page's address. `announce` is called with each
+    address once trains can connect. InputFileError: the file, a key or the database cannot be read. SettingsError: a
+    setting is wrong, or an address is not available.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
@@ -283,7 +283,7 @@ async def _run_until(
 def _centre(
     settings: CentreFile, keys: Path, store: Store, points: SimulatedPoints
 ) -> tuple[ControlCentre, CentreLinks]:
-    """Return the centre with its stored state, and its links, connected to each other."""
+    """Return the centre with its stored state, and the links that are connected to it."""
     supervision = Supervision(
         layout=settings.layout,
         state=at_start(settings.layout, settings.intervals()),
@@ -316,7 +316,7 @@ def _centre(
 
 
 def _stored_points(store: Store) -> dict[PointName, int]:
-    """Return the position of the simulated points: as detected, or commanded, when the previous process ended."""
+    """Return the tracks of the simulated points, as detected, or else commanded, when the previous process ended."""
     texts = store.documents(HEAD)
     points = from_documents(texts).points if texts else {}
     return {name: point.detected or point.wanted for name, point in points.items()}
@@ -329,7 +329,7 @@ def _call_in(loop: asyncio.AbstractEventLoop, work: Callable[[], None]) -> None:
 
 
 def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
-    """Return the time of each train's last frame over each bearer, as shown on the page."""
+    """Return the time since each train's last frame over each bearer, as shown on the page."""
     now = time.monotonic()
     return [
         {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,
@@ -340,7 +340,7 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
-    """Work every `STEP_S`, at most half of the time: the links receive one frame per turn of the event loop."""
+    """Run a step every `STEP_S`, for at most half of the time, as the links receive frames in the same event loop."""
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:
@@ -371,7 +371,7 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
 
 
 def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
-    """Store the stations and trains of the file at the first start; raise if the file differs later."""
+    """Store the stations and trains of the file at the first start; InputFileError: they differ at a later start."""
     under = {f"station {s.name}": s.model_dump_json() for s in settings.stations}
     under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
@@ -399,7 +399,7 @@ def _is_loopback(host: str) -> bool:
 def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
     """Return the password in the first line of a file, and personal passwords in the other lines, ``NAME PASSWORD``.
 
-    InputFileError: when the file cannot be read, is empty, has another form, or can be read by others than its owner.
+    InputFileError: the file cannot be read, is empty, has another form, or can be read by others than its owner.
     """
     try:
         shared = path.stat().st_mode & 0o077

@@ -24,14 +24,14 @@ class InterlockingLimits(Settings):
     """Limits of the interlocking."""
 
     margin_m: float = Field(default=20.0, ge=0)  #: Margin between the end of an authority and its limit.
-    #: Overlap beyond the end for a train that passes it at release speed; 0: no release speed.
+    #: Overlap beyond the end of an authority for a train that passes the end at release speed; with 0 there is no
+    #: release speed.
     overlap_m: float = Field(default=0.0, ge=0)
-    #: Points are released this long after the safe rear end has passed them.
+    #: Time from the passage of the safe rear end to the release of points.
     release_s: float = Field(default=3.0, ge=0)
-    #: The field answers a request for the detection of points within this time; otherwise the trains on them are
-    #: stopped.
+    #: Longest time until the field answers a request for the detection of points; then trains on them are stopped.
     answer_s: float = Field(default=10.0, gt=0)
-    #: The detection of a section answers at least this often; otherwise the section is unknown.
+    #: Longest time between two answers of a section's detection; then the section is unknown.
     detection_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.
@@ -61,18 +61,19 @@ class TrainInterval:
     #: Instant of the newest position, on the train's clock; None before the first report since a start on board.
     measured_ns: int | None = None
     speed_mps: float | None = None  #: Newest speed.
-    #: Ends of the train by the newest report with a position, contradicted or not, lower first; and its contradiction.
+    #: Ends of the train by the newest report with a position, contradicted or not, lower chainage first; and the
+    #: contradiction of this report.
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
-    #: Number of the newest authority by which it may run, sent or named by a report; None before the first, and once a
-    #: report names an order to brake of that number or later: no authority in transit ends that order.
+    #: Number of the newest authority by which the train may run, sent or named by a report. None before the first, and
+    #: once a report names an order to brake of this or a later number, which no authority in transit can end.
     runs_by: int | None = None
     stop: str | None = None  #: Reason of the stop, until the train is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
-    asked_number: int = 0  #: Number of the first authority that requests it.
-    held: bool = False  #: Whether a route was taken back: the next route is set by hand.
-    parted: int | None = None  #: Train that was divided from the rear of this one, until they are apart.
+    asked_number: int = 0  #: Number of the first authority that requests this end.
+    held: bool = False  #: Whether a route was withdrawn, after which the next route is set by hand.
+    parted: int | None = None  #: Train that was divided from the rear of this train, until the two are apart.
 
     def changed(self, **values: Any) -> Self:
         """Return a copy with changes, like `dataclasses.replace` without its cost; TypeError for an unknown name."""
@@ -96,7 +97,7 @@ class TrainInterval:
         return low, high
 
     def overlaps(self, low_m: float, high_m: float) -> bool:
-        """Return whether some chainage between two is occupied."""
+        """Return whether some chainage between two chainages is occupied."""
         return self.span_m[0] < high_m and low_m < self.span_m[1]
 
     def has_passed(self, low_m: float, high_m: float) -> bool:
@@ -104,7 +105,7 @@ class TrainInterval:
         return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
 
     def outside_m(self) -> float:
-        """Return the distance of the newest reported position from the interval, 0 where it may be inside [m]."""
+        """Return the distance of the newest reported position from the interval [m], 0 where it may be inside."""
         if self.reported_m is None:
             return 0.0
         front = max(self.direction * end for end in self.reported_m)
@@ -125,7 +126,7 @@ class PointState:
     detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
     #: Whether the field has received the command since `wanted` was stored.
     commanded: bool = True
-    #: Trains that lock the points: None until the train's rear end has passed, then the time of release [s].
+    #: Trains that lock the points, with the time of release once the train's rear end has passed [s], None before.
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
@@ -134,7 +135,7 @@ class PointState:
         return self.detected == self.wanted
 
 
-#: Fields of the records that are stored.
+#: Names of the fields of stored records.
 _NAMES: Final = {
     kind: dict.fromkeys(field.name for field in fields(kind)).keys() for kind in (TrainInterval, PointState)
 }
@@ -154,7 +155,7 @@ class Interlocking:
 
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
-    stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
+    stopped: bool = False  #: Whether satellite positioning is suspended: no authority is extended, and no route is set.
     granted: int = 0  #: Number of the last authorities that were sent.
     #: Last number before this start, according to the stored database, and first number of this start; numbers between
     #: them were issued from a newer database.
@@ -204,9 +205,9 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
-    """Return the state from its texts. Times of release restart: the earlier process's clock is unknown.
+    """Return the state from its texts; times of release restart, as the earlier process's clock is unknown.
 
-    InputFileError: when an older version wrote them.
+    InputFileError: the texts were written by an older version.
     """
     head = json.loads(texts[HEAD] or "")
     names = {field.name for field in fields(TrainInterval)}

@@ -1,8 +1,8 @@
 """Stops of one train, all trains, a section, or trains whose intervals overlap, and their release by hand.
 
-Until the release everything that was granted stays occupied. The train accepts a shorter end if it can stop before it.
-Every authority from the request on contains this end, and the train rejects authorities with older numbers, so that a
-late authority cannot lengthen it again.
+Until the release everything that was granted stays occupied. A train accepts a shorter end of its authority if it can
+stop before this end. Every authority after the request has the shorter end, and the train rejects authorities with
+older numbers, so that a late authority cannot extend the authority again.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from railfix.ground.layout import Layout, Piece, PointName, overlap
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
 
-#: Reasons why a section is barred: it was closed by hand; it is occupied by vehicles that report nothing, as entered by
-#: hand or as detected; or its detection has not answered. `BARS` are the reasons that stop the trains inside.
+#: Reasons why a section is barred: it was closed by hand; it is occupied by vehicles without reports, as entered by
+#: hand or as detected; or its detection has not answered. `BARS` are the reasons for which trains inside are stopped.
 CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
@@ -38,9 +38,9 @@ def overlaps_stopped(
     nearby: NearbyTrains | None = None,
     checked: Mapping[int, TrainInterval] | None = None,
 ) -> Interlocking:
-    """Return the state with overlapping trains stopped: the bounds of trains at rest may have grown.
+    """Return the state with trains stopped whose intervals overlap, as the bounds of trains at rest may have grown.
 
-    Trains that are as in `checked`, the trains that an earlier call returned, are not compared with each other again.
+    Trains that are unchanged since `checked`, the trains of an earlier call, are not compared with each other again.
     """
     nearby, checked = nearby or NearbyTrains(state, layout), checked or {}
     pairs = set()
@@ -61,12 +61,12 @@ def overlaps_stopped(
 
 
 def _occupation(train: TrainInterval) -> tuple[object, ...]:
-    """Return what the comparison of a train with others follows from."""
+    """Return the values that determine the result of comparing a train with other trains."""
     return train.span_m, train.tracks, train.stop, train.parted
 
 
 def parted_cleared(state: Interlocking) -> Interlocking:
-    """Return the state in which divided trains that are apart are treated as any other trains."""
+    """Return the state in which divided trains that are apart are treated as all other trains."""
     for train in [train for train in state.trains.values() if train.parted is not None]:
         rear = state.trains.get(train.parted or 0)
         if rear is None or not train.overlaps(*rear.span_m):
@@ -75,11 +75,11 @@ def parted_cleared(state: Interlocking) -> Interlocking:
 
 
 def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
-    """Return the state with the stop of one train released by hand, and the reason of a refusal.
+    """Return the state with the stop of one train released by hand, and the reason for a refusal.
 
-    Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
-    report names its line. Its station becomes the farthest station that its front has reached, on the train's track
-    there.
+    Points under the train's interval are locked for the train again, as a train that has rolled back may have passed
+    them before. The line of the train is taken from its next report. The route of the train ends in the farthest
+    station of the route that its front end has reached.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -106,7 +106,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     points = dict(state.points)
     for name in under:
         points[name] = replace(points[name], locked={**points[name].locked, train: None})
-    direction = known.direction  # where the train ran too far, its authority now ends there
+    direction = known.direction  # the authority of a train that ran too far ends at its front
     end = direction * max(direction * known.end_m, direction * known.front_m)
     station = known.station  # after a wrong change of ends a station behind the train
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
@@ -119,7 +119,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
 
 
 def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[PointName], layout: Layout) -> str | None:
-    """Return the refusal if points under an interval do not lead its train to its tracks."""
+    """Return the reason for a refusal if points under a train's interval are not set for the train's tracks."""
     for name in under:
         point = state.points[name]
         if not (point.lies and point.wanted == train.tracks.get(name[0])):
@@ -129,7 +129,7 @@ def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[Po
 
 
 def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
-    """Return a section, with its bar, that a train occupies in part and that stops the trains inside."""
+    """Return a section that a train occupies, with a bar for which trains inside are stopped; None without one."""
     occupied = pieces_of(train, layout)
     bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
     return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)
@@ -138,7 +138,7 @@ def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple
 def close_section(
     state: Interlocking, section: str, layout: Layout, reason: str, *, kind: str = CLOSED
 ) -> Interlocking:
-    """Return the state with a section barred: no authority reaches into it any more, trains inside are stopped."""
+    """Return the state with a section barred, into which no authority is extended, and the trains inside stopped."""
     state = replace(state, bars=state.bars | {(section, kind)})
     pieces = layout.sections[section]
     inside = [number for number, train in state.trains.items() if overlap(pieces, pieces_of(train, layout))]
@@ -146,12 +146,12 @@ def close_section(
 
 
 def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Interlocking:
-    """Return the state without a bar of a section; trains that it stopped are released one by one."""
+    """Return the state without a bar of a section; trains that were stopped by the bar must be released by hand."""
     return replace(state, bars=state.bars - {(section, kind)})
 
 
 def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[str]) -> Interlocking:
-    """Return the state with sections barred that are detected as occupied, but not by a reporting train."""
+    """Return the state with sections barred that are detected as occupied while no train's interval includes them."""
     for section in sections:
         pieces = layout.sections[section]
         if (section, OCCUPIED) not in state.bars and not any(
@@ -164,7 +164,7 @@ def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[st
 def ask_route_back(
     state: Interlocking, train: int, layout: Layout, *, limits: InterlockingLimits
 ) -> tuple[Interlocking, str | None]:
-    """Return the state in which a train is requested to stay in its station, and the reason of a refusal."""
+    """Return the state in which a train is requested to stay in its station, and the reason for a refusal."""
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"
@@ -181,10 +181,10 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer the request; the route is released where the train agrees,
-    otherwise kept.
+    """Return the state after a report that may answer a request for a shorter end.
 
-    For a stopped train, whose report may be wrong, no answer is used until it is released.
+    The route is released if the train agrees, otherwise it is kept. An answer of a stopped train, whose report may be
+    wrong, is not used until the train is released.
     """
     known = state.trains[message.train]
     if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:
@@ -211,7 +211,7 @@ def answers(known: TrainInterval, message: TrainMessage) -> bool:
 
 
 def holds_more_than_asked(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a train has a longer authority than requested, or is beyond that end."""
+    """Return whether a train has a longer authority than requested, or is beyond the requested end."""
     d = known.direction
     assert known.asked_m is not None
     further = max(d * (message.authority_end_cm or 0) / 100.0, d * known.front_m)

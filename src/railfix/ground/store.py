@@ -1,6 +1,7 @@
 """Stored state of the centre: trains, authorities and the log, in SQLite (WAL) or another SQL database.
 
-Everything is committed before it is acknowledged or granted: a centre that is killed at any moment can restore it.
+Reports are committed before they are acknowledged, and authorities before they are sent, so that a centre that is
+killed at any moment can restore them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ with needs_extra():
     from sqlalchemy import event
 
 _META: Final = sql.MetaData()
-#: Lines of the log that are kept while the database fails, and in the database.
+#: Largest number of log lines that are kept while the database fails, and in the database.
 MOST_NOTES: Final = 10_000
 MOST_LINES: Final = 1_000_000
 #: Document that names the process in charge.
@@ -51,13 +52,13 @@ LOG: Final = sql.Table(
 
 
 class DatabaseError(OutputError):
-    """The database does not accept data at the moment."""
+    """Error of a database that does not accept data at present."""
 
 
 class Store:
     """Stored state of a centre in a database (``sqlite:///centre.db``, ``postgresql+psycopg://...``).
 
-    InputFileError: when the database cannot be opened.
+    InputFileError: the database cannot be opened.
     """
 
     def __init__(self, url: str, *, most_lines: int = MOST_LINES) -> None:
@@ -73,13 +74,13 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self.abandoned = False  #: A commit hangs in another thread, which keeps the connection.
+        self.abandoned = False  #: Whether a commit hangs in another thread, which keeps the connection.
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
-        """Make this process the only writer: an earlier centre cannot commit any more.
+        """Make this process the only writer, so that an earlier centre cannot commit any more.
 
-        InputFileError: when another process on this machine uses the SQLite database.
+        InputFileError: another process on this machine uses the SQLite database.
         """
         database = self._engine.url.database
         if self._engine.dialect.name == "sqlite" and database:
@@ -118,10 +119,10 @@ class Store:
     def save(self, *records: TrainRecord, documents: Mapping[str, str | None] | None = None) -> None:
         """Commit train reports, named texts (None removes a text) and the lines of the log.
 
-        InputFileError: when another centre has taken charge of the database since `take_charge`. DatabaseError: when
-        the database fails; nothing is stored then, and the lines of the log are kept.
+        InputFileError: another centre has taken charge of the database since `take_charge`. DatabaseError: the database
+        fails; nothing is stored in this case, and the lines of the log are kept.
         """
-        notes = self._notes[:]  # more may be noted meanwhile, by another thread
+        notes = self._notes[:]  # another thread may add lines meanwhile
         try:
             self._save(records, documents or {}, notes)
         except sql.exc.SQLAlchemyError as error:
@@ -170,7 +171,7 @@ class Store:
         self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
-        """Return the records of all trains: unknown until they report, with their last positions."""
+        """Return the stored records of all trains, with their last positions and the state `TrainState.UNKNOWN`."""
         with self._connection.begin():
             rows = self._connection.execute(sql.select(TRAINS).order_by(TRAINS.c.train)).all()
         return {
@@ -214,7 +215,7 @@ class Store:
 
 
 def _time_outs(url: str) -> dict[str, Any]:
-    """Return time-outs of a connection: to connect, for a statement, and for a dead network."""
+    """Return the time-outs of a connection for connecting, for a statement, and for an interrupted network."""
     if url.startswith("postgresql"):
         return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
     if url.startswith(("mysql", "mariadb")):

@@ -37,13 +37,13 @@ from railfix.ground.stops import (
 )
 from railfix.io.train_message import TrainMessage
 
-#: A train within this distance of the end of its track requests the next route [m].
+#: Distance to the end of its track within which a train gets the next route [m].
 ROUTE_AHEAD_M = 700.0
-#: A train is sent an authority at its report, at a stop, and otherwise this often [s].
+#: Longest time between two authorities to a train, which also gets an authority after each report and at a stop [s].
 AUTHORITY_S = 1.0
 #: Least number of authority numbers that are skipped at a start.
 SKIPPED: Final = 1 << 20
-#: Time after the answered report at which an authority has lapsed on board: longer than `LONGEST_FRESH_S` [s].
+#: Time after the answered report at which an authority has certainly lapsed on board, above `LONGEST_FRESH_S` [s].
 LAPSED_S: Final = 60.0
 #: Largest drift between clocks of a train and of the centre.
 CLOCK_DRIFT: Final = 1e-4
@@ -55,7 +55,7 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    #: Called with points to be moved and their target track; `set_detected` gets the field's reports.
+    #: Function that is called with points to be moved and the target track; `set_detected` processes the detection.
     command: Callable[[PointName, int], None] = lambda *_: None
 
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -74,7 +74,7 @@ class Supervision:
     begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
     #: Trains that must report before anything is granted (`begin_again`).
     awaited: set[int] = field(default_factory=set)
-    #: Sections that are detected as occupied; None: not answered yet, or too long ago.
+    #: Whether each section is detected as occupied; None without an answer, or if the last answer is too old.
     detected: dict[str, bool | None] = field(default_factory=dict)
     #: Time of a section detection's last answer [s], for detections that must be repeated.
     answered_s: dict[str, float] = field(default_factory=dict)
@@ -88,7 +88,7 @@ class Supervision:
         self._nearby = NearbyTrains(self.state, self.layout)
 
     def report(self, message: TrainMessage, now_s: float) -> Rejection | None:
-        """Process a report; return the reason of its rejection, None if it is accepted."""
+        """Process a report; return the reason for its rejection, None if it is accepted."""
         number = message.train
         if number not in self.state.trains:
             return Rejection.UNKNOWN_TRAIN
@@ -114,7 +114,7 @@ class Supervision:
         sent_s, first = self.ordered.get(number, (0.0, 0))
         if number in self.ordered and is_obeyed(message, first):
             self.ordered[number] = math.inf, first
-        elif sent_s == math.inf:  # a start on board since then has reset it
+        elif sent_s == math.inf:  # a later start on board has ended the order on board
             self.ordered[number] = -math.inf, first
         elif held is not None and held not in self.issued.get(number, ()):
             reason = "the train obeys an order to brake from before this start"
@@ -123,11 +123,12 @@ class Supervision:
     def _read_clock(
         self, message: TrainMessage, record: TrainRecord, now_s: float
     ) -> tuple[float | None, tuple[float, float], bool]:
-        """Return the longest time since the train's previous position (None: unknown), the clock's delay and its state.
+        """Return the longest time since the train's previous position, and the delay of the train's clock [s].
 
-        The least delay of earlier reports is used; after an on-board start, whose clock is new, the centre's clock
-        alone. The third value is True for a new clock and for a clock that has been set back: its earlier delays do not
-        apply, because they would lengthen the time since every later position.
+        The time, None where unknown, is computed with the least delay of earlier reports; after an on-board start,
+        whose clock is new, only the centre's clock is used. The delay is returned with the time of its observation. The
+        third value is True for a new clock and for a clock that has been set back, whose earlier delays would lengthen
+        the time since every later position.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -149,7 +150,7 @@ class Supervision:
         return ", ".join(f"train {number}" for number in sorted(self.awaited))
 
     def set_detected(self, point: PointName, track: int | None) -> None:
-        """Process the detection of points: a track, None where they are at neither end."""
+        """Process the detection of points: a track, or None where the points are in neither end position."""
         self._asked_s.pop(point, None)
         self.state = points_reported(self.state, point, track, self.layout)
 
@@ -199,9 +200,10 @@ class Supervision:
             self.state = occupied_detected(self.state, self.layout, [section])
 
     def set_route(self, train: int, **step: Any) -> str | None:
-        """Set a route to the next station; return the reason of a refusal.
+        """Set a route to the next station; return the reason for a refusal.
 
-        `step` has the data of the current step for `route_requested`. Its points move once `command_points` is called.
+        `step` has the arguments `nearby` and `stopped` of `route_requested`. The points of the route move once
+        `command_points` is called.
         """
         if train not in self.state.trains:
             return f"no such train: {train}"
@@ -212,12 +214,12 @@ class Supervision:
         return reason
 
     def ask_route_back(self, train: int) -> str | None:
-        """Request a train to return its route to the next station; return the reason of a refusal."""
+        """Request a train to return its route to the next station; return the reason for a refusal."""
         self.state, reason = ask_route_back(self.state, train, self.layout, limits=self.limits)
         return reason
 
     def command_points(self, stored: Interlocking) -> None:
-        """Give the due commands to points of a stored state; none before every train has reported."""
+        """Give the due commands to points of a stored state; no commands are given before every train has reported."""
         if self.awaited:
             return
         self.state, commands = due_commands(self.state, self.layout, stored, self._locate())
@@ -240,7 +242,7 @@ class Supervision:
         return authorities
 
     def watch(self, now_s: float) -> list[BrakeOrder]:
-        """Find trains that have to stop, independent of the store; return the orders to brake to be sent.
+        """Find trains that have to stop, without use of the store; return the orders to brake that are to be sent.
 
         An order is repeated every `AUTHORITY_S` until a report of the train names it.
         """
@@ -276,7 +278,7 @@ class Supervision:
         """Release points, set routes, extend authorities; return the messages to send once the state is stored.
 
         It processes trains that have reported since the last call, whose stop has changed, or that were sent nothing
-        for `AUTHORITY_S`; the others wait for their report.
+        for `AUTHORITY_S`.
         """
         stopped = stop_orders(self.state)
         if not self.awaited:
@@ -308,7 +310,7 @@ class Supervision:
         )
 
     def _locate(self) -> NearbyTrains:
-        """Return the trains by location."""
+        """Return the updated index of trains by location."""
         self._nearby.update(self.state)
         return self._nearby
 
@@ -356,12 +358,12 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names this order to brake, or a later order."""
+    """Return whether a report names the order to brake of a number, or a later order."""
     return (message.brake_order or -1) >= number
 
 
 def counts(reason: Rejection | None) -> bool:
-    """Return whether a report is accepted: there is no reason for rejecting it."""
+    """Return whether a report is accepted, as there is no reason for rejecting it."""
     return reason is None
 
 

@@ -22,7 +22,7 @@ STOP_SHORT_M: Final = 2.0
 
 
 def line_with_loops(stations: int = 6) -> Layout:
-    """Return a line of equal stations of 500 m, one every 1,500 m."""
+    """Return a line of equal stations, 500 m long, which begin every 1,500 m."""
     begins = [1500.0 * k for k in range(stations)]
     return Layout(
         stations=tuple(LoopStation(name=chr(65 + k), begin_m=b, end_m=b + 500.0) for k, b in enumerate(begins))
@@ -70,7 +70,7 @@ class SimulatedTrain:
         )
 
     def message(self, now_s: float) -> TrainMessage:
-        """Return the position message of an instant."""
+        """Return the position message at a time [s], without a position while the train is blind."""
         self.sequence += 1
         self.on_board.note_report(self.sequence, now_s)
         time = 1_400_000_000_000_000_000 + round(now_s * 1e9)
@@ -112,7 +112,7 @@ class SimulatedTrain:
 
     @property
     def safe_front_m(self) -> float:
-        """Front end with its error and bound, and the driver's margin before the end of an authority [m]."""
+        """Safe front end from the erroneous position and its bound, plus the driver's margin `STOP_SHORT_M` [m]."""
         return self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M)
 
     def permitted_mps(self) -> float:
@@ -125,15 +125,15 @@ class SimulatedTrain:
 class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
 
-    Its messages are sent by a subclass: `send_report` and `exchange`.
+    Subclasses carry the messages in `send_report` and `exchange`.
     """
 
     trains: dict[int, SimulatedTrain]
     centre: Supervision
     random: random.Random
-    centre_works: bool = True  #: False while the centre is stopped: it receives nothing, and no points are detected.
+    centre_works: bool = True  #: Whether the centre runs; otherwise it receives no reports and no detection of points.
     now_s: float = 0.0
-    violations: Counter[str] = field(default_factory=Counter)  #: Invariants that were broken, by kind and in seconds.
+    violations: Counter[str] = field(default_factory=Counter)  #: Number of broken invariants in all steps, by kind.
     moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
     lie: dict[PointName, int] = field(default_factory=dict)  #: Track that points lead to; 1 by default.
     _stopped_s: float | None = None
@@ -143,7 +143,7 @@ class Traffic:
 
     @property
     def layout(self) -> Layout:
-        """Line."""
+        """Layout of the line."""
         return self.centre.layout
 
     def step(self) -> None:
@@ -247,7 +247,7 @@ class Traffic:
                 self.violations["opposing trains in a section"] += 1
 
     def _check_stops(self) -> None:
-        """Check that trains brake once their authority is too old, and thus at the latest after an order to stop."""
+        """Check that trains brake once their authority is too old, and are at rest in time after an order to stop."""
         stopped = self.centre.state.stopped and self.centre_works
         self._stopped_s = (self.now_s if self._stopped_s is None else self._stopped_s) if stopped else None
         for train in self.trains.values():

@@ -1,4 +1,4 @@
-"""A train's end of the links, and its supervision by the centre's newest authority and the authority's time limit."""
+"""A train's unit: its end of the links, and its supervision by the newest authority and the authority's time limit."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ async def run_train(
 ) -> tuple[int, int]:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
-    Ends with the positions, once the last report is answered or `ANSWER_S` after it. Returns the number of reports and
-    of authorities.
+    It ends after the end of the positions, once the last report is answered, or `ANSWER_S` later. Returns the number of
+    reports and of authorities.
 
-    The folder `keys` has the train's own two files and ``authority.pem``. The positions are messages as written by
-    `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
-    (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, its `is_complete` replaces
-    the messages' value. InputFileError: when a key is missing.
+    The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as written
+    by `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
+    (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, `is_complete` of this file
+    replaces the messages' value. InputFileError: a key is missing.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()
@@ -78,14 +78,14 @@ def is_complete(path: Path) -> bool:
 
 
 class _Desk:
-    """Newest position, newest authority, and whether the train brakes."""
+    """State of a train's unit: newest position, newest authority, and the reason for braking."""
 
     def __init__(
         self, *, train: int, write: Callable[[str], None], limits: OnBoardLimits, integrity: Path | None
     ) -> None:
         self._train, self._write, self._limits, self._integrity = train, write, limits, integrity
         self._newest: TrainMessage | None = None
-        # a start is identified by a random number: no clock decides what is newer
+        # a random number identifies the start, independent of any clock
         self._session, self._sequence, self._answered = draw_session(), 0, 0
         self._on_board: OnBoard | None = None
         self._reason: str | None = ""
@@ -135,7 +135,7 @@ class _Desk:
 
     @staticmethod
     def _note_position(on_board: OnBoard, message: TrainMessage, now_s: float) -> None:
-        """Update the braking curve with a position."""
+        """Pass a position to the on-board supervision, without one its absence."""
         place, over, under = message.chainage_cm, message.over_cm, message.under_cm
         if place is None or over is None or under is None or message.speed_cmps is None:
             on_board.note_position(None, None, now_s=now_s)
@@ -170,7 +170,7 @@ class _Desk:
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(now), 3), **self._speeds(now))
 
     def _speeds(self, now_s: float) -> dict[str, float]:
-        """Return the permitted speed, its target, and the release speed at the target."""
+        """Return the permitted speed, its target, and the release speed; no values before the first position."""
         assert self._on_board is not None
         if (found := self._on_board.supervised(now_s)) is None:
             return {}

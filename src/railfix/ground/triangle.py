@@ -1,9 +1,10 @@
 """Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points; its monitor.
 
-P3 (reference triangle): each fix is compared with its point by a circle of allowable error, and the vectors between
+In P3 (reference triangle) each fix is compared with its point by a circle of allowable error, and the vectors between
 neighbouring fixes (distance and bearing) with the vectors between the points. P3 treats a fix inside its circle as the
-point itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes: errors
-common to the three receivers cancel in them, their limit can be far below the radius, and such a drift is detected.
+point itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes. Errors
+common to the three receivers cancel in these vectors, so that their limit can be far below the radius, and a drift
+inside the circle is detected.
 
 The monitor is a pure state machine that suspends satellite positioning, with a latched stop and release by hand:
 `advance` takes the state and one sample, and returns the new state with the orders to be sent.
@@ -59,8 +60,8 @@ STOPPING: Final = frozenset(verdict for verdict in TriangleVerdict if verdict >=
 class TriangleLimits(Settings):
     """Limits of the triangle."""
 
-    #: Radius of the circle of allowable error. An error of up to this size is not detected: it is part of the error
-    #: budget of the trains.
+    #: Radius of the circle of allowable error. An error of up to this size is not detected, and must be part of the
+    #: error budget of the trains.
     radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
     #: Largest deviation of the vector between two fixes from the vector between their points.
     side_m: float = option("Largest deviation of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
@@ -81,14 +82,15 @@ def limits_for_false_stops(
 
     The length of a horizontal error of standard deviation sigma per axis is Rayleigh distributed:
     ``P(e > R) = exp(-R^2 / (2 sigma^2))``. Half of the false stops are allotted to the three circles, half to the
-    three sides; a year has as many independent samples as `independent_s` fit into it.
+    three sides. A year has ``YEAR_S / independent_s`` independent samples.
 
     Parameters
     ----------
     sigma_m : float [m]
         Standard deviation of a fix per axis.
     own_sigma_m : float [m]
-        Standard deviation of the part not common to the other receivers; a side contains it twice.
+        Standard deviation per axis of the part of the error that is not common to all receivers; the error of a side
+        contains this part of both receivers.
     stops_per_year : float
     independent_s : float [s]
         Time after which the errors of a fix are independent of earlier errors.
@@ -115,10 +117,10 @@ class TriangleResult(FrozenArrays):
 
     error_m: Floats  #: Horizontal distance of each fix from its point; NaN without a fix; shape (T, 3).
     side_error_m: Floats  #: Deviation of the vector between two fixes, in the order of `SIDES`; shape (T, 3).
-    distance_error_m: Floats  #: Deviation of the length of that vector, shape (T, 3).
-    bearing_error_deg: Floats  #: Deviation of its bearing, clockwise, in [-180, 180); shape (T, 3).
+    distance_error_m: Floats  #: Deviation of the distance between two fixes, shape (T, 3).
+    bearing_error_deg: Floats  #: Deviation of the bearing between two fixes, clockwise, in [-180, 180); shape (T, 3).
     verdict: Codes  #: `TriangleVerdict`, shape (T,).
-    receiver: Integers  #: Receiver that the verdict names, -1 where it names none; shape (T,).
+    receiver: Integers  #: Receiver that the verdict names, -1 without one; shape (T,).
 
 
 def compare_triangle(
@@ -138,7 +140,7 @@ def compare_triangle(
     Raises
     ------
     ValueError
-        The sides of the triangle are too short for the limits: a side is longer than ``2 radius_m + side_m``.
+        A side of the triangle is too short for the limits, as it is not longer than ``2 radius_m + side_m``.
     """
     first, second = np.array(SIDES).T
     side = points_m[second] - points_m[first]
@@ -175,7 +177,7 @@ def _verdicts(
 ) -> tuple[Codes, Integers]:
     """Return verdict and named receiver of each set of fixes, shapes (T,)."""
     outside = (~inside).sum(axis=1)
-    # receiver i alone: the sides that end at it differ, the third does not
+    # a single receiver i: both sides at receiver i differ, and the third side does not
     alone = np.stack([~small[:, i] & ~small[:, i - 1] & small[:, i - 2] for i in range(3)], axis=1)
     named = np.where(alone.any(axis=1), alone.argmax(axis=1), -1)
     own_outside = np.take_along_axis(~inside, np.maximum(named, 0)[:, None], axis=1)[:, 0] & (named >= 0)
@@ -184,7 +186,7 @@ def _verdicts(
             ~present & all_fallen,
             ~present,
             (outside == 0) & small.all(axis=1),
-            # with noise, a drift exceeds one of its two limits first
+            # with noise, a drift exceeds the limit of one side before that of the other side
             (outside == 0) & ((named >= 0) | (small.sum(axis=1) == 2)),
             (outside == 1) & own_outside,
             (outside == 3) & small.all(axis=1),
@@ -206,7 +208,7 @@ def _verdicts(
 
 
 class Order(Enum):
-    """Order of the monitor to the trains, in the order they are sent."""
+    """Orders of the monitor to the trains, in the sequence in which they are sent."""
 
     #: Suspend satellite positioning: its positions are no longer used.
     SUSPEND = "suspend satellite positioning"
@@ -224,7 +226,7 @@ _SETTLE_S: Final = 10.0
 class MonitorLimits(Settings):
     """Times of the monitor."""
 
-    #: A set of three fixes is late after this time; with the period of the fixes below the time to alert of 6 s.
+    #: Time after which a set of three fixes is late; with the period of the fixes it is below the time to alert of 6 s.
     late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
     healthy_s: float = Field(default=300.0, gt=0)  #: Healthy time before a stop can be released.
 
@@ -233,12 +235,12 @@ class MonitorLimits(Settings):
 class MonitorState:
     """State of the monitor."""
 
-    stopped: bool = True  #: True before the first healthy period was released, and from a stop to its release.
+    stopped: bool = True  #: Whether trains are stopped, as at the start, or since a stop that is not released.
     cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None at the start.
-    receiver: int = -1  #: Receiver that the cause names, -1 where it names none.
-    since_s: float = 0.0  #: Time of the stop.
-    complete_s: float = 0.0  #: Time of the last set of three fixes.
-    healthy_since_s: float | None = None  #: Start of the present healthy time.
+    receiver: int = -1  #: Receiver that the cause names, -1 without one.
+    since_s: float = 0.0  #: Time of the stop [s].
+    complete_s: float = 0.0  #: Time of the last set of three fixes [s].
+    healthy_since_s: float | None = None  #: Start of the present healthy time [s]; None if fixes are not healthy.
 
 
 def advance(
@@ -293,9 +295,10 @@ def _stop(
 def release(
     state: MonitorState, now_s: float, *, limits: MonitorLimits
 ) -> tuple[MonitorState, tuple[Order, ...], str | None]:
-    """Return the state after a release by hand, the orders, and the reason of a rejected release.
+    """Return the state after a release by hand, the orders, and the reason for a rejected release.
 
-    A stop is released after `MonitorLimits.healthy_s` of uninterrupted healthy fixes, the last of them not late.
+    A stop can be released after `MonitorLimits.healthy_s` of uninterrupted healthy fixes, if the last fixes are not
+    late.
     """
     if not state.stopped:
         return state, (), "there is no stop to release"
@@ -311,7 +314,7 @@ class MonitoredLog:
 
     fixes: StationFixes
     triangle: TriangleResult
-    #: Orders to the trains, with the cause and the receiver it names.
+    #: Orders to the trains: time, order, cause, and the receiver that the cause names, -1 without one.
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:
@@ -334,7 +337,7 @@ class MonitoredLog:
 
 @dataclass(kw_only=True)
 class Monitor:
-    """Monitor of fixes in order of time, in blocks of any number of epochs; released at the start."""
+    """Monitor of fixes in order of time, in blocks of any number of epochs; trains are not stopped at the start."""
 
     limits: TriangleLimits
     times: MonitorLimits
@@ -342,15 +345,15 @@ class Monitor:
     begun: bool = False
 
     def begin(self, now_s: float) -> None:
-        """Begin at a clock time: fixes are late `MonitorLimits.late_s` after it."""
+        """Begin at a clock time [s]; first fixes are late `MonitorLimits.late_s` after this time."""
         self.state, self.begun = replace(self.state, complete_s=now_s), True
 
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
-        """Process fixes at a clock time, by default each at its tag; return their verdicts with the orders to be sent.
+        """Process fixes at a clock time, by default each at its tag; return the verdicts and the orders to be sent.
 
-        Fixes that are late after the previous ones stop the trains, in a log as in a stream.
-        The cause of an order is the cause of the stop at the end of the fixes, which may have become more exact.
-        SettingsError: the sides of the triangle are too short for the limits.
+        Fixes that are late after the previous fixes stop the trains, in a log as in a stream. The cause of an order is
+        the cause of the stop after all these fixes, which may have become more exact. SettingsError: the sides of the
+        triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9
@@ -374,7 +377,7 @@ class Monitor:
 
 
 def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> None:
-    """Draw the fixes about their points, and the errors of fixes and sides over time."""
+    """Draw the fixes around their points, and the errors of fixes and sides over time, into a picture file."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 7), layout="constrained")

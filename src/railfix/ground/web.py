@@ -1,6 +1,6 @@
 """Page of the control centre: the line with trains, intervals and authorities, links, alarms and log.
 
-The page can be read without a log-in; orders need one. The page loads nothing from other servers.
+The page can be read without a log-in; orders require a log-in. The page loads nothing from other servers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SESSION_S: Final = 1800.0
 #: Number of wrong passwords of an address within `WRONG_S` after which its log-ins are refused for that time.
 MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
-#: A connection without a whole request for this time ends, at the latest after twice this time [s].
+#: A connection without a complete request for this time is ended, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
 #: Largest number of connections, beyond which further connections are refused; and largest number of a peer's
 #: connections without a complete request.
@@ -53,7 +53,7 @@ _HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 
-#: An order: called with the values of the request and its author, returns the reason of a refusal.
+#: Function of an order, called with the values and the author of the request; it returns the reason for a refusal.
 Order = Callable[..., str | None]
 
 
@@ -72,7 +72,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None for a wrong password, or after too many from that address."""
+        """Open a session and return its token; None for a wrong password, or after `MOST_WRONG` from this address."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
@@ -97,7 +97,7 @@ class Sessions:
         self._ends.pop(token, None)
 
     def valid(self, token: str) -> bool:
-        """Return whether a session is open; it is prolonged."""
+        """Return whether a session is open, and prolong an open session."""
         now = self.clock()
         if self._ends.get(token, -1.0) <= now:
             return False
@@ -114,7 +114,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     newest: tuple[float, str, bool] | None = None
 
     def snapshot_text() -> tuple[str, bool]:
-        """Return the snapshot as JSON, and whether it is the last: computed once for all readers within `EVENT_S`."""
+        """Return the snapshot as JSON, computed once for all readers within `EVENT_S`, and whether it is the last."""
         nonlocal newest
         now = time.monotonic()
         if newest is None or now - newest[0] >= 0.9 * EVENT_S:
@@ -177,7 +177,7 @@ def _session_routes(sessions: Sessions) -> list[Route]:
 
 
 async def _give_order(orders: Mapping[str, Order], sessions: Sessions, request: Request) -> Response:
-    """Give the order that a request names, where its session is open."""
+    """Carry out the order that a request names, if the request's session is open."""
     given = orders.get(request.path_params["name"])
     if given is None:
         return _answer({"refused": "there is no such order"}, 404)
@@ -196,7 +196,7 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 
 
 async def _values(request: Request) -> dict[str, Any] | None:
-    """Return the JSON object of a request; None where it has none.
+    """Return the JSON object of a request; None if the request has no object of at most `_LONGEST_BODY` bytes.
 
     Another site cannot send this content type without a preflight request, which is refused.
     """
@@ -218,8 +218,8 @@ async def _values(request: Request) -> dict[str, Any] | None:
 class _TimedProtocol(H11Protocol):
     """HTTP protocol that ends connections without a complete request, however slowly its bytes arrive.
 
-    At most `MOST_IDLE` connections of a peer wait for a request: one more ends the longest waiting, so that a peer that
-    opens many blocks neither others nor its own next request.
+    At most `MOST_IDLE` connections of a peer wait for a request; a further connection ends the connection that has
+    waited longest, so that a peer with many connections blocks neither other peers nor its own next request.
     """
 
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
@@ -264,7 +264,7 @@ class _Server(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Do nothing."""
+        """Install no signal handlers."""
         yield
 
 
@@ -291,7 +291,7 @@ class PageServer:
         self._task: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Serve until `stop`."""
+        """Start the server, and wait until it accepts connections."""
         self._task = asyncio.create_task(self._server.serve(sockets=[self._socket]))
         while not self._server.started:
             await asyncio.sleep(0.01)

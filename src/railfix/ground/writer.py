@@ -1,4 +1,4 @@
-"""Commits to the store in a thread, one at a time, so that a hanging database delays only uncommitted messages."""
+"""Sequential commits to the store in a thread, so that a hanging database delays only uncommitted messages."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ RETRY_S: Final = 1.0
 
 
 class ThreadWriter:
-    """Executor of commits in a daemon thread: the process can end while it runs.
+    """Executor of commits in a daemon thread, so that the process can end while a commit is in progress.
 
-    `done` is called in that thread after each function.
+    `done` is called in the thread after each commit.
     """
 
     def __init__(self, done: Callable[[], None] = lambda: None) -> None:
@@ -30,7 +30,7 @@ class ThreadWriter:
         self._thread.start()
 
     def submit(self, work: Callable[[], None]) -> Future[None]:
-        """Start a function after the previous one; return its outcome."""
+        """Queue a function, and return the future of its outcome."""
         outcome: Future[None] = Future()
         self._queue.put((work, outcome))
         return outcome
@@ -48,7 +48,7 @@ class ThreadWriter:
 
 
 def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
-    """Run a function; set its outcome in the future and return it."""
+    """Run a function, set its outcome in the future, and return the future."""
     try:
         work()
     except Exception as error:  # noqa: BLE001 (the caller of `result` gets the error)
@@ -60,9 +60,10 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
 
 @dataclass(kw_only=True)
 class Commits:
-    """Commits of the centre, one at a time, and their fault.
+    """Commits of the centre, at most one in progress, and the fault of the store.
 
-    `alarm` is the reason why the store rejects the state; nothing is granted meanwhile, but stops are sent.
+    `alarm` is the reason why the store rejects the state, None without a fault. During a fault no authority is sent,
+    but orders to brake are.
     """
 
     writer: ThreadWriter | None = None  #: Executor; without one a commit is carried out at once.
