@@ -332,6 +332,6 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("gap.xml", _landxml("650100</End></Line>", "650090</End></Line>"), "refused", "correct the elements"),
     Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves turn to the other side"),
     Odd("unknown_frame.xml", _landxml('"25832"', '"99999999"'), "refused", "'EPSG:99999999' is unknown"),
-    Odd("frame_without_grid.xml", _landxml('"25832"', '"4258"'), "refused", "no grid; a design is in one"),
+    Odd("frame_without_grid.xml", _landxml('"25832"', '"4258"'), "refused", "not a projected CRS"),
     Odd("another_grid.xml", _landxml('"25832"', '"2154"'), "refused", "is EPSG:2154 the right CRS"),
 )  # fmt: skip

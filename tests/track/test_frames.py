@@ -110,7 +110,7 @@ def test_japan_moves_by_a_semidynamic_correction_where_its_file_is_given(tmp_pat
     assert moved.latitude_deg - track.latitude_deg == pytest.approx(0.01 / 3600.0, abs=1e-9)
     assert moved.longitude_deg - track.longitude_deg == pytest.approx(0.02 / 3600.0, abs=1e-9)
     assert (shift.east_m, shift.north_m, shift.up_m) == pytest.approx((0.503, 0.308, 0.1), abs=2e-3)
-    assert "its epoch is not named" in shift.notes[0]
+    assert "its epoch is not given" in shift.notes[0]
     later, named = track_at(track, time, parameters=tmp_path / "s.par", epoch=2024.5)
     step = np.linalg.norm(later.ecef_m - moved.ecef_m, axis=1)
     assert 0.03 < step[0] < 0.07  # two years of the Eurasian plate in the ITRF

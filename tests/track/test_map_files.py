@@ -168,7 +168,7 @@ def test_a_file_without_an_accuracy_is_taken_as_a_survey_with_a_note(tmp_path: P
     path = geojson(tmp_path / "c.geojson", {"1": {}})
     track = read_track(path, heights=profile)
     assert track.sigma_plan_m == 0.3
-    note = "map: c.geojson states no accuracy, 0.3 m in plan is taken, that of an aerial survey (--plan-sigma)"
+    note = "map: c.geojson states no accuracy, 0.3 m in plan is assumed, as for an aerial survey (--plan-sigma)"
     assert track.provenance.notes.count(note) == 1
     given = read_track(path, heights=profile, sigma_plan_m=3.0)
     assert given.sigma_plan_m == 3.0

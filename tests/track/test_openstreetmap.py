@@ -118,7 +118,7 @@ def test_every_exporter_gives_the_same_tracks_with_id_name_and_accuracy(tmp_path
     np.testing.assert_allclose(segments[1].longitude_deg, [x for x, _ in WAYS[12]], atol=1e-12)
     assert {s.metadata["sigma_plan_m"] for s in segments} == {"2"}
     notes = " ".join(segments[0].notes)
-    assert "2 m in plan is taken (--plan-sigma)" in notes
+    assert "2 m in plan is assumed (--plan-sigma)" in notes
     assert "1 railway=platform" in notes
     network = read_network([path], MapReading(sigma_plan_m=0.5))
     assert network.sigma_plan_m == 0.5

@@ -1,4 +1,4 @@
-"""The 3-D track map, its quality checks, vehicles, and antenna trajectories (P1 2.2(1), 3.1(1), 4.2(1))."""
+"""Track maps, networks of tracks, vehicles, and antenna trajectories (P1 2.2(1), 3.1(1), 4.2(1))."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Coordinate reference systems of maps: their relation to the Earth, and coordinates in degrees of their frames.
+"""Coordinate reference systems of maps, their relation to the ITRF, and PROJ operations between them.
 
-Definitions are from the EPSG dataset (https://epsg.org). Motions relative to a plate are used for notes only.
+Definitions are from the EPSG dataset (https://epsg.org). Motions relative to a plate are used only in notes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import SettingsError
 from railfix.core.files import FilePath
 
-#: Three-dimensional codes of the realisations of the ITRF.
+#: EPSG codes of the three-dimensional geographic CRS of each ITRF realisation.
 _ITRF: Final = {
     "ITRF88": "EPSG:7900", "ITRF89": "EPSG:7901", "ITRF90": "EPSG:7902", "ITRF91": "EPSG:7903", "ITRF92": "EPSG:7904",
     "ITRF93": "EPSG:7905", "ITRF94": "EPSG:7906", "ITRF96": "EPSG:7907", "ITRF97": "EPSG:7908",
@@ -41,31 +41,30 @@ _ALIGNED: Final = {
     "ITRF2014": "IGS14, IGb14, WGS 84 (G2139), ATRF2014, SIRGAS-CON SIR17P01",
     "ITRF2020": "IGS20, WGS 84 (G2296)",
 }
-#: Code of the ITRF realisation of a frame's name.
+#: EPSG codes of ITRF realisations by the names of frames that agree with them.
 REALISATIONS: Final = _ITRF | {name: _ITRF[itrf] for itrf, names in _ALIGNED.items() for name in names.split(", ")}
 
 
 @dataclass(frozen=True)
 class HeldFrame:
-    """A frame that is a realisation of the ITRF at an epoch."""
+    """National frame that is a realisation of the ITRF at a fixed epoch."""
 
-    itrf: str  #: Name of the realisation.
-    epoch: float  #: [year].
-    plate: str  #: Plate of the ITRF2020 model that carries most of the country.
-    #: Least and largest motion of the country relative to that plate [mm per year].
+    itrf: str  #: Name of the ITRF realisation.
+    epoch: float  #: Epoch of the coordinates [year].
+    plate: str  #: Plate of the ITRF2020 plate motion model on which most of the country lies.
+    #: Smallest and largest motion of the country relative to the plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: Sentence on other neglected motions.
-    #: Second plate, and two points (latitude, longitude) of a line; this plate carries the country to the right of the
-    #: line.
+    but: str = ""  #: Clause on other neglected motions, for the note.
+    #: Second plate, and two points (latitude, longitude) of its border; the second plate is on the right of the border.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
 
     @property
     def code(self) -> str:
-        """Three-dimensional code of the realisation."""
+        """EPSG code of the three-dimensional geographic CRS of the realisation."""
         return _ITRF[self.itrf]
 
     def plate_at(self, latitude_deg: float, longitude_deg: float) -> str:
-        """Return the plate that carries a point of the country."""
+        """Return the plate on which a point of the country lies."""
         if self.border is None:
             return self.plate
         other, (south, west), (north, east) = self.border
@@ -73,17 +72,17 @@ class HeldFrame:
         return other if cross < 0.0 else self.plate
 
     def describe_rest(self, years: float) -> str:
-        """Return the neglected motion after some years, in words."""
+        """Return a clause with the motion relative to the plate that is neglected over a number of years."""
         low, high = (abs(years) * rate / 1000.0 for rate in self.rest_mm)
         but = f", {self.but}" if self.but else ""
-        return f"its motion against that plate, {low:.2f} to {high:.2f} m, is left out{but}"
+        return f"its motion relative to the plate, {low:.2f} to {high:.2f} m, is left out{but}"
 
 
 _ANDES: Final = "as are earthquakes, metres in Chile since 2010"
 #: National frames that are a realisation of the ITRF fixed at an epoch, where PROJ has no motion for them.
 HELD: Final = {
     "JGD2011": HeldFrame(
-        "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "and the epoch 1997.0 of western Japan, of which --map-epoch is asked"
+        "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "as is the epoch 1997.0 of western Japan (--map-epoch 1997)"
     ),
     "JGD2000": HeldFrame("ITRF94", 1997.0, "EURA", (5.0, 30.0), "as is the earthquake of 2011, up to 5 m"),
     "KGD2002": HeldFrame("ITRF2000", 2002.0, "AMUR", (0.0, 3.0), "as is the earthquake of 2011, 0.01 to 0.06 m"),
@@ -136,7 +135,7 @@ HELD: Final = {
     "Mexico ITRF2008": HeldFrame("ITRF2008", 2010.0, "NOAM", (0.0, 50.0)),
     "RGSPM06": HeldFrame("ITRF2000", 2006.0, "NOAM"),
 }
-#: Frames with the coordinates of another frame: its three-dimensional code, and the agreement.
+#: Frames that are treated as another frame, with the EPSG code of that frame and a clause on the agreement.
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
@@ -150,11 +149,11 @@ SAME: Final = {
 }
 
 
-TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later ones.
-#: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
+TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later realisations.
+#: Frame in which positions are computed: the three-dimensional geographic CRS of ITRF2020.
 WORKING_FRAME: Final = "EPSG:9989"
-#: Usual frames of maps of a region: name, three-dimensional code. Of the frames whose areas contain a point, the first
-#: is the most likely.
+#: EPSG codes of the three-dimensional CRS of frames that are usual for maps of a region. Of the frames whose areas
+#: contain a point, the first is the most likely.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
@@ -163,7 +162,7 @@ REGIONAL: Final = {
 MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
 #: Largest scale of a grid for a single line, less 1: national grids have up to 0.005.
 LARGEST_SCALE: Final = 0.01
-MODERN_M: Final = 0.5  #: Accuracy [m] above which a PROJ transformation is between datums of different age.
+MODERN_M: Final = 0.5  #: Worst accuracy of a PROJ transformation between modern frames [m]; older datums are worse.
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
 #: Operations with a worse accuracy are not used [m]; 999 in the EPSG dataset means unknown.
@@ -175,7 +174,11 @@ Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
 @lru_cache(maxsize=32)
 def kind_of_frame(crs: str) -> Kind:
-    """Return the kind of a CRS by its relation to the Earth; SettingsError if the CRS is unknown."""
+    """Return the kind of a CRS by its relation to the ITRF; raise SettingsError if the CRS is unknown.
+
+    "moves with its plate" is a frame fixed to a plate, "dynamic" an ITRF realisation, and "older datum" a datum without
+    a transformation to ITRF2020 of at most `MODERN_M`.
+    """
     geodetic = get_geodetic_frame(crs)
     name = geodetic.name
     if name in REALISATIONS:
@@ -189,12 +192,12 @@ def kind_of_frame(crs: str) -> Kind:
 
 @lru_cache(maxsize=64)
 def _system(crs: str) -> CRS:
-    """Return the system of a name, which PROJ needs a millisecond to find; CRSError if there is none."""
+    """Return the CRS of a name, cached because PROJ takes a millisecond; raise CRSError if the name is unknown."""
     return CRS.from_user_input(crs)
 
 
 def find_crs(crs: str, *, path: FilePath = "") -> CRS:
-    """Return the system of a name that a file requests; SettingsError when PROJ does not know it."""
+    """Return the CRS of a name; raise SettingsError, which names the file `path`, if the name is unknown to PROJ."""
     try:
         return _system(crs)
     except CRSError:
@@ -205,7 +208,10 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 
 
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
-    """Return the CRS given for a file, or named by the file; SettingsError if they contradict each other."""
+    """Return the CRS of a file, which the user gives or the file names; None without either.
+
+    Raise SettingsError if the two CRS contradict each other, or a CRS is unknown.
+    """
     if given is None or named is None:
         used = given or named
         if used is not None:
@@ -214,32 +220,35 @@ def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | No
     one, other = (find_crs(name, path=path).to_2d() for name in (given, named))
     if not one.equals(other, ignore_axis_order=True):
         raise SettingsError(f"{path}: crs {given} (--crs) contradicts the file's own CRS {named}")
-    return given if find_crs(given).is_compound else named  # with its height datum, if it has any
+    return given if find_crs(given).is_compound else named  # a compound CRS has a height datum
 
 
 def unit_of_grid(crs: str, *, path: str) -> float:
-    """Return the length of a projected CRS's unit [m]; SettingsError if it has none."""
+    """Return the unit of a projected CRS [m]; raise SettingsError if the CRS is not projected."""
     system = find_crs(crs, path=path)
     if not system.is_projected and not (system.is_compound and system.sub_crs_list[0].is_projected):
-        raise SettingsError(f"{path}: {crs} is {system.name}, no grid; a design is in one, such as EPSG:25832 (--crs)")
+        raise SettingsError(
+            f"{path}: {crs} is {system.name}, which is not a projected CRS; give the projected CRS of the design, for "
+            "example EPSG:25832 (--crs)"
+        )
     return float(system.axis_info[0].unit_conversion_factor)
 
 
 def unit_of_heights(crs: str | None) -> float:
-    """Return the length of the unit of a CRS's heights [m]; 1 if it has none."""
+    """Return the unit of the heights of a CRS [m]; 1 if the CRS is None or has no heights."""
     axes = [] if crs is None else find_crs(crs).axis_info
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
 def get_vertical_datum(crs: str | None) -> CRS | None:
-    """Return the height datum of a compound CRS, None for others."""
+    """Return the vertical CRS of a compound CRS; None for any other CRS."""
     system = None if crs is None else find_crs(crs)
     return system.sub_crs_list[1] if system is not None and system.is_compound else None
 
 
 @lru_cache(maxsize=64)
 def get_geodetic_frame(crs: str) -> CRS:
-    """Return the geodetic frame that a CRS is based on."""
+    """Return the geodetic CRS on which a CRS is based; raise SettingsError if it has none."""
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
@@ -250,7 +259,10 @@ def get_geodetic_frame(crs: str) -> CRS:
 
 @lru_cache(maxsize=32)
 def find_operation(crs: str) -> Transformer | None:
-    """Return PROJ's best transformation to the working frame; None where PROJ has none between modern frames."""
+    """Return PROJ's best transformation from the frame of a CRS to the working frame.
+
+    The result is None if PROJ has no transformation with an accuracy of `MODERN_M` or better.
+    """
     source = get_geodetic_frame(crs)
     sources = [source] if source.name not in SAME else [source, CRS.from_user_input(SAME[source.name][0])]
     for frame in sources:
@@ -262,13 +274,16 @@ def find_operation(crs: str) -> Transformer | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operations:
-    """PROJ's operations between two systems over a box: usable, best first, and with missing grids."""
+    """PROJ's operations between two CRS within a box."""
 
-    usable: tuple[Transformer, ...]
-    lacking: tuple[Any, ...] = ()
+    usable: tuple[Transformer, ...]  #: Usable operations, best first.
+    lacking: tuple[Any, ...] = ()  #: Operations whose grids are not installed.
 
     def describe_lacking(self, crs: str | None = None) -> str:
-        """Return the most accurate operation that lacks a grid, and how to get the grid; empty without one."""
+        """Return a clause on the best operation whose grid is not installed, and how to get the grid; "" if none.
+
+        Operations whose grids can be downloaded by projsync precede others; then accuracy decides.
+        """
         if not self.lacking:
             return ""
         best = min(self.lacking, key=lambda o: (not _is_served(o), known_accuracy_m(o.accuracy)))
@@ -285,12 +300,12 @@ class Operations:
 
 
 def _is_served(operation: Any) -> bool:
-    """Return whether PROJ's content delivery network has all grids of an operation."""
+    """Return whether all missing grids of an operation can be downloaded from PROJ's content delivery network."""
     return all(grid.available or "cdn.proj.org" in grid.url for grid in operation.grids)
 
 
 def name_operation(description: str, crs: str | None = None) -> str:
-    """Return the name of an operation of PROJ from a CRS without the steps that change no datum."""
+    """Return the name of a PROJ operation from a CRS, without the steps that do not change the datum."""
     system = None if crs is None else find_crs(crs).to_2d()
     conversion = None if system is None else system.coordinate_operation
     left_out = (*_NO_DATUM_CHANGE, *([f"Inverse of {conversion.name}"] if conversion is not None else []))
@@ -299,10 +314,13 @@ def name_operation(description: str, crs: str | None = None) -> str:
 
 
 def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operations:
-    """Find PROJ's operations between two systems over a box, except ballpark operations, best first."""
+    """Find PROJ's operations between two CRS whose areas of use contain a box, except ballpark operations.
+
+    Without a box all operations are returned in PROJ's order. With a box, operations worse than `WORST_M` are left out.
+    """
     area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # warns of missing grids, which are reported here
+        warnings.simplefilter("ignore", UserWarning)  # missing grids are in the result
         try:
             group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
         except (ProjError, IndexError):  # IndexError: pyproj cannot construct an operation known at a single epoch
@@ -315,18 +333,18 @@ def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operati
 
 
 def rank_operation(operation: Transformer) -> tuple[bool, float]:
-    """Return the sort key of operations: operations for land first, then by accuracy; ties keep PROJ's order."""
+    """Return a sort key that puts operations for land first, and then sorts by accuracy."""
     area = "" if operation.area_of_use is None else operation.area_of_use.name
     return "offshore" in area and "onshore" not in area, known_accuracy_m(operation.accuracy)
 
 
 def known_accuracy_m(accuracy_m: float) -> float:
-    """Return an accuracy of PROJ, infinite where it is unknown (negative)."""
+    """Return an accuracy stated by PROJ [m]; infinity where it is unknown (negative)."""
     return accuracy_m if accuracy_m >= 0.0 else np.inf
 
 
 def contains(area: Any, box: Box) -> bool:
-    """Return whether an area of use contains a box; True for no area."""
+    """Return whether an area of use contains a box; True if there is no area."""
     if area is None:
         return True
     south, north, west, east = box
@@ -335,7 +353,7 @@ def contains(area: Any, box: Box) -> bool:
 
 
 def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:
-    """Return which points lie in the area of use of a CRS, with a margin; all points for a CRS without an area."""
+    """Return a mask of the points within a margin of the area of use of a CRS; all True for a CRS without an area."""
     area = crs.area_of_use
     if area is None:
         return np.ones(len(latitude_deg), dtype=bool)
@@ -343,7 +361,7 @@ def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_
 
 
 def _in_bounds(bounds: Box, latitude_deg: Floats, longitude_deg: Floats, margin_deg: float) -> Masks:
-    """Return which points lie within bounds, also across the date line, with a margin."""
+    """Return a mask of the points within a margin of bounds, which may cross the date line."""
     south, north, west, east = bounds
     inside = (latitude_deg >= south - margin_deg) & (latitude_deg <= north + margin_deg)
     width = (east - west) % 360.0 if east - west < 360.0 else 360.0

@@ -1,10 +1,10 @@
-"""Curve of a centreline between its points: arcs and clothoids in plan, parabolas in height, cant ramps.
+"""Curve of a centreline between its points, which follows arcs and clothoids in plan, and parabolas in height.
 
-Between two points the curve is a cubic over their chord, defined by its directions at both ends. The direction at a
-point is the mean of the directions computed from the chords on either side, for a curvature that is linear between
-points. The curvature at a point is from the map's radii, or from the circle through the point and its neighbours. Arcs,
-clothoids and parabolas are thus followed within millimetres; every point lies on the curve, and chainages are measured
-along the chords.
+Between two points the curve is a cubic over their chord, defined by the directions at both ends. For a curvature that
+is linear between points, each chord implies a direction at its ends; the direction at a point is the mean from both
+adjacent chords. The curvature at a point is from the map's radius, or from the circle through the point and its
+neighbours. The curve passes through every point, and follows arcs, clothoids and parabolas within millimetres.
+Chainages are measured along the chords.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest difference of a chord's middle ordinate between the map's curvature and the curvature from neighbouring
-#: points at which the map's is used [m]; with more, the radius belongs to another point, or to the other side.
+#: Largest difference between the middle ordinates of a chord by the map's radius and by neighbouring points [m]. With a
+#: larger difference the radius is not used: it belongs to another point, or has the wrong sign.
 _AGREES_M: Final = 0.03
-_CORNER_RAD: Final = 0.25  #: Points at which the line turns by more than this are corners, which are not rounded [rad].
-#: Ends of ramps are searched for between points, at least this fraction of the gap away from either point, and where
-#: the values of the two lines differ by this much over the gap.
+_CORNER_RAD: Final = 0.25  #: Smallest change of direction that is a corner, which the curve does not round [rad].
+#: Minimum distance of a ramp's end from either point, as a fraction of the distance between the points, and minimum
+#: difference of the two lines over this distance.
 _BREAK_SHARE: Final = 1e-3
 _LEAST_BREAK: Final = 1e-4
-_CHORD_M: Final = 2e-3  #: Chords of the points of `curved_line` leave the curve by no more than this [m].
+_CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `curved_line` [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class CentreCurve:
 
     chainage_m: Floats  #: Values of the points, shape (V,).
     points_m: Floats  #: ECEF, shape (V, 3).
-    #: Slopes against the chord at the start and the end of each segment, to the right and upward, (V - 1, 2) [rad].
+    #: Directions at start and end of each segment relative to its chord, to the right and upward, (V - 1, 2) [rad].
     to_right: Floats
     to_top: Floats
 
@@ -55,7 +55,7 @@ class CentreCurve:
         return np.stack([along, right, np.cross(right, along)], axis=1)
 
     def at(self, chainage_m: Floats) -> Floats:
-        """Return points of the curve, shape (n, 3) ECEF [m]; beyond the ends the chords go straight on."""
+        """Return points of the curve, shape (n, 3) ECEF [m]; beyond both ends of the line its chords are extended."""
         last = len(self.length_m) - 1
         segment = np.clip(np.searchsorted(self.chainage_m, chainage_m, side="right") - 1, 0, last)
         along = chainage_m - self.chainage_m[segment]
@@ -63,15 +63,18 @@ class CentreCurve:
         return np.asarray(self.points_m[segment] + np.einsum("ni,nij->nj", parts, self._axes[segment]))
 
     def _offset(self, slopes: Floats, segment: Indices, along_m: Floats) -> Floats:
-        """Return the distance of the curve from its chord by the slopes at its ends."""
+        """Return the distance of the curve from its chord, given the directions at both ends [m]."""
         share = np.clip(along_m / self.length_m[segment], 0.0, 1.0)
         first, last = slopes[segment].T
         return np.asarray(self.length_m[segment] * share * (1.0 - share) * (first * (1.0 - share) - last * share))
 
     def chords_m(self, within_m: float) -> Floats:
-        """Return chainages, including all points' chainages, whose chords stay within a distance of the curve."""
-        # A cubic deviates from its chord by an eighth of the change of direction, and more if its slopes differ in
-        # size.
+        """Return chainages [m] such that the chords between them are within `within_m` of the curve.
+
+        The chainages of all points are included.
+        """
+        # A cubic deviates from its chord by an eighth of the length times the change of direction, and by more if its
+        # slopes differ in size.
         turn = np.abs(self.to_right).sum(axis=1) + np.abs(self.to_top).sum(axis=1)
         pieces = np.maximum(np.ceil(np.sqrt(self.length_m * turn / (6.0 * within_m))), 1.0).astype(np.int64)
         start, piece = places_in_groups(pieces)
@@ -79,7 +82,7 @@ class CentreCurve:
 
 
 def centre_curve(track: Track) -> CentreCurve:
-    """Return the curve through the points of a track, which are all different."""
+    """Compute the curve through the points of a track, which must not have duplicate points."""
     step = np.diff(track.ecef_m, axis=0)
     axes = axes_at(track.ecef_m)
     before, after = (np.einsum("vij,vj->vi", axes[1:-1], part) for part in (step[:-1], step[1:]))
@@ -101,12 +104,12 @@ def centre_curve(track: Track) -> CentreCurve:
 
 
 def _to_ends(inner: Floats) -> Floats:
-    """Return values of the inner points, extended at both ends by the neighbouring values, shape (V,)."""
+    """Return values of the inner points, with the first and last value repeated for the end points, shape (V,)."""
     return np.concatenate([inner[:1], inner, inner[-1:]]) if len(inner) else np.zeros(2)
 
 
 def _with_radii(track: Track, of_points: Floats) -> Floats:
-    """Return the curvature at each point: from the map where it agrees with the points, else from the points."""
+    """Return the curvature at each point, from the map if consistent with the points, otherwise from the points."""
     with np.errstate(divide="ignore"):
         of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
     around = np.stack([np.roll(of_points, 1), of_points, np.roll(of_points, -1)])
@@ -118,8 +121,10 @@ def _with_radii(track: Track, of_points: Floats) -> Floats:
 
 
 def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -> Floats:
-    """Return the slopes against the chord at both ends of each segment, shape (V - 1, 2), for a curvature that is
-    linear between the points (V,), made equal at each inner point, at which the chords turn (V - 2,).
+    """Compute the directions at both ends of each segment relative to its chord, shape (V - 1, 2) [rad].
+
+    `curvature` (V,) is linear between points. At an inner point, where the chords turn by `turn` (V - 2,), the
+    directions of both segments are made equal, except at a corner.
     """
     first, last = curvature[:-1], curvature[1:]
     start, end = -length_m * (2.0 * first + last) / 6.0, length_m * (first + 2.0 * last) / 6.0
@@ -131,9 +136,10 @@ def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -
 
 
 def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return chainages and values of a piecewise linear function, with the ends of pieces between the points.
+    """Return a piecewise linear function with additional points at the ends of ramps that lie between its points.
 
-    Where the lines through the two points before and the two after a gap intersect in it, a ramp ends there.
+    A ramp ends between two points if the line through the two points before and the line through the two points after
+    intersect there. Chainages `place_m` and `values` have shape (V,).
     """
     if len(place_m) < 4:
         return place_m, values
@@ -151,7 +157,7 @@ def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def curved_line(track: Track) -> Trajectory:
-    """Return the centreline of a track as a trajectory of points on its curve, close enough for its chords."""
+    """Compute the centreline of a track as a trajectory whose chords are within 2 mm of the curve."""
     curve = centre_curve(track)
     chainage = curve.chords_m(_CHORD_M)
     cant = np.interp(chainage, track.chainage_m, np.where(np.isnan(track.cant_m), 0.0, track.cant_m))

@@ -1,8 +1,9 @@
-"""Reference frames of track maps, and transformation of maps to the satellites' frame.
+"""Reference frames of track maps, and transformation of maps to the frame of the satellites.
 
-Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation to centimetres. Maps are in a plate-fixed
-frame, or in the ITRF at the epoch of their survey. PROJ transforms with the coordinate epoch; otherwise the plate
-motion is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), with a note.
+Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation within centimetres. Maps are in a plate-fixed
+frame, or in an ITRF realisation at the epoch of their survey. PROJ transforms coordinates with their epoch. Where it
+has no transformation, the ITRF2020 plate motion model (Altamimi et al. 2023, doi:10.1029/2023GL106373) is used, and a
+note reports this.
 """
 
 from __future__ import annotations
@@ -37,31 +38,31 @@ PLATES: Final = tuple("AMUR ANTA ARAB AUST CARB EURA INDI NAZC NOAM NUBI PCFC SO
 
 @dataclass(frozen=True, kw_only=True)
 class FrameShift:
-    """Transformation of a map to the satellites' frame."""
+    """Description of the transformation of a map to the frame of the satellites."""
 
-    frame: str  #: Frame of the map, as its CRS is named.
+    frame: str  #: Name of the map's frame.
     used: str  #: Frame and epoch of the positions.
     method: str  #: Description of the transformation.
-    #: Shift at the middle of the line.
+    #: Shift at the middle point of the line.
     east_m: float = 0.0
     north_m: float = 0.0
     up_m: float = 0.0
 
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: Notes on the uncertainty of the transformation.
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Notes on the transformation, and on the shift in plan where there is one."""
+        """Notes to the user on the transformation, with the shift in plan if it is not zero."""
         size = float(np.hypot(self.east_m, self.north_m))
         moved = (
             f"map: {self.frame} moved by {size:.2f} m (east {self.east_m:+.2f}, north {self.north_m:+.2f}) to "
-            f"{self.used}, the frame of the positions (--same-frame: they are in the frame of the map)"
+            f"{self.used}, the frame of the positions (if positions are in the frame of the map, give --same-frame)"
         )
         return (*self.notes, moved) if size > 0.0 else self.notes
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Transformation as plain values for JSON."""
         return {
             "frame": self.frame,
             "used": self.used,
@@ -71,7 +72,7 @@ class FrameShift:
 
 
 def decimal_year(time: np.datetime64 | Datetimes) -> float:
-    """Return the time as a decimal year, as used for frames' epochs."""
+    """Return the time as a decimal year, in which the epochs of frames are stated."""
     year = np.asarray(time, dtype="datetime64[Y]")
     start, end = year.astype("datetime64[s]"), (year + np.timedelta64(1, "Y")).astype("datetime64[s]")
     part = (np.asarray(time, dtype="datetime64[s]") - start) / (end - start)
@@ -79,17 +80,17 @@ def decimal_year(time: np.datetime64 | Datetimes) -> float:
 
 
 class MapMotion(TypedDict, total=False):
-    """Transformation of map coordinates to the frame of the satellites, in addition to PROJ."""
+    """Options for the motion of map coordinates that PROJ does not model."""
 
-    epoch: float | None  #: Epoch of the map's coordinates, where its frame is an ITRF [year].
-    plate: str | None  #: Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
-    #: Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
-    #: deformation included; `epoch` is the file's epoch, from which on the plate moves them.
+    epoch: float | None  #: Epoch of the map's coordinates, for a frame that is an ITRF realisation [year].
+    plate: str | None  #: Plate, one of `PLATES`, with which ITRF coordinates move from `epoch` to the time of the log.
+    #: Parameter file of the semi-dynamic correction of Japan (``SemiDynaEXE`` format), which transforms JGD2011 to the
+    #: epoch of the file with crustal deformation. `epoch` is then this epoch, after which the plate motion is used.
     parameters: FilePath | None
 
 
 def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> tuple[Track, FrameShift]:
-    """Move the track from `Provenance.frame` to the frame of the satellites at a time, as `points_at`."""
+    """Transform a track from `Provenance.frame` to the frame of the satellites at a time; see `points_at`."""
     provenance = track.provenance
     moved, shift = points_at(track.ecef_m, provenance.frame, time, named=provenance.crs != UNNAMED, **motion)
     if moved is track.ecef_m:
@@ -102,7 +103,26 @@ def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> 
 def points_at(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Move points of a map (n, 3) to the satellites' frame at a time; return also the shift at the middle point."""
+    """Transform points of a map to the frame of the satellites at a time.
+
+    Parameters
+    ----------
+    ecef_m : ndarray, shape (n, 3) [m]
+    crs : str
+        CRS of the map; `named` is False if it is assumed because the map names no frame.
+    time : datetime64
+        Time of the log.
+
+    Returns
+    -------
+    tuple
+        Transformed points, shape (n, 3) [m], and the shift at the middle point.
+
+    Raises
+    ------
+    SettingsError
+        The plate is unknown, or epoch, plate or parameters do not apply to the frame of the map.
+    """
     epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
     kind, frame, year = kind_of_frame(crs), get_geodetic_frame(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
@@ -136,7 +156,7 @@ def points_at(
 
 
 def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
-    """Return the points after a transformation of PROJ at an epoch."""
+    """Return points transformed by an operation of PROJ at an epoch, shape (n, 3) [m]."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
     return ecef_from_geodetic(np.asarray(lat), np.asarray(lon), np.asarray(up))
@@ -145,7 +165,10 @@ def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
 def in_map_frame(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Transform positions, or NaN, from the satellites' frame to a map's frame by subtracting the shift."""
+    """Transform positions, shape (n, 3) [m], from the frame of the satellites to the frame of a map.
+
+    The shift of `points_at` is subtracted. NaN stays NaN; MismatchError if all positions are NaN.
+    """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")
@@ -158,12 +181,13 @@ def in_map_frame(
 def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return ITRF coordinates of an epoch in the working frame at the log's epoch."""
+    """Return ITRF coordinates of an epoch in ITRF2020 at the epoch of the log, with a description and notes."""
     name = get_geodetic_frame(crs).name
     moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
         note = (
-            f"map: coordinates in {name} move 1 to 8 cm a year; no epoch is named, that of the log ({year:.2f}) is used"
+            f"map: coordinates in {name} move 1 to 8 cm per year; the epoch of the log ({year:.2f}) is used, because "
+            "no epoch is given (--map-epoch)"
         )
         return moved, f"{name} at the epoch of the log", (note,)
     if plate is None:
@@ -173,14 +197,14 @@ def _from_dynamic(
 
 
 def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
-    """Return the coordinates of a realisation of the ITRF in ITRF2020, both at an epoch."""
+    """Transform coordinates from a realisation of the ITRF to ITRF2020 at the same epoch."""
     return _transform(Transformer.from_crs(code, WORKING_FRAME, always_xy=True, allow_ballpark=False), ecef_m, year)
 
 
 def _from_held(
     ecef_m: Floats, name: str, held: HeldFrame, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return coordinates of a frame that is the ITRF at an epoch, moved since then by the plate of their middle."""
+    """Return coordinates of a frame fixed at an ITRF epoch, moved to `year` with the plate at the middle point."""
     since = epoch or held.epoch
     latitude, longitude, _ = geodetic_from_ecef(ecef_m[len(ecef_m) // 2])
     plate = plate or held.plate_at(float(latitude), float(longitude))
@@ -190,7 +214,7 @@ def _from_held(
 
 
 def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
-    """Return a note on the realisation of an ensemble, or on a frame with another frame's coordinates."""
+    """Return a note if the frame is a datum ensemble, or is treated as another frame; otherwise an empty tuple."""
     if frame.name in SAME and not operation.description.startswith(frame.name):
         code, how_well = SAME[frame.name]
         return (f"map: {frame.name} is taken as {CRS.from_user_input(code).name}; {how_well}",)
@@ -199,7 +223,7 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
         return ()
     taken = re.search(rf"{re.escape(frame.name)} to (\S+)", operation.description)
     return (
-        f"map: {frame.name} is an ensemble of {len(datum['members'])} realisations, alike within "
+        f"map: {frame.name} is an ensemble of {len(datum['members'])} realisations, which agree within "
         f"{datum['accuracy']} m; taken as {taken[1] if taken else operation.description}",
     )
 
@@ -207,7 +231,11 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Move JGD2011 by a semi-dynamic correction, computed once per thousandth of a degree, and with the plate."""
+    """Transform JGD2011 by a semi-dynamic correction, and from its epoch on by plate motion.
+
+    The correction is computed once per cell of a thousandth of a degree. InputFileError if the file is not valid or
+    does not cover the map.
+    """
     with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans
     try:
@@ -219,25 +247,25 @@ def _by_parameters(
     try:
         values = [correction.forward_corr(*cell) for cell in cells.tolist()]
     except jgdtrans.ParameterNotFoundError:
-        raise InputFileError(path, "has no parameters for a part of the map; is it the file of its region?") from None
+        raise InputFileError(path, "has no parameters for a part of the map; give the file of the region") from None
     moves = np.array([(v.latitude, v.longitude, v.altitude) for v in values])[which.ravel()]
     moved = ecef_from_geodetic(latitude + moves[:, 0], longitude + moves[:, 1], height + moves[:, 2])
     method = f"semi-dynamic correction {path}"
     if epoch is None:
-        return moved, method, (f"map: JGD2011 moved by the {method}; its epoch is not named (--map-epoch)",)
+        return moved, method, (f"map: JGD2011 moved by the {method}; its epoch is not given (--map-epoch)",)
     method += f", motion of the plate {plate} since its epoch {epoch:g}"
     return _by_plate(moved, plate, year - epoch), method, (f"map: JGD2011 moved by the {method}",)
 
 
 def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
-    """Return coordinates moved with a plate for some years (ITRF2020 plate motion model)."""
+    """Return coordinates moved with a plate by a number of years (ITRF2020 plate motion model)."""
     motion = Transformer.from_pipeline(f"+proj=pipeline +step +init=ITRF2020:{plate} +t_epoch=0")
     x, y, z, _ = motion.transform(ecef_m[:, 0], ecef_m[:, 1], ecef_m[:, 2], np.full(len(ecef_m), years))
     return np.stack([x, y, z], axis=-1)
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """Return a note on the possible error of a map without a named frame at one of its points."""
+    """Return a note on the possible error at a point of a map that names no reference frame."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():
@@ -249,5 +277,5 @@ def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
         found.append(f"in {name}, it is {size:.2f} m off ({parts}); give crs {code} (--crs)")
     if found:
         choices = "; if ".join(found)
-        return (f"map: no reference frame is named, WGS 84 is assumed; if the map is, as is usual there, {choices}",)
+        return (f"map: no reference frame is named, WGS 84 is assumed; if the map is, as usual there, {choices}",)
     return ("map: no reference frame is named, WGS 84 is assumed; national frames differ from it by up to 2 m",)

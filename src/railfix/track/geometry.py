@@ -20,13 +20,14 @@ class Geometry:
     spacing_m: Floats  #: Length of each segment, shape (V - 1,).
     #: Horizontal turn at each point, positive to the right; NaN at the ends and at duplicates; shape (V,).
     turn_deg: Floats
-    reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is; shape (V,).
-    #: Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R from the map where
-    #: both ends have it, otherwise from the circle through neighbouring points; shape (V - 1,).
+    reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is NaN; shape (V,).
+    #: Distance from chord to arc at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; shape
+    #: (V - 1,). R is from the map if both ends have a radius, otherwise from circles through neighbouring points.
     mid_chord_m: Floats
     gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
-    height_spike_m: Floats  #: Height over the straight line between the neighbours; NaN at the ends; shape (V,).
-    #: Mean over about 40 m from `Track.radius_m`, NaN where unknown, and from the points; right positive; (V,) [1/m].
+    height_spike_m: Floats  #: Height above the straight line between both neighbours; NaN at the ends; shape (V,).
+    #: Mean curvatures over 40 m from `Track.radius_m` (NaN where unknown) and from the points, positive to the right;
+    #: shape (V,) [1/m].
     map_curvature: Floats
     point_curvature: Floats
 
@@ -65,7 +66,7 @@ def compute_geometry(track: Track) -> Geometry:
 
 
 def _windows(along: Floats, window_m: float) -> tuple[Floats, Floats]:
-    """Compute the ends of a window about each point, within the line."""
+    """Compute the chainages of start and end of a window centred on each point, limited to the line, shape (V,) [m]."""
     return np.maximum(along - window_m / 2.0, along[0]), np.minimum(along + window_m / 2.0, along[-1])
 
 
@@ -76,7 +77,7 @@ def _scatter(values: Floats, places: Integers, size: int) -> Floats:
 
 
 def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
-    """Compute the steps between points, east and north, shape (n, 2), and their height differences [m]."""
+    """Compute the steps between points east and north, shape (n, 2), and their height differences, shape (n,) [m]."""
     latitude, longitude = track.latitude_deg[kept], track.longitude_deg[kept]
     half_step = ((np.diff(longitude) + 180.0) % 360.0 - 180.0) / 2.0  # also across the date line
     axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, longitude[:-1] + half_step)
@@ -85,7 +86,7 @@ def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
 
 
 def _turns(plan: Floats) -> tuple[Floats, Floats]:
-    """Compute the right turn between neighbouring steps [rad] and their mean length [m], shapes (n - 1,)."""
+    """Compute the turns to the right between successive steps [rad], and the mean lengths [m], shape (n - 1,) each."""
     cross = plan[:-1, 1] * plan[1:, 0] - plan[:-1, 0] * plan[1:, 1]
     dot = np.einsum("ni,ni->n", plan[:-1], plan[1:])
     length = np.hypot(plan[:, 0], plan[:, 1])
@@ -93,7 +94,10 @@ def _turns(plan: Floats) -> tuple[Floats, Floats]:
 
 
 def _circle_curvature(plan: Floats) -> Floats:
-    """Compute the curvature of the circle through each point and its neighbours, shape (n + 1,) [1/m]; NaN at ends."""
+    """Compute the curvature of the circle through each point and its neighbours, shape (n + 1,) [1/m].
+
+    The curvature is positive to the right, and NaN at the ends.
+    """
     turn, _ = _turns(plan)
     across = plan[:-1] + plan[1:]
     chord = np.hypot(across[:, 0], across[:, 1])
@@ -105,7 +109,7 @@ def _circle_curvature(plan: Floats) -> Floats:
 
 
 def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
-    """Compute the means of values at points of the line from one chainage to another; NaN with an unknown value."""
+    """Compute the means of a piecewise linear function from `low` to `high`; NaN if it has an unknown value there."""
     unknown = np.isnan(values)
 
     def between(part: Floats) -> Floats:
@@ -117,7 +121,7 @@ def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floa
 
 
 def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
-    """Compute the curvature of the points over a window [1/m], shape (V,), to average the noise of single points."""
+    """Compute the curvature from the change of heading over a window, to average the noise of points, (V,) [1/m]."""
     along = track.chainage_m
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     middle = (along[kept][1:] + along[kept][:-1]) / 2.0
@@ -129,7 +133,10 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 
 def mean_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
-    """Return the mean gradients [permille] of attribute and heights over a window, shapes (V,); NaN where unknown."""
+    """Compute the mean gradients over a window from `gradient_permille` and from the heights, shape (V,) each.
+
+    Gradients are in permille, and NaN where unknown or where the line covers less than half of the window.
+    """
     different = np.concatenate([[True], np.diff(track.chainage_m) > 0.0])
     along, height = track.chainage_m[different], track.height_m[different]
     low, high = _windows(track.chainage_m, window_m)

@@ -36,28 +36,28 @@ def read_track(
 ) -> Track:
     """Read the centreline of a route from map files.
 
-    CSV (``.csv``) and GeoJSON (``.geojson``, ``.json``), plain or packed; GeoPackage, Shapefile, FlatGeobuf, GML, GPX,
-    KML, DXF and OpenStreetMap through GDAL; alignments of IFC 4.3 (``.ifc``) and LandXML, and railML 3 (``.xml``,
-    ``.railml``); tables of EGNSS MATE.
+    Formats are CSV (``.csv``) and GeoJSON (``.geojson``, ``.json``), also compressed; GeoPackage, Shapefile,
+    FlatGeobuf, GML, GPX, KML, DXF and OpenStreetMap through GDAL; alignments of IFC 4.3 (``.ifc``) and LandXML; railML
+    3 (``.xml``, ``.railml``); RDF of RINF; and tables of EGNSS MATE.
 
     Parameters
     ----------
     paths : path or sequence of paths
-        Several files are joined in the given order; each may have either direction.
+        Several files are joined in the given order, each in whichever direction fits.
     crs : str, optional
-        Coordinate reference system of files without one, for example ``EPSG:6677``.
+        Coordinate reference system of files that do not name it, for example ``EPSG:6677``.
     height_datum : {"ellipsoidal", "orthometric"}, optional
-        Height datum of GeoJSON files that state none; in CSV files the column name states it.
+        Height datum of GeoJSON files that do not state it; in CSV files the column name states the datum.
     geoid : str, optional
-        Geoid of orthometric heights: ``japan`` (JPGEO2024), ``gsigeo2011``, a pyproj grid or CRS.
+        Geoid of orthometric heights: ``japan`` (JPGEO2024), ``gsigeo2011``, a pyproj grid, or a CRS.
     name : str, optional
         Name of the route; by default the name in the file, otherwise the file name.
     max_gap_m : float [m]
-        Widest gap between the ends of two segments.
+        Widest accepted gap between the ends of two segments.
     sigma_plan_m, sigma_height_m : float, optional [m]
-        Accuracy of the map; by default as stated in the file, else 0.30 m and 0.60 m (P1 4.1(3)).
+        Accuracy of the map; by default as stated in the file, otherwise 0.30 m and 0.60 m (P1 4.1(3)).
     duplicates : {"merge", "keep"}
-        Equal consecutive points become one, with a note, or are kept for `railfix.track.check_track`.
+        Whether equal consecutive points are merged, with a note, or kept for `railfix.track.check_track`.
     heights : path, optional
         Source of heights for a map without heights; see `railfix.track.height_source.with_heights`.
 
@@ -68,9 +68,11 @@ def read_track(
     Raises
     ------
     InputFileError
-        A file is not a track map; the message names line and cause.
+        A file is not a valid track map; the message names line and cause.
     SettingsError
-        An option is unknown or contradicts the file.
+        An option is unknown, missing, or contradicts the file.
+    ValueError
+        `duplicates` is neither "merge" nor "keep".
     """
     names = path_names(paths)
     reading = MapReading(**options)
@@ -101,7 +103,7 @@ def track_of_segments(
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """Join segments to a track, with heights from a second source if they lack heights; see `read_track`."""
+    """Join segments to a track, with heights from `heights` if the segments have none; see `read_track`."""
     check_heights(segments, heights, geoid=geoid, height_datum=height_datum, sigma_height_m=sigma_height_m)
     track = join(
         [replace(s, height_m=np.zeros(len(s.height_m))) if s.height_datum == NO_HEIGHTS else s for s in segments],
@@ -123,14 +125,17 @@ def check_heights(
     height_datum: str | None,
     sigma_height_m: float | None,
 ) -> None:
-    """Check that segments have heights, or a second source of them; the error names every option that is missing."""
+    """Check that either the segments or `heights` give the heights.
+
+    Raise InputFileError, which names all missing options, or SettingsError if both give heights.
+    """
     flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
     if flat and heights is None:
         raise InputFileError(
             flat[0].source,
-            "the coordinates have no height; give heights (--heights): log, in railfix run those of the log's own "
-            "positions, or a file: a raster with height_datum (--height-datum), sigma_height_m (--height-sigma) and, "
-            "of orthometric heights, geoid (--geoid) "
+            "the coordinates have no height; give heights (--heights), either `log` in railfix run, for the heights of "
+            "the log's own positions, or a file: a raster with height_datum (--height-datum), sigma_height_m "
+            "(--height-sigma) and, for orthometric heights, geoid (--geoid) "
             f"({GEOIDS}); a profile by chainage; or a log of 3-D positions",
         )
     if heights is not None and len(flat) < len(segments):
@@ -142,20 +147,26 @@ def check_heights(
 
 
 def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of one map file in their order; a file without heights gives segments without heights."""
+    """Read the lines of one map file as segments, in the order of the file; see `read_track` for errors.
+
+    Segments of a file without heights have the height datum `NO_HEIGHTS`.
+    """
     segments = [_without_repeated(segment, reading) for segment in _read_segments(file, reading)]
     if (given := reading.sigma_plan_m) is not None:
         return [_with_given_accuracy(segment, given) for segment in segments]
     if unknown := [s for s in segments if np.isnan(s.datum_plan_m)]:
         raise SettingsError(
-            f"{unknown[0].source}: the accuracy of the transformation from its CRS is unknown; give that of the map "
-            "with it (sigma_plan_m, --plan-sigma)"
+            f"{unknown[0].source}: the accuracy of the transformation from its CRS is unknown; give the accuracy of "
+            "the transformed map (sigma_plan_m, --plan-sigma)"
         )
     return [s if "sigma_plan_m" in s.metadata else _with_usual_accuracy(s, Path(file).name) for s in segments]
 
 
 def _without_repeated(segment: Segment, reading: MapReading) -> Segment:
-    """Return a segment without repeated consecutive points; InputFileError if fewer than two points are left."""
+    """Return a segment without repeated consecutive points; raise InputFileError if fewer than two points remain.
+
+    With duplicates "keep" the repeated points remain.
+    """
     points = np.stack([segment.latitude_deg, segment.longitude_deg, np.nan_to_num(segment.height_m)])
     new = np.concatenate([[True], (np.diff(points) != 0.0).any(axis=0)])
     if new.sum() < 2:
@@ -169,13 +180,13 @@ def _without_repeated(segment: Segment, reading: MapReading) -> Segment:
 def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
     drawn = "origin" in segment.metadata
     sigma_m, source = (OSM_SIGMA_M, "OpenStreetMap") if drawn else (SIGMA_PLAN_M, file)
-    usual = "" if drawn else ", that of an aerial survey"
-    note = f"map: {source} states no accuracy, {sigma_m:g} m in plan is taken{usual} (--plan-sigma)"
+    usual = "" if drawn else ", as for an aerial survey"
+    note = f"map: {source} states no accuracy, {sigma_m:g} m in plan is assumed{usual} (--plan-sigma)"
     return _with_accuracy(segment, sigma_m, note)
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with a given accuracy in plan, which includes the transformation from its datum."""
+    """Return a segment with a given accuracy in plan, which includes the transformation from the datum of the map."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

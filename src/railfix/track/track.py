@@ -1,7 +1,7 @@
 """3-D centreline of a railway line with curve attributes (P1 2.2(1), 4.1(3)).
 
-Right is positive: seen in the direction of rising chainage, a curve to the right has a positive radius. Cant is the
-height of the outer rail above the inner rail. The height of a point is at the middle between the rail tops.
+A curve to the right, seen in the direction of rising chainage, has a positive radius. Cant is the height of the outer
+rail above the inner rail. Points are at the middle between the tops of the rails.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.notebook import NotebookTable, plural
 
 SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
-SIGMA_HEIGHT_M = 0.60  #: Standard deviation of this centreline's height [m]: about twice that in plan (P1 4.1(3)).
-#: Note on a section that is joined against the order of its points, after its name.
+SIGMA_HEIGHT_M = 0.60  #: Standard deviation of its height, about twice the one in plan [m] (P1 4.1(3)).
+#: Note on a section whose points are joined in reverse order; it follows the name of the section.
 BACKWARDS = "is used against the order of its points"
-UNNAMED = "not named (WGS 84 assumed)"  #: Reference system of a map that does not name any.
-#: Kilometrage has a break where it differs by more than this and a twentieth of the length [m].
+UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
+#: Largest difference, plus a twentieth of the length, between length and kilometrage without a break [m].
 KILOMETRAGE_BREAK_M = 1.0
-HEIGHTS_M = (-1000.0, 9000.0)  #: Ellipsoidal heights of railways, tunnels below the sea included [m].
-ANOTHER_PLACE_M = 100_000.0  #: A log farther from a map than this is at another location [m].
+HEIGHTS_M = (-1000.0, 9000.0)  #: Range of ellipsoidal heights of railways, including tunnels below the sea [m].
+ANOTHER_PLACE_M = 100_000.0  #: Distance of a log from a map beyond which they are at different locations [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
     """Origin of a track map, copied to every output."""
 
-    files: tuple[str, ...] = ()
-    crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` where none is named.
-    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
-    #: ``"ellipsoidal"`` or ``"orthometric"``; `height_datum_asked` is empty if none was given.
+    files: tuple[str, ...] = ()  #: Files from which the map was read.
+    crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` if the files do not name it.
+    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the track; see `railfix.track.frames`.
+    #: Height datum given by the user and datum that was used, "ellipsoidal" or "orthometric"; "" if not given.
     height_datum_asked: str = ""
     height_datum_used: str = "ellipsoidal"
-    geoid: str = ""  #: Geoid model used to convert orthometric to ellipsoidal heights; empty where none was needed.
-    notes: tuple[str, ...] = ()  #: Notes that every result computed with this map must contain.
+    geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" without one.
+    notes: tuple[str, ...] = ()  #: Notes that must be in every result computed with this map.
 
 
 class TrackFields(TypedDict, total=False):
-    """Fields of `Track` besides its coordinates: attributes (V,), sections, accuracy, and origin."""
+    """Optional fields of `Track`: attributes of shape (V,), sections, accuracy, and origin."""
 
     name: str
     kilometrage_m: ArrayLike | None
@@ -59,21 +59,21 @@ class TrackFields(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class Track(NotebookTable):
-    """Centreline of a route, V points in the order of the route."""
+    """Centreline of a route of V points, in the order of the route."""
 
     name: str
-    latitude_deg: Floats  #: WGS 84, shape (V,).
+    latitude_deg: Floats  #: Geodetic coordinates in `Provenance.frame`, shape (V,).
     longitude_deg: Floats
     height_m: Floats  #: Ellipsoidal height of the middle between the rail tops, shape (V,).
-    #: Kilometrage of the line; may jump or run backwards; NaN where the map has none; shape (V,).
+    #: Kilometrage of the line, shape (V,); it may jump or decrease, and is NaN where the map has none.
     kilometrage_m: Floats
-    cant_m: Floats  #: Outer rail above inner rail; NaN where the map has none; shape (V,).
-    #: Positive in a curve to the right in the direction of rising chainage, infinite on straight track, NaN where the
-    #: map has none; shape (V,).
+    cant_m: Floats  #: Height of the outer above the inner rail, shape (V,); NaN where the map has none.
+    #: Horizontal radius, positive in a curve to the right in the direction of rising chainage, infinite on straight
+    #: track, NaN where the map has none; shape (V,).
     radius_m: Floats
-    gradient_permille: Floats  #: Positive where the line rises with chainage; NaN where the map has none; shape (V,).
-    section: Integers  #: Index in `sections` of each point, shape (V,).
-    sections: tuple[str, ...] = ("track",)  #: The files or features that were joined to the route, in order.
+    gradient_permille: Floats  #: Gradient, positive if the line rises with chainage; NaN if unknown; shape (V,).
+    section: Integers  #: Index of each point's section in `sections`, shape (V,).
+    sections: tuple[str, ...] = ("track",)  #: Files or features that were joined to the route, in order.
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map across the line and in height.
     sigma_height_m: float = SIGMA_HEIGHT_M
     provenance: Provenance = field(default_factory=Provenance)
@@ -101,7 +101,10 @@ class Track(NotebookTable):
     def from_geodetic(
         cls, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, **attributes: Unpack[TrackFields]
     ) -> Track:
-        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height); others are NaN (`TrackFields`)."""
+        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height), shape (V,).
+
+        `attributes` are the fields of `TrackFields`; an attribute that is not given is NaN. TypeError for others.
+        """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"a track has no {', '.join(sorted(unknown))}")
         latitude = np.array(latitude_deg, dtype=np.float64)
@@ -128,7 +131,7 @@ class Track(NotebookTable):
 
     @classmethod
     def from_ecef(cls, ecef_m: ArrayLike, **attributes: Unpack[TrackFields]) -> Track:
-        """Create a track from ECEF points, shape (V, 3) [m]; attributes not given are NaN."""
+        """Create a track from ECEF points, shape (V, 3) [m]; attributes as in `from_geodetic`."""
         return cls.from_geodetic(*geodetic_from_ecef(ecef_m), **attributes)
 
     def __len__(self) -> int:
@@ -141,12 +144,12 @@ class Track(NotebookTable):
 
     @cached_property
     def ecef_m(self) -> Floats:
-        """Points of the centreline, shape (V, 3) [m]."""
+        """ECEF coordinates of the points, shape (V, 3) [m]."""
         return read_only(ecef_from_geodetic(self.latitude_deg, self.longitude_deg, self.height_m))
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Length of the polyline from its first point, shape (V,) [m]; strictly rising except at duplicate points."""
+        """Length of the polyline from its first point to each point, shape (V,) [m]; equal at duplicate points."""
         steps = np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1)
         return read_only(np.concatenate([[0.0], np.cumsum(steps)]))
 
@@ -156,7 +159,10 @@ class Track(NotebookTable):
 
 
 def section_spans(track: Track) -> list[tuple[float, float]]:
-    """Return the chainages of each section's beginning and end; decreasing if the section is passed backwards."""
+    """Return the chainages of the first and the last point of each section [m].
+
+    They decrease if the section was joined in reverse order.
+    """
     ends = [0.0, *track.chainage_m[np.flatnonzero(np.diff(track.section, append=len(track.sections)))].tolist()]
     backwards = [f"{source} {BACKWARDS}" in track.provenance.notes for source in track.sections]
     spans = zip(ends[:-1], ends[1:], backwards, strict=True)
@@ -164,20 +170,23 @@ def section_spans(track: Track) -> list[tuple[float, float]]:
 
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
-    """Flag segments (V - 1,) whose kilometrage jumps by more than `KILOMETRAGE_BREAK_M` and a twentieth."""
+    """Return a mask of segments, shape (V - 1,), whose kilometrage has a break.
+
+    A break is a difference from the length by more than `KILOMETRAGE_BREAK_M` plus a twentieth of the length.
+    """
     return _jumps(np.diff(chainage_m), np.diff(kilometrage_m))
 
 
 def _jumps(length_m: Floats, change_m: Floats) -> Masks:
-    """Flag segments whose change of kilometrage differs from their length, any shape."""
+    """Return a mask of segments with a break, in the shape of the arguments; see `kilometrage_breaks`."""
     return np.asarray(np.abs(np.abs(change_m) - length_m) > KILOMETRAGE_BREAK_M + 0.05 * length_m)
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """Interpolate the kilometrage at chainages of any shape; NaN if the nearer point has none, and for NaN.
+    """Interpolate the kilometrage at chainages of any shape; NaN if a point of the segment has none, and for NaN.
 
-    It is linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is extrapolated
-    in its own direction, never interpolated across the jump.
+    The kilometrage is linear between two points. Within a segment that has a break, it is extrapolated from the nearer
+    point in the direction of the kilometrage on that side of the break.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2
@@ -197,7 +206,7 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
 
 
 def _running_direction(kilometrage_m: Floats, broken: Masks) -> tuple[Floats, Floats]:
-    """Determine the direction (+1 or -1) of the kilometrage before and after each point."""
+    """Determine the direction of the kilometrage before and after each point, +1 (rising) or -1; shape (V,) each."""
     sign = np.sign(np.diff(kilometrage_m))
     usable = ~broken & np.isfinite(sign) & (sign != 0)
     if not usable.any():

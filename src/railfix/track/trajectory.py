@@ -1,4 +1,4 @@
-"""Trajectory of an antenna, a polyline in ECEF to which its position is constrained, and nearest-point search."""
+"""Trajectory of an antenna as a polyline in ECEF, to which its position is constrained, and nearest-point search."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ from railfix.core.geodesy import axes_at
 from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
-#: Samples examined in the first round; four times as many for positions without a proven nearest point.
+#: Number of candidates in the first round of the search. It is multiplied by 4 in each further round, for positions
+#: whose nearest point is not yet proven.
 _FIRST_CANDIDATES = 6
-_CHUNK = 2_000_000  #: Number of positions times candidates processed at once.
+_CHUNK = 2_000_000  #: Largest product of the numbers of positions and candidates in one array.
 
 
 def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
-    """Return differences of positions in the shorter direction of a closed line of length `turn_m` (infinite: open)."""
+    """Return differences of arc length in the shorter direction of a closed line.
+
+    `turn_m` is the length of the closed line; with infinity, for an open line, the differences are unchanged.
+    """
     return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
 
 
@@ -37,7 +41,7 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
 
 
 class NearestOnPolyline:
-    """Search structure for nearest points of a polyline (V, 3), each within `reach_m` of a sample of its segment."""
+    """Search structure for nearest points of a polyline, shape (V, 3), with samples along its segments."""
 
     def __init__(self, points_m: Floats) -> None:
         self._start = points_m[:-1]
@@ -47,12 +51,15 @@ class NearestOnPolyline:
         pieces = np.maximum(np.ceil(self._length / spacing).astype(np.int64), 1)
         self._segment, piece = places_in_groups(pieces)
         share = (piece + 0.5) / pieces[self._segment]
-        #: Half the spacing of the samples, which are in the middle of their pieces [m].
+        #: Largest distance of a point of the polyline from the nearest sample of its segment [m].
         self.reach_m = float((self._length / pieces).max()) / 2.0 * (1.0 + 1e-9)
         self._tree = scipy.spatial.cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
 
     def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
-        """Return the segment, distance along it and distance from it, shapes (n,); -1 and NaN for NaN."""
+        """Return the nearest segment, the distance along it and the distance from it for positions (n, 3), shape (n,).
+
+        For a position that is NaN the segment is -1, and the distances are NaN.
+        """
         points = np.asarray(ecef_m, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"ecef_m has shape {points.shape}, expected (n, 3)")
@@ -72,7 +79,7 @@ class NearestOnPolyline:
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Find the best of the nearest samples' segments, and whether no other segment can be better."""
+        """Find the nearest of the segments of the nearest samples, and whether no other segment can be nearer."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
@@ -83,30 +90,30 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Return the nearest of given segments (n, C) to each point (n, 3), the position on it and the distance."""
+    """Return the nearest of C candidate segments (n, C) to each point (n, 3), and the fraction of it and distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
-    # independent of the order in which the tree returns the segments
+    # of equally near segments the first on the line is returned, whatever the order of the candidates
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
     row, column = np.arange(len(points_m)), place.argmin(axis=1)
     return segment[row, column], share[row, column], best
 
 
-#: Largest distance of a line's end from another part at which the line is closed [m]: no other track is as near.
+#: Largest distance between the end of a closed line and another part of it [m]; a second track is farther away.
 _CLOSED_M: Final = 3.0
-_SAME_WAY: Final = 0.9  #: Cosine of the largest angle between parts in the same direction.
-_END_M: Final = 100.0  #: Positions within this distance along the line belong to the end itself [m].
+_SAME_WAY: Final = 0.9  #: Cosine of the largest angle between two parts that count as parallel.
+_END_M: Final = 100.0  #: Distance along the line from its end within which no other part is searched for [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
-    """Return the arc lengths at which a closed line continues before its start and after its end; NaN if open."""
+    """Return the arc lengths at which a closed line continues before its start and after its end [m]; NaN if open."""
     segment = np.diff(ecef_m, axis=0)
     segment /= np.linalg.norm(segment, axis=1, keepdims=True)
     return _beside(arc_m, ecef_m, segment, 0), _beside(arc_m, ecef_m, segment, -1)
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest other part to an end of the line, in the same direction; NaN without one."""
+    """Return the arc length of the nearest part of the line beside its end and parallel to it [m]; NaN if none."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -124,21 +131,21 @@ _END_TOLERANCE_M = 1e-6  #: Rounding allowed beyond the ends of a trajectory [m]
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory(FrozenArrays, NotebookTable):
-    """Trajectory of one antenna, V points.
+    """Trajectory of one antenna, given by V points.
 
-    Right is positive across the path, in the direction of rising chainage.
+    Lateral offsets are positive to the right, seen in the direction of rising chainage.
     """
 
     name: str  #: Name of the antenna, or of the track used as its path.
-    ecef_m: Floats  #: Shape (V, 3).
+    ecef_m: Floats  #: ECEF coordinates of the points, shape (V, 3).
     chainage_m: Floats  #: Chainage of the track at the reference point, strictly rising, shape (V,).
-    kilometrage_m: Floats  #: Kilometrage at the reference point; NaN where the map has none; shape (V,).
-    cant_m: Floats  #: Cant of the track at the reference point; NaN where the map has none; shape (V,).
-    #: Roll of the car body, positive to the right; 0 where the track is used as the path; shape (V,).
+    kilometrage_m: Floats  #: Kilometrage at the reference point, shape (V,); NaN where the map has none.
+    cant_m: Floats  #: Cant of the track at the reference point, shape (V,); NaN where the map has none.
+    #: Roll of the car body, positive to the right, shape (V,); 0 if the track itself is used as the path.
     roll_deg: Floats
     reference: str = "antenna"  #: Point of the vehicle to which `chainage_m` refers.
-    #: Chainage of the middle between the bogies with the antenna at the point, strictly rising; it relates the
-    #: positions of a vehicle's two antennas. None without a vehicle; shape (V,).
+    #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising, shape (V,). It
+    #: relates the positions of two antennas on one vehicle. None without a vehicle.
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
     #: Distance of the antenna ahead of the middle between the bogies, toward the vehicle's front.
@@ -147,11 +154,11 @@ class Trajectory(FrozenArrays, NotebookTable):
     #: middle; None where unknown.
     front_end_m: float | None = None
     rear_end_m: float | None = None
-    #: Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
+    #: Lateral distance of the contact points of a wheelset, to which cant refers; None without a vehicle.
     contact_m: float | None = None
-    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map, included in the solution.
+    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map in plan and height, used in the solution.
     sigma_height_m: float = SIGMA_HEIGHT_M
-    notes: tuple[str, ...] = ()  #: Notes that every result must contain.
+    notes: tuple[str, ...] = ()  #: Notes that must be in every result.
 
     def __post_init__(self) -> None:
         points = len(self.ecef_m)
@@ -173,9 +180,9 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @classmethod
     def from_antenna_path(cls, track: Track) -> Trajectory:
-        """Create a trajectory from a map of the antenna's own path, as from a survey; `notes` records this.
+        """Create a trajectory from a map that is the antenna's path itself, as from a survey; `notes` records this.
 
-        The antenna of a train is above the track and swings out in curves: `antenna_trajectory` computes its path.
+        On a train the antenna is above the track, and its path differs in curves: `antenna_trajectory` computes it.
         """
         check_type(track, Track, "track")
         return cls(
@@ -198,7 +205,7 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @cached_property
     def arc_m(self) -> Floats:
-        """Arc length of each point from the first, shape (V,) [m]."""
+        """Arc length from the first point to each point, shape (V,) [m]."""
         return read_only(np.concatenate([[0.0], np.cumsum(self.length_m)]))
 
     @cached_property
@@ -208,7 +215,7 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @cached_property
     def turn_m(self) -> float:
-        """Length of one turn of a closed line [m]; infinite for an open line."""
+        """Length of a closed line [m]; infinite for an open line."""
         before, after = self.joins_m
         turns = (self.arc_m[-1] - after, before - self.arc_m[0])
         return float(np.nan_to_num(np.fmin(*turns), nan=np.inf))
@@ -220,12 +227,12 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @cached_property
     def _axes(self) -> Floats:
-        """East, north, up at the middle of each segment, shape (V - 1, 3, 3)."""
+        """Unit vectors east, north and up at the middle of each segment, shape (V - 1, 3, 3)."""
         return axes_at((self.ecef_m[1:] + self.ecef_m[:-1]) / 2.0)
 
     @cached_property
     def up(self) -> Floats:
-        """Normal of the ellipsoid at each segment, unit vectors, shape (V - 1, 3)."""
+        """Unit normal of the ellipsoid at the middle of each segment, shape (V - 1, 3)."""
         return read_only(np.ascontiguousarray(self._axes[:, 2]))
 
     @cached_property
@@ -235,28 +242,28 @@ class Trajectory(FrozenArrays, NotebookTable):
         return read_only(right / np.linalg.norm(right, axis=1, keepdims=True))
 
     def get_axes(self, segment: Indices) -> Floats:
-        """Return the unit vectors along, across and up at some segments, shape (n, 3, 3)."""
+        """Return the unit vectors along, across (to the right) and up of given segments, shape (n, 3, 3)."""
         return np.stack([self.tangent[segment], self.across[segment], self.up[segment]], axis=1)
 
     @cached_property
     def heading_deg(self) -> Floats:
-        """Azimuth of each segment in rising chainage, clockwise from north, shape (V - 1,) [deg]."""
+        """Azimuth of each segment in the direction of rising chainage, clockwise from north, shape (V - 1,) [deg]."""
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
         return read_only(np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360.0)
 
     @cached_property
     def gradient_permille(self) -> Floats:
-        """Gradient of each segment in rising chainage, shape (V - 1,)."""
+        """Gradient of each segment in the direction of rising chainage, shape (V - 1,) [permille]."""
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
         return read_only(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
 
     @property
     def front_sign(self) -> float:
-        """1 where the vehicle's front points toward rising chainage, else -1."""
+        """Direction of the vehicle's front: 1 toward rising chainage, -1 toward falling chainage."""
         return 1.0 if self.facing == "rising" else -1.0
 
     def body_azimuth_deg(self, arc_m: ArrayLike) -> Floats:
-        """Compute the azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""
+        """Return the azimuth to which the vehicle's front points, clockwise from north [deg]; NaN if `arc_m` is NaN."""
         heading = self.heading_deg[self.segment_at(arc_m)[0]] + (0.0 if self.facing == "rising" else 180.0)
         return np.where(np.isfinite(np.asarray(arc_m, dtype=np.float64)), heading % 360.0, np.nan)
 
@@ -265,36 +272,42 @@ class Trajectory(FrozenArrays, NotebookTable):
         return NearestOnPolyline(self.ecef_m)
 
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
-        """Find the segment of each arc length, any shape, and the distance along it [m].
+        """Return the segment at each arc length, of any shape, and the distance along the segment [m].
 
-        A point shared by two segments belongs to the later one. Before the start the first segment is returned, with a
-        negative distance; beyond the end and for NaN the last segment, with a NaN distance for NaN.
+        A point shared by two segments belongs to the later segment. Before the start the result is the first segment
+        with a negative distance. Beyond the end it is the last segment; for NaN it is the last segment with NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
-        """Return values (V, ...) at arc lengths of any shape; NaN beyond the ends by more than the tolerance."""
+        """Interpolate values, shape (V, ...), at arc lengths of any shape; NaN beyond the ends and for NaN."""
         arc = np.asarray(arc_m, dtype=np.float64)
         return between_points(arc, self.arc_m, self.length_m, values, self.segment_at(arc)[0])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the ECEF position at arc lengths, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
         return self._interpolate(arc_m, self.ecef_m)
 
     def chainage_at(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the chainage of the reference point at an arc length [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the chainage of the reference point at arc lengths [m]; NaN beyond the ends and for NaN."""
         return self._interpolate(arc_m, self.chainage_m)
 
     def body_at(self, arc_m: ArrayLike) -> Floats:
-        """Return chainages of the vehicle's middle at antenna arc lengths; NaN without vehicle or off the path [m]."""
+        """Interpolate the chainage of the middle between the bogies at antenna arc lengths [m].
+
+        The result is NaN without a vehicle, beyond the ends, and for NaN.
+        """
         if self.body_chainage_m is None:
             return np.full(np.shape(arc_m), np.nan)
         return self._interpolate(arc_m, self.body_chainage_m)
 
     def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
-        """Return antenna arc lengths at chainages of the vehicle's middle; NaN without vehicle or off the path [m]."""
+        """Interpolate the antenna's arc length at chainages of the middle between the bogies [m].
+
+        The result is NaN without a vehicle, beyond the ends, and for NaN.
+        """
         if self.body_chainage_m is None:
             return np.full(np.shape(body_chainage_m), np.nan)
         return np.interp(
@@ -302,42 +315,46 @@ class Trajectory(FrozenArrays, NotebookTable):
         )
 
     def arc_at_chainage(self, chainage_m: ArrayLike) -> Floats:
-        """Interpolate the arc length at a chainage of the reference point [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the arc length at chainages of the reference point [m]; NaN beyond the ends and for NaN."""
         chainage = np.asarray(chainage_m, dtype=np.float64)
         first, last = self.chainage_m[0] - _END_TOLERANCE_M, self.chainage_m[-1] + _END_TOLERANCE_M
         inside = (chainage >= first) & (chainage <= last)
         return np.where(inside, np.interp(chainage, self.chainage_m, self.arc_m), np.nan)
 
     def kilometrage_at(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the kilometrage at an arc length [m]; never across a jump."""
+        """Interpolate the kilometrage at arc lengths [m], but not across a break; NaN where the map has none."""
         return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
 
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Find the nearest point of the trajectory to each position (n, 3): its arc length and its distance, shapes
-        (n,) [m].
+        """Return the arc length of the nearest point to each position (n, 3), and the distance to it, shape (n,) [m].
 
-        The search is exact over all segments: a k-d tree gives the candidates, and a bound excludes all others. Of two
-        equally near points the one with the smaller arc length is returned; NaN where the position is NaN.
+        The search is exact: a k-d tree gives candidate segments, and a bound excludes all others. Of two equally near
+        points, the point with the smaller arc length is returned. Both results are NaN where the position is NaN.
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where no segment was found
 
 
 class Passes(NamedTuple):
-    """Segments near positions, P of them, sorted by position and segment."""
+    """P pairs of a position and a segment near it, sorted by position and segment; shapes (P,) unless stated."""
 
-    position: Indices
-    segment: Indices
-    #: Distance of the position along the segment's straight line from its start, and of the segment's nearest point.
+    position: Indices  #: Index of the position.
+    segment: Indices  #: Index of the segment.
+    #: Distances from the start of the segment to the projection of the position on the extended segment, and to the
+    #: nearest point of the segment.
     along_m: Floats
     foot_m: Floats
-    offset_m: Floats  #: Vector from that point to the position, shape (P, 3).
-    lowest: Masks  #: Whether no neighbouring segment is nearer: the line passes the position here.
-    again: Masks  #: Whether the previous segment is equally near, at the point between the two.
+    offset_m: Floats  #: Vector from the nearest point to the position, shape (P, 3).
+    lowest: Masks  #: True if no adjacent segment in the list is nearer to the position.
+    again: Masks  #: True if the previous segment is equally near, because the nearest point is shared.
 
 
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
-    """Return the segments whose middle is within a reach and half the longest segment of each position (n, 3)."""
+    """Find all segments within `reach_m` of each position (n, 3).
+
+    Segments whose middle is within `reach_m` plus half of the longest segment are returned, so that some are farther
+    than `reach_m`.
+    """
     length, tangent = trajectory.length_m, trajectory.tangent
     middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
     reach = np.broadcast_to(reach_m + 0.5 * length.max(), len(ecef_m))
@@ -358,11 +375,11 @@ def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats |
 
 
 def between_points(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, section: Indices) -> Floats:
-    """Interpolate values (V, ...) of a line at arc lengths on its sections (n, ...); NaN beyond its ends."""
+    """Interpolate values (V, ...) of a line at arc lengths on given segments; NaN beyond the ends of the segments."""
     length = length_m[section]
     share, beyond = (arc - arc_m[section]) / length, _END_TOLERANCE_M / length
     share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)
     if values.ndim > 1:
         share = share[..., None]
-    # exact at both ends of a section
+    # exact at both ends of a segment
     return np.asarray((1.0 - share) * values[section] + share * values[section + 1])

@@ -1,11 +1,13 @@
-"""Transition curves in plan defined by ordinates over the tangent: cubic parabolas and the half-sine.
+"""Transition curves in plan that are defined by ordinates over the tangent: cubic parabolas and the half-sine.
 
-With x along the tangent from the straight end, X the length on the tangent and R the radius at the other end:
+The abscissa x is measured along the tangent from the straight end, X is the length on the tangent, and R is the radius
+at the curved end:
 
-- cubic parabola ``y = x^3 / (6 R X)``, of many railways; IFC has ``y = x^3 / (6 R L)`` with the length L of the curve
-- with the correction of Japan's railways ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``, whose curvature at the
-  end is 1/R within half a percent
-- half-sine, of the Shinkansen, ``y = X^2 / R ((x/X)^2 / 4 - (1 - cos(pi x/X)) / (2 pi^2))``
+- The cubic parabola ``y = x^3 / (6 R X)`` is used by many railways. IFC defines ``y = x^3 / (6 R L)`` with the length L
+  of the curve.
+- The corrected parabola of Japanese railways is ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``. Its curvature at the end is
+  1/R within half a percent.
+- The half-sine of the Shinkansen is ``y = X^2 / R ((x/X)^2 / 4 - (1 - cos(pi x/X)) / (2 pi^2))``.
 """
 
 from __future__ import annotations
@@ -20,26 +22,26 @@ from railfix.core.arrays import Floats
 
 Shape = Literal["cubic", "half-sine"]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_PIECES: Final = 16  #: Pieces of the quadrature of the length; 12 nodes each are exact to rounding.
-_ROUNDS: Final = 30  #: Number of the fixed-point iterations below, which converge within ten.
-_HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: y R / X^2 at the end of a half-sine.
+_PIECES: Final = 16  #: Intervals of the quadrature of the length; with 12 nodes each it is exact to rounding.
+_ROUNDS: Final = 30  #: Number of fixed-point iterations for the length on the tangent, which converge within ten.
+_HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end of a half-sine.
 
 
 @dataclass(frozen=True, kw_only=True)
 class OrdinateElement:
-    """Transition between straight and curve, with ordinates over the tangent at its straight end."""
+    """Transition between straight and curve, defined by ordinates over the tangent at its straight end."""
 
-    #: First point, easting and northing.
+    #: Easting and northing of the first point.
     x_m: float
     y_m: float
-    direction_rad: float  #: At the first point, counter-clockwise from the x axis.
-    tangent_m: float  #: Length on the tangent, X.
-    ordinate_m: float  #: Ordinate at X, positive to the left of the tangent seen from the straight.
+    direction_rad: float  #: Direction at the first point, counter-clockwise from the x axis (east).
+    tangent_m: float  #: Length X on the tangent.
+    ordinate_m: float  #: Ordinate at X, positive to the left of the tangent, seen from the straight end.
     shape: Shape = "cubic"
     into: bool = True  #: Whether the first point is the straight end.
 
     def _ordinates(self, x: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return y and its first and second derivative at abscissae on the tangent."""
+        """Return the ordinates [m] at abscissae x [m], and their first and second derivatives with respect to x."""
         share, end, size = x / self.tangent_m, self.ordinate_m, self.tangent_m
         if self.shape == "cubic":
             return end * share**3, 3.0 * end / size * share**2, 6.0 * end / size**2 * share
@@ -52,7 +54,7 @@ class OrdinateElement:
 
     @cached_property
     def _knots(self) -> tuple[Floats, Floats]:
-        """Abscissae on the tangent and the curve lengths up to them."""
+        """Abscissae of the interval limits on the tangent, and the curve lengths up to these abscissae [m]."""
         x = np.linspace(0.0, self.tangent_m, _PIECES + 1)
         return x, np.concatenate([[0.0], np.cumsum(self._length_between(x[:-1], x[1:]))])
 
@@ -63,23 +65,23 @@ class OrdinateElement:
 
     @property
     def length_m(self) -> float:
-        """Length of the curve."""
+        """Length of the curve [m]."""
         return float(self._knots[1][-1])
 
     def _place_on_tangent(self, way_m: Floats) -> Floats:
-        """Return the abscissae on the tangent for lengths of the curve from the first point."""
+        """Return the abscissae on the tangent [m] at distances along the curve from the first point [m]."""
         x, length = self._knots
         target = way_m if self.into else length[-1] - way_m
         piece = np.clip(np.searchsorted(length, target, side="right") - 1, 0, _PIECES - 1)
         place = np.interp(target, length, x)
-        for _ in range(4):  # Newton: the slope is known
+        for _ in range(4):  # Newton iterations
             rest = length[piece] + self._length_between(x[piece], place) - target
             place = place - rest / np.hypot(1.0, self._ordinates(place)[1])
         return np.asarray(place)
 
     @property
     def turn_rad(self) -> float:
-        """Direction at the curved end relative to the straight end, positive to the left [rad]."""
+        """Direction at the curved end less the direction at the straight end, positive to the left [rad]."""
         return float(np.arctan(self._ordinates(np.array([self.tangent_m]))[1][0]))
 
     @property
@@ -89,20 +91,20 @@ class OrdinateElement:
 
     @property
     def last(self) -> float:
-        """Curvature at the last point."""
+        """Curvature at the last point, positive to the left [1/m]."""
         return float(self.curvature_at(np.array([self.length_m]))[0])
 
     def curvature_at(self, way_m: Floats) -> Floats:
-        """Return the curvature [1/m] at distances from the first point."""
+        """Return the curvature, positive to the left [1/m], at distances along the curve from the first point [m]."""
         _, slope, second = self._ordinates(self._place_on_tangent(way_m))
         curvature = second / np.hypot(1.0, slope) ** 3
         return np.asarray(curvature if self.into else -curvature)
 
     def place_at(self, way_m: Floats) -> Floats:
-        """Return the easting and northing at distances from the first point, shape (n, 2) [m]."""
+        """Return easting and northing, shape (n, 2) [m], at distances along the curve from the first point [m]."""
         x = self._place_on_tangent(way_m)
         own = np.stack([x, self._ordinates(x)[0]], axis=-1)
-        if not self.into:  # from the curve to the straight: the same curve from its other end
+        if not self.into:  # a transition from the curve to the straight is the same curve from its curved end
             cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
             own = (np.array([self.tangent_m, self.ordinate_m]) - own) @ np.array([[cosine, -sine], [sine, cosine]])
         cosine, sine = np.cos(self.direction_rad), np.sin(self.direction_rad)
@@ -112,7 +114,11 @@ class OrdinateElement:
 def cubic_of_length(
     *, x_m: float, y_m: float, direction_rad: float, first: float, last: float, length_m: float, variant: str
 ) -> OrdinateElement:
-    """Return a cubic parabola of a given curve length: ``"length"`` (IFC), ``"tangent"`` or ``"corrected"``."""
+    """Compute a cubic parabola of a given curve length.
+
+    `first` and `last` are the curvatures at the ends, one of which is 0, positive to the left [1/m]. The variant is
+    ``"length"`` (IFC), ``"tangent"`` (length on the tangent) or ``"corrected"`` (Japanese railways).
+    """
     into = first == 0.0
     curvature = last if into else -first
     tangent = length_m
