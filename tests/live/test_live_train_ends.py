@@ -175,7 +175,7 @@ def test_the_vehicle_file_has_the_ends(tmp_path: Path) -> None:
         path.write_text(text.format(extra))
         assert railfix.read_vehicle(path).ends_m == ends
     path.write_text(text.format("front_end_m = 21.0\n"))
-    with pytest.raises(SettingsError, match="front_end_m is at most length_m"):
+    with pytest.raises(SettingsError, match="front_end_m must be at most length_m"):
         railfix.read_vehicle(path)
     antennas = {"front": AntennaOffset(along_m=1.0, up_m=4.0)}
     assert Vehicle(bogie_distance_m=10.0, antennas=antennas).ends_m == (None, None)  # type: ignore[arg-type]

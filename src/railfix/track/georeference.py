@@ -1,7 +1,7 @@
-"""Coordinates of a map in degrees of a modern frame, with the transformation and its accuracy.
+"""Transformation of map coordinates to latitude and longitude in a modern frame, with its accuracy.
 
-Operations are PROJ operations (https://proj.org) whose area of use contains the map and whose grids are installed; a
-ballpark operation, which does not change the datum, is never used.
+PROJ operations (https://proj.org) are used whose area of use contains the map and whose grids are installed. Ballpark
+operations, which do not change the datum, are not used.
 """
 
 from __future__ import annotations
@@ -37,15 +37,14 @@ from railfix.track.crs import (
     rank_operation,
 )
 
-#: Projections of web maps and of the world, whose scale is unsuitable for a survey.
+#: Projections of web and world maps, whose scale differs from 1 so much that it cannot be checked.
 _UNEVEN: Final = (
     "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
 )  # fmt: skip
-_CELL_DEG: Final = 0.25  #: Cell size: maps within one cell have the same operation [deg].
-#: Accuracies better than this are within the accuracy of a map [m].
+_CELL_DEG: Final = 0.25  #: Size of the cells in which all maps have the same operation [deg].
+#: Accuracy of a transformation below which it is negligible compared with the accuracy of a map [m].
 NEGLIGIBLE_M: Final = 0.1
-#: An operation with a missing grid is reported where its accuracy is better than this fraction of the used operation's
-#: accuracy.
+#: Ratio of accuracies below which an operation with a missing grid is reported as better than the used operation.
 _BETTER: Final = 0.9
 
 
@@ -53,16 +52,16 @@ _BETTER: Final = 0.9
 class Georeference:
     """Coordinates of n points of a map in a modern frame, and their transformation."""
 
-    latitude_deg: Floats  #: Shape (n,).
-    longitude_deg: Floats  #: Shape (n,).
+    latitude_deg: Floats  #: Latitude, shape (n,).
+    longitude_deg: Floats  #: Longitude, shape (n,).
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates.
-    operation: str = ""  #: PROJ's operation between the datums; empty where the CRS is in a modern frame itself.
-    accuracy_m: float = 0.0  #: Standard deviation in plan of the operation [m]; NaN where it is unknown.
+    operation: str = ""  #: Name of the PROJ operation between the datums; "" if the CRS is based on a modern frame.
+    accuracy_m: float = 0.0  #: Standard deviation in plan of the operation; NaN if unknown.
     notes: tuple[str, ...] = ()
 
     @property
     def box(self) -> Box:
-        """South, north, west and east of the points."""
+        """South, north, west and east bounds of the points [deg]."""
         return _box(self.latitude_deg, self.longitude_deg)
 
 
@@ -70,15 +69,15 @@ class Georeference:
 class EllipsoidalHeights:
     """Ellipsoidal heights of n points of a map, and their transformation."""
 
-    height_m: Floats  #: Shape (n,).
-    datum: str  #: CRS of the file: ``"ellipsoidal"`` or ``"orthometric"``.
-    geoid: str = ""  #: Geoid model or operation used; empty where none was needed.
-    accuracy_m: float = 0.0  #: Standard deviation of the model [m]; NaN where it is unknown.
+    height_m: Floats  #: Ellipsoidal height, shape (n,).
+    datum: str  #: Height datum of the file, "ellipsoidal" or "orthometric".
+    geoid: str = ""  #: Geoid model or operation that was used; "" for ellipsoidal heights.
+    accuracy_m: float = 0.0  #: Standard deviation of the model; NaN if unknown.
     notes: tuple[str, ...] = ()
 
 
 def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
-    """Return the box about points, across the date line with an east of more than 180."""
+    """Return the bounds of points [deg]; across the date line the east bound is more than 180."""
     west = float(longitude_deg.min())
     if float(longitude_deg.max()) - west > 180.0:
         longitude_deg = longitude_deg % 360.0
@@ -89,7 +88,7 @@ def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
 
 
 def _cells(box: Box) -> Box:
-    """Return a box widened to whole cells, so that the parts of one map share one operation."""
+    """Return a box extended to full cells, so that all parts of a map have the same operation."""
     south, north, west, east = box
     low = [float(np.floor(v / _CELL_DEG) * _CELL_DEG) for v in (south, west)]
     high = [float(np.ceil(v / _CELL_DEG) * _CELL_DEG) for v in (north, east)]
@@ -97,7 +96,7 @@ def _cells(box: Box) -> Box:
 
 
 def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
-    """Return map coordinates in degrees of a modern frame, with the operation used and its accuracy.
+    """Transform map coordinates to latitude and longitude in a modern frame.
 
     Parameters
     ----------
@@ -106,12 +105,17 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
     x, y : ndarray, shape (n,)
         Easting and northing, or longitude and latitude, in the units of the CRS; finite.
     path : str
-        File named in errors.
+        Name of the file for error messages.
+
+    Returns
+    -------
+    Georeference
+        Coordinates, with the operation between datums and its accuracy.
 
     Raises
     ------
     InputFileError
-        The coordinates are not in the CRS.
+        The coordinates are outside the area of use of the CRS, or belong to another grid.
     SettingsError
         PROJ has no operation from the datum of the CRS there, or its grid is not installed.
     """
@@ -139,7 +143,10 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return coordinates of positions in a CRS (inverse of `georeference`); modern frames are equal, within 2 m."""
+    """Return the coordinates of positions in a CRS (inverse of `georeference`), shape (n,) each.
+
+    Modern frames are not distinguished, which causes errors of up to 2 m. SettingsError as in `georeference`.
+    """
     if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
         conversion, unit, origin = _to_datum(crs)
         degrees = (place.longitude_deg - origin) / unit, place.latitude_deg / unit
@@ -151,7 +158,7 @@ def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]
 
 
 def _find_chosen(crs: str, box: Box, *, path: str) -> _Chosen:
-    """Return the coordinate operation for the frame of a map over a box; SettingsError where none exists."""
+    """Return the operation from a CRS to a modern frame within a box; raise SettingsError if there is none."""
     chosen = _choose_operation(crs, _cells(box))
     if isinstance(chosen, str):
         chosen = _choose_operation(crs, box)
@@ -171,7 +178,7 @@ class _Chosen:
 
 @lru_cache(maxsize=256)
 def _choose_operation(crs: str, box: Box) -> _Chosen | str:
-    """Return the best operation of a CRS of an older datum to a modern frame over a box; a sentence where none is."""
+    """Return the best operation from a CRS of an older datum to a modern frame within a box, or the reason for none."""
     source = find_crs(crs).to_2d()
     known = {code: find_operations(source, CRS.from_user_input(code).to_2d(), box) for code in _targets(crs, box)}
     datum = "its own datum" if source.is_bound else get_geodetic_frame(crs).name
@@ -216,9 +223,10 @@ def _targets(crs: str, box: Box) -> Iterable[str]:
 
 
 def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
-    """Return the accuracy of the first operation [m]: as stated by PROJ, or from its distance to the others.
+    """Return the accuracy of the first operation [m], as stated by PROJ or implied by the other operations.
 
-    If another operation differs from the first by more than its own accuracy, the first may be wrong by the excess.
+    If another operation differs from the first operation by more than the accuracy of that other operation, the first
+    operation may be wrong by the excess. NaN if PROJ states no accuracy and no other operation differs.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -233,7 +241,10 @@ def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
 
 
 def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
-    """Reject points outside the area of use of a CRS's frame; a projection may be used outside its own area."""
+    """Raise InputFileError for points outside the area of use of the frame of a CRS.
+
+    The area of use of the projection is not checked, because projections are used beyond it.
+    """
     south, north, west, east = _bounds(crs)
     of_latitude = south <= latitude_deg.min() and latitude_deg.max() <= north
     if of_latitude and west <= longitude_deg.min() and longitude_deg.max() <= east:
@@ -253,13 +264,13 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
         path,
         f"latitude {lat[0]:.4f}, longitude {lon[0]:.4f} is outside the area of use of {geodetic.name} (latitude "
         f"{area.south:g} to {area.north:g}, longitude {area.west:g} to {area.east:g}); "
-        + ("latitude and longitude are swapped" if swapped else f"is {crs} the right CRS?"),
+        + ("latitude and longitude are swapped" if swapped else f"check whether {crs} is the right CRS"),
     )
 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """Return south, north, west and east of the area of use of a CRS's frame, with the margin, or empty."""
+    """Return the bounds of the area of use of the frame of a CRS, with the margin; an empty box without an area."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)
@@ -267,7 +278,7 @@ def _bounds(crs: str) -> Box:
 
 
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Reject points at which the scale of the grid differs from 1: they belong to another grid."""
+    """Raise InputFileError if the lengths in the grid and on the ground differ, as coordinates are of another grid."""
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
     if len(xy) < 2 or method in _UNEVEN:
@@ -286,7 +297,7 @@ def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, p
 
 @lru_cache(maxsize=32)
 def _to_datum(crs: str) -> tuple[Transformer, float, float]:
-    """Return the conversion of a CRS to its own datum, and the unit [deg] and origin [deg] of its longitudes there."""
+    """Return the conversion of a CRS to coordinates on its datum, and their angular unit and prime meridian [deg]."""
     system, datum = find_crs(crs), CRS.from_user_input(_find_frame(crs)).to_2d()
     plan = system.source_crs if system.is_bound and system.source_crs is not None else system
     meridian = datum.prime_meridian
@@ -296,7 +307,7 @@ def _to_datum(crs: str) -> tuple[Transformer, float, float]:
 
 
 def _in_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return latitude and longitude [deg] of coordinates on the datum of their CRS."""
+    """Return latitude and longitude on the datum of a CRS for coordinates in the CRS, shape (n,) each [deg]."""
     conversion, unit, origin = _to_datum(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in conversion.transform(x, y))
     return (latitude, longitude) if (unit, origin) == (1.0, 0.0) else (latitude * unit, longitude * unit + origin)

@@ -1,4 +1,4 @@
-"""Heights for a map without heights: a raster, a profile by chainage or kilometrage, or the 3-D positions of a run."""
+"""Heights for a map without heights, from a raster, a profile along the line, or the 3-D positions of a run."""
 
 from __future__ import annotations
 
@@ -24,37 +24,38 @@ from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 from railfix.track.trajectory import NearestOnPolyline
 
-#: Endings of rasters, read by GDAL through `rasterio`: GeoTIFF, ESRI ASCII grid with its .prj file, SRTM, DTED, ...
+#: File name endings of rasters, which GDAL reads: GeoTIFF, ESRI ASCII grid with a .prj file, SRTM, DTED and others.
 RASTERS: Final = (
     ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
 )  # fmt: skip
-HeightSource = FilePath | PositionLog  #: A file, or positions in memory.
-_SPACING_M: Final = 50.0  #: Largest spacing of the points that receive heights [m].
-_WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
-_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan belong to another line [m].
-_REACH_M: Final = 200.0  #: Points farther than this along the line from any height have no height [m].
-#: Standard deviation of the weights of positions along the line [m]: of fixed positions, and of single positions, whose
-#: errors persist for hundreds of metres; the error in a vertical curve of 2 km radius is then up to 5 m.
+HeightSource = FilePath | PositionLog  #: File with heights, or positions in memory.
+_SPACING_M: Final = 50.0  #: Largest spacing of points with heights [m].
+_WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are read at once.
+_NEAR_M: Final = 15.0  #: Largest distance in plan of positions that belong to the line [m].
+_REACH_M: Final = 200.0  #: Largest distance along the line between a point and the positions that give its height [m].
+#: Standard deviation of the Gaussian weights along the line [m], for RTK fixed positions, and for single-point
+#: positions, whose errors persist for hundreds of metres. The latter causes up to 5 m error in a vertical curve of 2 km
+#: radius.
 _KERNEL_M: Final = 15.0
 _LARGEST_KERNEL_M: Final = 150.0
-#: Positions whose heights are this many median deviations off have zero weight (Cleveland 1979, robust locally weighted
-#: regression, doi:10.1080/01621459.1979.10481038), and number of iterations.
+#: Deviation, in median deviations, beyond which a height has zero weight, and number of reweighting iterations (robust
+#: locally weighted regression, Cleveland 1979, doi:10.1080/01621459.1979.10481038).
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError with all missing options of a raster; InputFileError if the file is not a raster."""
+    """Raise SettingsError that names all missing options for a raster, or InputFileError if the file is no raster."""
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []
     if height_datum is None and not own:
-        asked.append("height_datum (--height-datum; orthometric: above the sea, as most are; or ellipsoidal)")
+        asked.append("height_datum (--height-datum), orthometric (above the sea, as in most rasters) or ellipsoidal")
     if height_datum != "ellipsoidal" and geoid is None and not own:
-        asked.append(f"geoid (--geoid), where they are orthometric ({GEOIDS})")
+        asked.append(f"geoid (--geoid) for orthometric heights ({GEOIDS})")
     if sigma_m is None:
-        asked.append("sigma_height_m (--height-sigma), their accuracy in metres")
+        asked.append("sigma_height_m (--height-sigma), the accuracy of the heights in metres")
     if asked:
-        raise SettingsError(f"{path}: a raster does not state all that its heights need; give {', '.join(asked)}")
+        raise SettingsError(f"{path}: a raster does not state the reference of its heights; give {', '.join(asked)}")
 
 
 def with_heights(
@@ -65,8 +66,11 @@ def with_heights(
     height_datum: str | None = None,
     sigma_m: float | None = None,
 ) -> Track:
-    """Return the track with heights and sigmas of a raster (`RASTERS`; needs `height_datum`, `sigma_m`), of a CSV by
-    chainage or kilometrage, or of a log of positions. InputFileError: heights are missing for a part of the line.
+    """Return the track with heights from a source, and with their standard deviation.
+
+    The source is a raster (`RASTERS`), which requires `height_datum` and `sigma_m`, a CSV table by chainage or
+    kilometrage, or a position log. Points are added so that heights are at most 50 m apart. Raise InputFileError if the
+    source lacks heights for a part of the line.
     """
     track = _dense(track)
     if isinstance(source, PositionLog):
@@ -82,7 +86,7 @@ def with_heights(
 
 
 def _dense(track: Track) -> Track:
-    """Return the track with points at most `_SPACING_M` apart, so that heights are followed on straight track, too."""
+    """Return the track with points at most `_SPACING_M` apart, so that straight track follows the heights, too."""
     pieces = np.ceil(np.diff(track.chainage_m) / _SPACING_M).astype(np.intp)
     if not (pieces > 1).any():
         return track
@@ -105,7 +109,7 @@ def _dense(track: Track) -> Track:
 
 @contextmanager
 def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
-    """Yield a raster and its CRS; InputFileError if it names no CRS."""
+    """Open a raster, and yield it with its CRS; raise InputFileError if it has no CRS or cannot be read."""
     with needs_extra(f"{path}: a raster"):
         import rasterio
     try:
@@ -120,7 +124,7 @@ def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
 def _from_raster(
     track: Track, path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None
 ) -> Track:
-    """Return the heights of a raster at the points of the track, linear between the middles of its cells."""
+    """Return the track with the heights of a raster, interpolated linearly between the centres of cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
     with _open_raster(path) as (raster, crs):
         datum, model = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
@@ -145,7 +149,10 @@ def _from_raster(
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
-    """Sample a raster at rows and columns, shape (2, n), in windows about neighbouring points; NaN without a value."""
+    """Interpolate a raster at rows and columns, shape (2, n); the result has shape (n,), and is NaN without a value.
+
+    It is read in windows around successive points.
+    """
     from scipy.ndimage import map_coordinates
 
     low = np.floor(place.min(axis=1)).astype(np.int64)
@@ -205,7 +212,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
     fitted = _smooth(target, place, height, sigma, reach_m=reach_m)
-    # neighbouring positions have common errors: the standard deviation is that of a single position
+    # as successive positions have common errors, the standard deviation of a single position is used
     spread = float(np.median(sigma)) if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
@@ -222,7 +229,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
 
 
 def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
-    """Return the weighted straight lines through the heights about each target; NaN if all are beyond the reach."""
+    """Return heights at the chainages `target`, smoothed by local straight lines; NaN beyond `reach_m` of positions."""
     kernel = float(np.clip(_KERNEL_M * np.median(sigma) / SIGMA_HEIGHT_M, _KERNEL_M, _LARGEST_KERNEL_M))
     weight = 1.0 / sigma**2
     for _ in range(_WEIGHED_AGAIN if kernel > _KERNEL_M else 0):
@@ -235,14 +242,14 @@ def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, rea
         nearest = np.clip(np.searchsorted(place, target), 1, len(place) - 1)
         gap = np.minimum(np.abs(target - place[nearest - 1]), np.abs(place[nearest] - target))
         fill = missing & (gap <= reach_m)
-        if reach_m == np.inf and not missing.all():  # single positions: the smoothed heights on either side
+        if reach_m == np.inf and not missing.all():  # interpolate between smoothed heights, not single positions
             place, height = target[~missing], fitted[~missing]
         fitted[fill] = np.interp(target[fill], place, height)
     return fitted
 
 
 def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
-    """Return the heights of weighted straight lines about each target; NaN where no position is near."""
+    """Return the heights at the chainages `target` of locally weighted straight lines; NaN without positions there."""
     fitted = np.full(len(target), np.nan)
     bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
     for k, (low, high) in enumerate(bounds.tolist()):
@@ -257,7 +264,7 @@ def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, 
 
 
 def _place(track: Track) -> Georeference:
-    """Return the points of a track in plan."""
+    """Return the points of a track in plan as a georeference."""
     return Georeference(
         latitude_deg=track.latitude_deg, longitude_deg=track.longitude_deg, frame=track.provenance.frame
     )

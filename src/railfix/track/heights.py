@@ -1,4 +1,4 @@
-"""Ellipsoidal heights of a map, with the geoid model or transformation and its accuracy (P1 3.1(1))."""
+"""Conversion of the heights of a map to ellipsoidal heights, by a geoid model or a PROJ operation (P1 3.1(1))."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from railfix.track.crs import find_operations, get_vertical_datum, known_accurac
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
 from railfix.track.route import MapReading
 
-#: Geoid models of the GSI of Japan: GSIGEO2011 for heights levelled before April 2025, JPGEO2024 since.
+#: Names of the geoid models of the GSI of Japan: GSIGEO2011 for heights levelled before April 2025, JPGEO2024 since.
 JAPAN_MODELS: Final = {
     "japan": "JPGEO2024",
     "jpgeo2024": "JPGEO2024",
@@ -33,35 +33,37 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
-#: Standard deviation of these models [m] (GSI: 2 cm against GNSS and levelling).
+#: Standard deviation of the Japanese models [m], stated by the GSI from GNSS and levelling.
 _JAPAN_M: Final = 0.02
-GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Geoids by name.
+GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Accepted geoids.
 #: Advice for orthometric heights without a geoid.
 GEOID_HELP: Final = f"give one (--geoid): {GEOIDS}; or a column geoid_m"
 _EGM96_NAMES: Final = ("egm96", "epsg:5773")
-#: Standard deviation of EGM96 against heights above the sea [m], as EPSG states it (operation 10084).
+#: Standard deviation of EGM96 [m], as stated by EPSG (operation 10084).
 _EGM96_M: Final = 1.0
 HEIGHT_DATUMS: Final = ("ellipsoidal", "orthometric")
 
 
 @dataclass(frozen=True, kw_only=True)
 class GeoidModel:
-    """Heights of a geoid above the ellipsoid at n points, the name of the model, and its standard deviation [m]."""
+    """Geoid heights at n points."""
 
-    height_m: Floats
-    name: str
-    accuracy_m: float
+    height_m: Floats  #: Height of the geoid above the ellipsoid, shape (n,).
+    name: str  #: Name of the model.
+    accuracy_m: float  #: Standard deviation of the model; NaN if unknown.
 
 
 def check_height_datum(height_datum: str | None) -> None:
-    """Raise `SettingsError` for a height datum other than ellipsoidal and orthometric."""
+    """Raise SettingsError if a height datum is given that is neither "ellipsoidal" nor "orthometric"."""
     if height_datum is not None and height_datum not in HEIGHT_DATUMS:
         raise SettingsError(f"height_datum {height_datum!r} is unknown; expected 'ellipsoidal' or 'orthometric'")
 
 
 def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidModel:
-    """Return heights of a geoid (`JAPAN_MODELS`, ``egm96``, a pyproj grid, a vertical or compound CRS) above the
-    ellipsoid of the frame of some points. SettingsError: the geoid is unknown or not installed.
+    """Compute the heights of a geoid above the ellipsoid at the points of a map.
+
+    The geoid is a name in `JAPAN_MODELS`, ``egm96``, a grid of PROJ, or a vertical or compound CRS. Raise SettingsError
+    if it is unknown or not installed, InputFileError if it does not cover all points.
     """
     key = geoid.strip().lower() if isinstance(geoid, str) else ""
     if isinstance(geoid, CRS) and geoid.to_authority() == ("EPSG", "5773"):
@@ -82,15 +84,16 @@ def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidM
         raise InputFileError(
             path,
             f"{int(outside.sum())} of {len(outside)} points lie outside the geoid {model.name}, the first at latitude "
-            f"{place.latitude_deg[i]:.6f}, longitude {place.longitude_deg[i]:.6f}; are latitude and longitude swapped, "
-            "or is it another country's geoid?",
+            f"{place.latitude_deg[i]:.6f}, longitude {place.longitude_deg[i]:.6f}; give the geoid of the country, or "
+            "check whether latitude and longitude are swapped",
         )
     return model
 
 
 def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
-    """Compute heights of the geoid EGM96 above the WGS 84 ellipsoid, shape (n,) [m]: a cubic spline through its grid
-    of 15' (NGA, WW15MGH), within 5 mm of the published test values.
+    """Compute the heights of the geoid EGM96 above the WGS 84 ellipsoid, shape (n,) [m].
+
+    They are interpolated by a cubic spline in the 15' grid (NGA, WW15MGH), within 5 mm of the published test values.
     """
     place = (90.0 - latitude_deg) * 4.0, (longitude_deg % 360.0) * 4.0 + _WRAP
     return np.asarray(scipy.ndimage.map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
@@ -101,14 +104,17 @@ _WRAP: Final = 16  #: Columns of the grid that are repeated at both sides, so th
 
 @lru_cache(maxsize=1)
 def _egm96_spline() -> Floats:
-    """Return the spline coefficients of the grid, which is stored as differences in centimetres along both axes."""
+    """Return the spline coefficients of the EGM96 grid, which is stored as differences along both axes [cm]."""
     with (files("railfix.track") / "egm96_15.npz").open("rb") as file, np.load(file) as data:
         heights = data["second_differences_cm"].astype(np.int64).cumsum(axis=0).cumsum(axis=1) / 100.0
     return read_only(scipy.ndimage.spline_filter(np.pad(heights, ((0, 0), (_WRAP, _WRAP)), mode="wrap"), order=3))
 
 
 def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
-    """Return a geoid model from PROJ: a grid file, or the operation from a height datum to the frame's ellipsoid."""
+    """Compute geoid heights with PROJ, from a grid file or by the operation from a height datum to the ellipsoid.
+
+    Raise SettingsError if the geoid is unknown, has no height datum, or its grid is not installed.
+    """
     try:
         if isinstance(geoid, str) and (geoid.lower().endswith((".tif", ".tiff", ".gtx")) or _is_file(geoid)):
             steps = f"+proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=vgridshift +grids={geoid} +multiplier=1"
@@ -145,7 +151,7 @@ def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
 
 
 def _is_file(geoid: str) -> bool:
-    """Return whether a text is the path of a file; False for texts that are too long for a path."""
+    """Return whether a text is the path of an existing file; False if the text is too long for a path."""
     try:
         return Path(geoid).is_file()
     except OSError:
@@ -153,7 +159,7 @@ def _is_file(geoid: str) -> bool:
 
 
 def _undulation(transformer: Transformer, place: Georeference) -> Floats:
-    """Return the height above the ellipsoid of points of height 0."""
+    """Return the ellipsoidal heights of points with orthometric height 0, shape (n,) [m]."""
     zeros = np.zeros(len(place.latitude_deg))
     return np.asarray(transformer.transform(place.longitude_deg, place.latitude_deg, zeros)[2], np.float64)
 
@@ -168,9 +174,11 @@ def heights_of_file(
     geoid: str | None = None,
     geoid_m: Floats | None = None,
 ) -> EllipsoidalHeights:
-    """Return ellipsoidal heights of a file, whose datum, geoid and `geoid_m` are used unless `reading` gives others.
+    """Convert the heights of a file to ellipsoidal heights.
 
-    InputFileError: the file names an unknown datum. SettingsError: no datum is known, or two contradict each other.
+    `datum`, `geoid` and `geoid_m` are those stated in the file; `reading` has those given by the user, which take
+    precedence. Raise InputFileError if the file names an unknown datum, SettingsError if no datum is known or if two
+    datums contradict each other.
     """
     check_height_datum(reading.height_datum)
     if datum is not None and datum not in HEIGHT_DATUMS:
@@ -185,7 +193,7 @@ def heights_of_file(
     if used == "ellipsoidal":
         geoid_m = None
     elif geoid_m is not None and not isinstance(model, str):
-        model = None  # the compound CRS's model is replaced by the map's own
+        model = None  # `geoid_m` of the map replaces the model of the compound CRS
     elif model is None:
         model = geoid
     return ellipsoidal_heights(heights_m, place, datum=used, geoid=model, geoid_m=geoid_m, path=path)
@@ -194,7 +202,10 @@ def heights_of_file(
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Return the given height datum and geoid, or the compound CRS's; SettingsError if they contradict each other."""
+    """Return the height datum and geoid that are given, or those of a compound CRS.
+
+    Raise SettingsError if the two contradict each other.
+    """
     vertical = get_vertical_datum(crs)
     if vertical is None:
         return height_datum, geoid
@@ -211,7 +222,7 @@ def own_height_datum(
 
 
 def _is_geoid_of(geoid: str, vertical: CRS) -> bool:
-    """Return whether a geoid given by name belongs to a height datum; a grid file is always accepted."""
+    """Return whether a geoid belongs to a height datum; True for a grid file, which is not checked."""
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:
         return vertical.name.startswith(("JGD", "JSLD"))
@@ -234,7 +245,10 @@ def ellipsoidal_heights(
     path: str,
     geoid_m: Floats | None = None,
 ) -> EllipsoidalHeights:
-    """Convert heights of a datum to ellipsoidal heights, by a model or the map's `geoid_m`."""
+    """Convert heights of a datum to ellipsoidal heights, by a geoid model or the geoid heights `geoid_m` of the map.
+
+    Raise SettingsError for contradictory options, InputFileError for orthometric heights without a geoid.
+    """
     if datum == "ellipsoidal":
         if geoid is not None:
             raise SettingsError(f"{path}: geoid {geoid!r} was given, but the heights are ellipsoidal already")

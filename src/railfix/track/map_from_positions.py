@@ -1,4 +1,4 @@
-"""Track map from accurate positions, where no map exists (P1 4.2(1))."""
+"""Track maps from accurate positions of a run, for lines without a map (P1 4.2(1))."""
 
 from __future__ import annotations
 
@@ -20,41 +20,39 @@ from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog, qualities_in_words
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
-#: Note of every map of this kind.
+#: Note in every map made from positions.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
-_TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
-#: A position is an outlier if its distance from the line between its neighbours exceeds a distance [m], this multiple
-#: of the median distance, and the ordinate of a curve of this radius [m]; with enough positions the search is repeated
-#: without outliers, in some rounds. Along the line a change of speed is allowed for by this acceleration [m/s2]. The
-#: line is straight between neighbours near in time [s], or where the cosine of the turns of the path around them is at
-#: least this.
+_TURN: Final = -0.5  #: Cosine of the turn beyond which the path reverses: 120 degrees.
+#: Largest distance of a position from the straight line between its neighbours; an outlier exceeds all three limits: a
+#: distance [m], a multiple of the median distance, and the ordinate of a curve of this radius [m].
 _BESIDE_M: Final = 5.0
 _BESIDE_MEDIANS: Final = 6.0
 _LEAST_RADIUS_M: Final = 150.0
-_ROUNDS: Final = 20
-_ENOUGH: Final = 10
-_ACCELERATION_MPS2: Final = 2.0
+_ROUNDS: Final = 20  #: Largest number of searches for outliers, each without the outliers found before.
+_ENOUGH: Final = 10  #: Minimum number of positions for a search.
+_ACCELERATION_MPS2: Final = 2.0  #: Acceleration that is allowed for in the distance along the line.
+#: The path between neighbours counts as straight if they are this near in time [s], or if the cosine of the change of
+#: direction before and after them is at least this.
 _NEAR_S: Final = 2.5
 _STRAIGHT: Final = 0.87
-_STANDING_WINDOW_S: Final = 3.0  #: Half of the displacement window [s].
+_STANDING_WINDOW_S: Final = 3.0  #: Half length of the window over which the displacement is computed [s].
 
 
 class ThinningLimits(Settings):
     """Limits for the selection of positions as points of a map."""
 
     spacing_m: float = Field(default=5.0, gt=0)  #: Smallest distance between consecutive points.
-    #: Where positions between two points deviate from their chord by more, the farthest position becomes a point, too
-    #: (P1 4.1(3): chords within 0.30 m of the curve). Requires times, to distinguish a bend from noise while
-    #: stationary.
+    #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). Beyond it the farthest
+    #: position becomes a point, too. Times are required, to distinguish a bend from noise at standstill.
     chord_m: float = Field(default=0.30, gt=0)
-    #: Below this horizontal speed over `_STANDING_WINDOW_S` the antenna is stationary and its positions are noise or
-    #: drift. Requires times; 0 keeps all.
+    #: Horizontal speed below which the antenna is stationary, so that its positions are noise or drift. Times are
+    #: required; with 0 all positions are kept.
     standing_mps: float = Field(default=0.2, ge=0)
-    #: Neighbouring points farther apart, joined by a straight line, are reported.
+    #: Longest distance between consecutive points that is not reported as a gap.
     jump_m: float = Field(default=50.0, gt=0)
-    gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points farther apart do not form a line: an error.
-    #: Positions that the vehicle could reach from the others only above this speed are wrong and dropped; without
-    #: times, positions farther than `gap_m` from the others are dropped.
+    gap_m: float = Field(default=2000.0, gt=0)  #: Longest gap that is bridged; a longer gap is an error.
+    #: Largest speed of the vehicle. Positions that are reachable only at a higher speed are dropped; without times,
+    #: positions farther than `gap_m` from the others are dropped.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
@@ -62,16 +60,20 @@ class ThinningLimits(Settings):
 class Thinned:
     """Result of the selection of positions."""
 
-    kept: Indices  #: Rows that became points of the map, in order; shape (V,).
-    dropped: dict[str, int]  #: Number of rows by reason.
-    jumps: Indices  #: Points whose successor is farther away than `ThinningLimits.jump_m`, shape (j,).
-    jump_m: Floats  #: Distance to the successor, shape (j,).
-    #: Points at which the path turns by more than 120 degrees: reversals, or wrong positions; shape (t,).
+    kept: Indices  #: Rows of the positions that became points of the map, in ascending order, shape (V,).
+    dropped: dict[str, int]  #: Number of dropped rows by reason.
+    jumps: Indices  #: Points before a gap of more than `ThinningLimits.jump_m`, shape (j,).
+    jump_m: Floats  #: Length of these gaps, shape (j,).
+    #: Points at which the path turns by more than 120 degrees, at reversals or wrong positions, shape (t,).
     turns: Indices
 
 
 def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
-    """Flag rows at which the horizontal displacement over the window is below speed times window; times rise."""
+    """Return a mask of the rows at which the antenna is stationary, shape (T,).
+
+    The horizontal displacement over `window_s` on both sides is then below `speed_mps` times its duration. Times must
+    rise; without times (NaT) no row is stationary.
+    """
     if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
         return np.zeros(len(time), dtype=np.bool_)
     t = seconds(time - time[0])
@@ -87,11 +89,11 @@ def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: f
 def thin(
     time: Datetimes, ecef_m: Floats, *, usable: Masks | None = None, limits: ThinningLimits | None = None
 ) -> Thinned:
-    """Choose the positions (n, 3) [m] that become points of a map; rows with NaN, or not `usable`, are dropped.
+    """Select the positions, shape (n, 3) ECEF [m], that become points of a map.
 
-    Noise and drift of a stationary antenna cause no loops: stationary rows are dropped first, and a point is kept only
-    at full spacing from the last. The last usable position is kept where it is at least a fifth of the spacing further
-    on.
+    Rows that are NaN, not `usable`, out of reach, outliers or stationary are dropped first, so that noise and drift at
+    standstill cause no loops. Further points are at least a spacing apart. The last position is also kept if it is at
+    least a fifth of the spacing ahead.
     """
     limits = limits or ThinningLimits()
     finite = np.isfinite(ecef_m).all(axis=1)
@@ -131,7 +133,10 @@ def thin(
 
 
 def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks:
-    """Flag rows that one vehicle can have passed, outward from the longest piece without a jump, shape (n,)."""
+    """Return a mask of the rows that one vehicle can have passed, shape (n,).
+
+    The search starts from the longest part without a jump, and goes outward from it.
+    """
     if len(ecef_m) < 2:
         return np.ones(len(ecef_m), dtype=np.bool_)
     timed = not np.isnat(time).any()
@@ -161,7 +166,10 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 
 
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
-    """Flag positions off the straight line between their neighbours, the farthest first; shape (n,)."""
+    """Return a mask of the positions off the straight line between their neighbours, shape (n,).
+
+    The farthest positions are removed first, because they also displace the lines of their neighbours.
+    """
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
         return wrong
@@ -191,9 +199,10 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 
 
 def _goes_on(points: Floats, direction: Floats) -> Masks:
-    """Return whether the path before and after each inner point continues in the direction between its neighbours.
+    """Return a mask of the inner points about which the path is straight, in the direction between their neighbours.
 
-    The next position or the one after it is used, since the next may be an outlier as well.
+    Before and after the neighbours one of the next two steps must be in that direction, as a position may be an
+    outlier.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -207,7 +216,7 @@ def _goes_on(points: Floats, direction: Floats) -> Masks:
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Extend the stationary rows by moves between them that stay within the spacing."""
+    """Return the mask of stationary rows, extended by movements between them that remain within the spacing."""
     if not stands.any():
         return stands
     edges = np.flatnonzero(np.diff(stands)) + 1
@@ -219,7 +228,7 @@ def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
 
 
 def _at_spacing(points: Floats, spacing_m: float) -> Indices:
-    """Select points at least the spacing apart, and the last point where it is far enough."""
+    """Return the indices of points at least the spacing apart, and of the last point if it is a fifth of it ahead."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
     kept = [0]
@@ -241,7 +250,7 @@ def _at_spacing(points: Floats, spacing_m: float) -> Indices:
 
 
 def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
-    """Add to the chosen points the point furthest from each chord, where it exceeds the limit."""
+    """Return the chosen points and, for each chord with a deviation above `chord_m`, the point farthest from it."""
     if len(chosen) < 2:
         return chosen
     piece = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
@@ -250,7 +259,7 @@ def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
     start, step = points[chosen[piece]], points[chosen[piece + 1]] - points[chosen[piece]]
     share = np.einsum("ni,ni->n", points[inside] - start, step) / np.einsum("ni,ni->n", step, step)
     off = np.linalg.norm(points[inside] - start - share[:, None] * step, axis=1)
-    # near an end of the chord the point would make a kink, not a curve
+    # a point near an end of the chord would cause a kink
     off = np.where((share > 0.2) & (share < 0.8), off, 0.0)
     worst = np.zeros(len(chosen) - 1)
     np.maximum.at(worst, piece, off)
@@ -270,11 +279,11 @@ def from_positions(
     sigma_plan_m: float = SIGMA_PLAN_M,
     sigma_height_m: float = SIGMA_HEIGHT_M,
 ) -> Track:
-    """Create a track from positions (n, 3) [m] in the order of travel, thinned and without stationary positions.
+    """Create a track from positions, shape (n, 3) ECEF [m], in the order of travel.
 
-    `time` is NaT where unknown; `usable` drops rows; `spacing_m` is used without `limits`. The notes of the
-    track record that it is the path of the antenna, and its gaps and reversals. ValueError: fewer than two points are
-    left.
+    The positions are selected by `thin`. `time` is NaT where unknown; `usable` is a mask of the rows that may be used;
+    `spacing_m` is ignored if `limits` are given. The notes of the track report its gaps and reversals, and that it is
+    the path of the antenna. Raise ValueError if fewer than two points are left, or a gap is too long.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
     return create_track(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
@@ -291,7 +300,7 @@ def create_track(
     gap_m: float = 2000.0,
     accuracy: str = "",
 ) -> Track:
-    """Create the track of the positions selected by `thin`."""
+    """Create a track of the positions selected by `thin`; ValueError for fewer than two points or too long a gap."""
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
         dropped = f" ({dropped})" if dropped else ""
@@ -322,7 +331,11 @@ def create_track(
 
 
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
-    """Flag the rows of a log within the quality limits: by default fixes (1) if it has a quality column, else all."""
+    """Return a mask of the rows of a log within the limits of quality and standard deviation.
+
+    By default RTK fixed positions (quality 1) are used, or all positions of a log without a quality column. Raise
+    InputFileError if the log lacks the column of a limit, NoPositionError if no position has the quality.
+    """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
         raise InputFileError(log.path, "a quality was given, but the log has no column 'quality'")
@@ -342,15 +355,18 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     return usable
 
 
-#: Standard deviations of positions by their quality number (RTKLIB), plan and height [m]; for a fix, P1's standard
-#: deviation of a surveyed map. 2: float, 3: SBAS, 4: differential, 5: single point without corrections.
+#: Standard deviations of positions, plan and height [m], by RTKLIB quality number: 1 is an RTK fix, with P1's values
+#: for a surveyed map, 2 float, 3 SBAS, 4 differential, and 5 single point without corrections.
 SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (SIGMA_PLAN_M, SIGMA_HEIGHT_M), 2: (0.5, 1.0), 3: (1.5, 3.0), 4: (1.0, 2.0), 5: (3.0, 6.0)}
 )
 
 
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
-    """Return the sigmas in plan and height of a map's positions, the larger of stated and usual, with their basis."""
+    """Return the standard deviations of a map in plan and height [m], and a note on their basis.
+
+    They are the largest of those stated in the log, those of the quality numbers, and those of P1.
+    """
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]
     reasons = []
@@ -375,10 +391,10 @@ def from_position_log(
     limits: ThinningLimits | None = None,
     name: str | None = None,
 ) -> tuple[Track, Thinned]:
-    """Create a track from the accurate positions of a log, and report the selection of rows.
+    """Create a track from the accurate positions of a log; return also the selection of rows.
 
-    NoPositionError: fewer than two points are left. InputFileError: the times run backwards, the log has no column for
-    a filter, or a gap is too long.
+    Raise NoPositionError if fewer than two points are left. Raise InputFileError if times decrease, the log lacks the
+    column of a limit, or a gap is too long.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)

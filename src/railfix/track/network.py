@@ -1,7 +1,7 @@
-"""A network of tracks: track centrelines, the connections of their ends, and routes through it (P1 4.2(1)).
+"""Network of tracks: track centrelines, connections of their ends, and routes through the network (P1 4.2(1)).
 
-Connections are stated by the file, or else join ends within a tolerance of each other. At a switch each leg is
-navigable with the stem, but not with the other leg.
+Connections are stated by the file, or join ends within a tolerance of each other. At a switch a train can pass between
+the stem and either leg, but not between the two legs.
 """
 
 from __future__ import annotations
@@ -26,60 +26,59 @@ from railfix.track.trajectory import NearestOnPolyline, project_on_segments
 if TYPE_CHECKING:
     import networkx as nx
 
-#: Prior probability that the train is on an unmapped track, and the least distance of two tracks [m].
-UNMAPPED_PRIOR: Final = 0.05
-CLEARANCE_M: Final = 3.0
-#: Assumed height of an antenna above the rails, and its standard deviation [m], for bogies to roofs.
+UNMAPPED_PRIOR: Final = 0.05  #: Prior probability that the train is on an unmapped track.
+CLEARANCE_M: Final = 3.0  #: Minimum distance between the centrelines of two tracks [m].
+#: Assumed height of an antenna above the rails, and its standard deviation [m]; antennas are on bogies to roofs.
 ANTENNA_UP_M: Final = 2.5
 ANTENNA_SIGMA_M: Final = 1.5
-_DIRECTION_M: Final = 10.0  #: Length over which the direction of an end is computed [m].
-_NEAR_WAY_M: Final = 5_000.0  #: Length of routes searched before the whole network is searched [m].
-_SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
-#: Number of nearest samples examined for each position at first; more if these do not extend far enough.
+_DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].
+_NEAR_WAY_M: Final = 5_000.0  #: Length of the routes that are searched before the whole network [m].
+_SAMPLE_M: Final = 50.0  #: Largest spacing of the samples in the spatial index [m].
+#: Number of nearest samples that are examined first for each position; it is increased if they are not enough.
 _SAMPLES: Final = 32
-_TOGETHER: Final = 256  #: Positions processed together: every nearby sample of each is in memory.
-#: Properties that the connections do not change.
+_TOGETHER: Final = 256  #: Number of positions processed at once, which bounds the memory for nearby samples.
+#: Cached properties that do not depend on the connections.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
-_NAMED: Final = 8  #: Number of tracks that a message names individually.
+_NAMED: Final = 8  #: Largest number of tracks of which a message lists all names.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """Connection of the end of a track with another track's end; ends are 0 (first point) and 1 (last)."""
+    """Connection between the ends of two tracks; end 0 is the first point of a track, end 1 the last point."""
 
-    first: int
+    first: int  #: Index of the first track.
     first_end: int
-    second: int
+    second: int  #: Index of the second track.
     second_end: int
-    navigable: bool = True
+    navigable: bool = True  #: Whether a train can pass from one track to the other without reversing.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidates(RowArrays):
-    """Tracks near positions (n, m), nearest first, -1 for none; `offset_m` in plan, right positive, else infinite."""
+    """Up to m tracks near each of n positions, nearest first; shapes (n, m)."""
 
-    track: Indices
-    chainage_m: Floats
-    offset_m: Floats
+    track: Indices  #: Index of the track, -1 if there are fewer than m tracks.
+    chainage_m: Floats  #: Chainage of the nearest point of the track; NaN without a track.
+    offset_m: Floats  #: Distance from the track in plan, positive to the right; infinite without a track.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Network(NotebookTable):
-    """Tracks, each from one end or switch to the next, their connections, and notes on the connections' source."""
+    """Tracks, which extend between switches or open ends, and their connections."""
 
     tracks: tuple[Segment, ...]
-    links: tuple[Link, ...]
-    notes: tuple[str, ...] = ()
+    links: tuple[Link, ...]  #: Connections of track ends.
+    notes: tuple[str, ...] = ()  #: Notes on the source of the connections.
 
     def connect(self, links: tuple[Link, ...], note: str) -> Network:
-        """Return the network with new connections, and a note on them; the data of its points are kept."""
+        """Return the network with new connections and a note on their source; cached data of the points are kept."""
         network = replace(self, links=links, notes=(note,))
         vars(network).update({name: vars(self)[name] for name in _OF_POINTS if name in vars(self)})
         return network
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the tracks from the file; repeated names are numbered."""
+        """Names of the tracks as in the file, or the source of a track without a name; repeated names are numbered."""
         seen: dict[str, int] = {}
         names = []
         for track in self.tracks:
@@ -90,19 +89,19 @@ class Network(NotebookTable):
 
     @cached_property
     def first_point(self) -> Indices:
-        """Index of each track's first point in `points_m`, and the end of the last track, shape (tracks + 1,)."""
+        """Index in `points_m` of each track's first point, and the number of points, shape (tracks + 1,)."""
         return np.concatenate([[0], np.cumsum([len(t.latitude_deg) for t in self.tracks])]).astype(np.intp)
 
     @cached_property
     def points_m(self) -> Floats:
-        """Points of all tracks on the ellipsoid, shape (V, 3) ECEF [m], so that distances are in plan."""
+        """Points of all tracks, reduced to the ellipsoid so that distances are in plan, shape (V, 3) ECEF [m]."""
         latitude = np.concatenate([t.latitude_deg for t in self.tracks])
         longitude = np.concatenate([t.longitude_deg for t in self.tracks])
         return read_only(ecef_from_geodetic(latitude, longitude, np.zeros(len(latitude))))
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Length in plan on the ellipsoid from the first point of its track, of each point of `points_m`."""
+        """Length in plan, on the ellipsoid, from the first point of the track to each of `points_m`, shape (V,) [m]."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         steps[self.first_point[1:-1] - 1] = 0.0
         way = np.concatenate([[0.0], np.cumsum(steps)])
@@ -110,12 +109,15 @@ class Network(NotebookTable):
 
     @cached_property
     def length_m(self) -> Floats:
-        """Length of each track, shape (tracks,)."""
+        """Length of each track in plan, shape (tracks,) [m]."""
         return read_only(self.chainage_m[self.first_point[1:] - 1])
 
     @cached_property
     def graph(self) -> nx.DiGraph[int]:
-        """Directed graph of passages: node 4 t + 2 e is entering track t at end e, 4 t + 2 e + 1 leaving it there."""
+        """Directed graph of train movements, with lengths [m] as weights.
+
+        Node ``4 t + 2 e`` is the entry of track t at end e, and node ``4 t + 2 e + 1`` is the exit at that end.
+        """
         import networkx as nx
 
         graph: nx.DiGraph[int] = nx.DiGraph()
@@ -131,7 +133,7 @@ class Network(NotebookTable):
 
     @cached_property
     def joints(self) -> Integers:
-        """Joint at each end of each track, shape (tracks, 2); linked ends have the same number."""
+        """Number of the joint at each end of each track, shape (tracks, 2); connected ends have the same number."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -143,7 +145,7 @@ class Network(NotebookTable):
 
     @cached_property
     def passages(self) -> dict[tuple[int, int], dict[tuple[int, int], None]]:
-        """Ends (track, end), in order, to which a train passes from each end that has a navigable connection."""
+        """Ends (track, end) to which a train can pass from an end (track, end), by navigable connections."""
         passages: dict[tuple[int, int], dict[tuple[int, int], None]] = {}
         for link in self.links:
             if link.navigable:
@@ -154,17 +156,20 @@ class Network(NotebookTable):
 
     @cached_property
     def height_m(self) -> Floats:
-        """Ellipsoidal height of each point of `points_m`; NaN where the map has none."""
+        """Ellipsoidal height of each of `points_m`, shape (V,) [m]; NaN where the map has none."""
         return read_only(np.concatenate([t.height_m for t in self.tracks]))
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats]:
-        """Chainage of each point, and of the start of each track, on one axis over all tracks, with gaps of a metre."""
+        """Chainages of all points, and of the starts of tracks, on one axis with all tracks 1 m apart [m]."""
         before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
         return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
 
     def course_on(self, track: Indices, chainage_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points in plan, unit vectors along tracks there, both ECEF of shape (n, 3), and heights, shape (n,)."""
+        """Return points in plan, unit vectors along the track, and heights at chainages on tracks.
+
+        Points and vectors are in ECEF, shape (n, 3); heights have shape (n,). Chainages are limited to the track.
+        """
         way, before = self._way
         at = before[track] + np.clip(chainage_m, 0.0, self.length_m[track])
         last = self.first_point[track + 1] - 2
@@ -177,32 +182,32 @@ class Network(NotebookTable):
 
     @property
     def frame(self) -> str:
-        """Geographic CRS of the coordinates; MismatchError if the tracks are in different frames."""
+        """Geographic CRS of the coordinates; raises MismatchError if the tracks are in different frames."""
         return one_frame(self.tracks)
 
     @cached_property
     def sigma_plan_m(self) -> float:
-        """Standard deviation of the tracks in plan: the worst of the files, by default a surveyed map's."""
+        """Standard deviation of the tracks in plan [m]: the worst stated value, by default that of P1 4.1(3)."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
     @cached_property
     def sigma_height_m(self) -> float:
-        """Standard deviation of the tracks' heights: the worst of the files, by default a surveyed map's."""
+        """Standard deviation of the tracks' heights [m]: the worst stated value, by default that of P1 4.1(3)."""
         return sigma_of_files(self.tracks, "sigma_height_m", SIGMA_HEIGHT_M)
 
     @cached_property
     def datum_plan_m(self) -> float:
-        """Standard deviation of the tracks' transformation from their datum, included in the above [m]."""
+        """Largest standard deviation of the transformation of a track from its datum [m]; part of `sigma_plan_m`."""
         return max(track.datum_plan_m for track in self.tracks)
 
     @property
     def named(self) -> bool:
-        """Whether the files name the frame."""
+        """Whether all files name their reference frame."""
         return all(track.crs != UNNAMED for track in self.tracks)
 
     @cached_property
     def _index(self) -> tuple[scipy.spatial.cKDTree, Indices, Indices, float]:
-        """Tree of samples of all segments, segment and track of each sample, and the reach of a sample's piece."""
+        """k-d tree of samples on all segments, segment and track of each sample, and half the largest spacing [m]."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
         inner[self.first_point[1:-1] - 1] = False
@@ -216,7 +221,10 @@ class Network(NotebookTable):
         return scipy.spatial.cKDTree(samples, balanced_tree=False), of, track, reach
 
     def _samples_near(self, points_m: Floats, within_m: float, least: int) -> tuple[Floats, Indices]:
-        """Distance and number of every sample near each point, `least` at least; infinite where there are fewer."""
+        """Return the distances and indices of all samples near each point, in at least `least` columns.
+
+        Samples are near if their piece of track can be within `within_m`. The distance is infinite in unused columns.
+        """
         tree, _, _, reach = self._index
         count, short = max(_SAMPLES, least), np.arange(len(points_m))
         distance, sample = np.full((len(points_m), count), np.inf), np.zeros((len(points_m), count), dtype=np.intp)
@@ -229,7 +237,7 @@ class Network(NotebookTable):
         return distance, np.where(np.isfinite(distance), sample, 0).astype(np.intp)
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
-        """Return tracks within a distance in plan of positions, shapes (n,), by a spatial index of all tracks."""
+        """Return up to `most` tracks within `within_m` in plan of each position; coordinates have shape (n,)."""
         parts = [
             self._near(latitude_deg[k : k + _TOGETHER], longitude_deg[k : k + _TOGETHER], within_m, most)
             for k in range(0, max(len(latitude_deg), 1), _TOGETHER)
@@ -237,7 +245,7 @@ class Network(NotebookTable):
         return join_rows(parts)
 
     def _near(self, latitude_deg: Floats, longitude_deg: Floats, within_m: float, most: int) -> Candidates:
-        """Return a part of `near`; arrays contain every sample near each position."""
+        """Return the result of `near` for a few positions."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
@@ -249,7 +257,7 @@ class Network(NotebookTable):
         offset = np.where(present & (offset <= within_m), offset, np.inf)
         side = np.einsum("nki,nki->nk", np.cross(step, points[:, None] - start), points[:, None])
         chainage = self.chainage_m[of] + share * np.linalg.norm(step, axis=-1)
-        # the nearest segment of each track: rows ordered by track, then by distance
+        # sort by track, then by distance, so that the first of a track is its nearest segment
         order = np.lexsort((offset, track), axis=-1)
         ordered = np.take_along_axis(track, order, axis=1)
         first = np.ones_like(ordered, dtype=np.bool_)
@@ -266,7 +274,10 @@ class Network(NotebookTable):
         )
 
     def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-        """Chainage on given tracks and distance from them in plan, shapes (n,); NaN without track (-1) or position."""
+        """Return the chainage on given tracks of positions, and their distance in plan, shape (n,) each [m].
+
+        Both are NaN without a track (-1) or a position (NaN).
+        """
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         chainage, offset = np.full(len(track), np.nan), np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
@@ -277,7 +288,7 @@ class Network(NotebookTable):
         return chainage, offset
 
     def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
-        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where missing."""
+        """Return the kilometrage at chainages on given tracks, shape (n,) [m]; NaN where the map has none."""
         kilometrage = np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
             rows = track == number
@@ -287,7 +298,10 @@ class Network(NotebookTable):
         return kilometrage
 
     def find_index(self, name: str) -> int:
-        """Return the number of a track by name, an OpenStreetMap way also by its id; SettingsError without a track."""
+        """Return the index of a track by its name, or of an OpenStreetMap way by its id.
+
+        Raise SettingsError if there is no such track.
+        """
         drawn = [k for k, track in enumerate(self.tracks) if "origin" in track.metadata]
         by_id = [k for k in drawn if self.tracks[k].metadata.get("name", "").startswith(f"{name} ")]
         if name not in self.names and len(by_id) == 1:
@@ -303,10 +317,10 @@ class Network(NotebookTable):
     def extend_routes(
         self, routes: Mapping[int, tuple[float, list[int]]], stop: int
     ) -> dict[int, tuple[float, list[int]]]:
-        """Return the shortest routes to each entry of a track, searched near it first, else in the whole network.
+        """Extend routes to the two entries of the track `stop`, and return the shortest route to each entry.
 
-        A route has its length and its nodes of `graph`: the start node, and the nodes at which tracks are entered.
-        `routes` are the routes so far, by the node that is left.
+        `routes` are the routes so far by their last node, an exit. A route consists of its length [m] and its nodes of
+        `graph`, the start node and the nodes at which tracks are entered. An entry that no route reaches is left out.
         """
         import networkx as nx
 
@@ -326,7 +340,7 @@ class Network(NotebookTable):
         return reached
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
-        """Return the shortest route that passes the given tracks in order; MismatchError where none exists."""
+        """Return the indices of the tracks of the shortest route over given tracks in order; MismatchError if none."""
         route = self.route_over(stops)
         if route is None:
             first = next(stop for k, stop in enumerate(stops, start=1) if self.route_over(stops[:k]) is None)
@@ -336,17 +350,17 @@ class Network(NotebookTable):
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the tracks of the shortest route that passes the given tracks in order; None without a route."""
+        """Return the indices of the tracks of the shortest route over given tracks in order; None if there is none."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         routes = {4 * wanted[0] + end: (0.0, [4 * wanted[0] + end]) for end in (1, 3)}
         for stop in wanted[1:]:
-            # a track entered at one end is left at the other
+            # a track that is entered at one end is left at the opposite end
             routes = {entry ^ 3: route for entry, route in self.extend_routes(routes, stop).items()}
         return [node // 4 for node in min(routes.values())[1]] if routes else None
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:
-    """Return the ends of tracks on the ellipsoid and unit vectors out of them, shapes (tracks, 2, 3)."""
+    """Return the end points of tracks on the ellipsoid, and outward unit vectors there, shape (tracks, 2, 3) each."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     place, before = network._way
     inner = np.clip(np.searchsorted(place, before + _DIRECTION_M), first + 1, last)

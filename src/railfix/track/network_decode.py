@@ -1,11 +1,11 @@
-"""Probability of each track at each position of a log, with a common error of the positions.
+"""Probability of each track at each position of a log, with a common error of all positions.
 
-A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, or an
-unmapped track, and the common error of the positions: a first-order Gauss-Markov process east, north and up, on a
-lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining error of each position has heavy tails
-(Student's t) and persists for `correlation_s`; the likelihood of a position is weighted by the fraction of that time
-that it represents. An unmapped track runs parallel to the nearest track at a constant distance (`SHIFTS_M`), clear of
-all others, or is anywhere else.
+The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). Its state is a track near the
+position, or an unmapped track, together with the common error of the positions. The common error is a first-order
+Gauss-Markov process east, north and up on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining
+error of each position has heavy tails (Student's t) and a correlation time `correlation_s`; the likelihood of a
+position is weighted with the fraction of this time that the position represents. An unmapped track is either parallel
+to the nearest track at a constant distance (`SHIFTS_M`) and clear of all other tracks, or anywhere else.
 """
 
 from __future__ import annotations
@@ -20,91 +20,82 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
 from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Network
 
-#: Negative logarithm of the likelihood of a position on an unmapped track that is parallel to no track, compared with a
-#: position at distance 0.
+#: Negative logarithm of the likelihood of a position on an unmapped track parallel to no track, relative to a position
+#: at distance 0 from a track.
 _UNMAPPED_COST: Final = 5.0
-#: Distances to the right of the nearest track at which an unmapped track can run parallel to it [m].
+#: Distances to the right of the nearest track at which an unmapped track can be parallel to it [m].
 SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
-#: Prior fractions of these distances, in inverse proportion: most parallel tracks are neighbours.
+#: Prior probabilities of `SHIFTS_M`, in inverse proportion to the distance, as most parallel tracks are adjacent.
 _SHARES: Final = 1.0 / np.abs(SHIFTS_M) / (1.0 / np.abs(SHIFTS_M)).sum()
-#: Probability, from a position to the next, that such a track changes to the next nearer or farther of `SHIFTS_M`.
+#: Probability per position that the distance of a parallel unmapped track changes to an adjacent one of `SHIFTS_M`.
 _DRIFTS: Final = 1e-3
-_SHIFT_STEP_M: Final = 2.0
-_FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of positions.
-#: Negative logarithms of the probability, from a position to the next, of passing to another track without connection,
-#: of leaving the map and of entering it, and of leaving to and entering from a parallel unmapped track: a train is on
-#: unmapped track for `UNMAPPED_PRIOR` of the time, a quarter of an hour at a time. A change of track by way of unmapped
-#: track is as improbable as the jump.
+_SHIFT_STEP_M: Final = 2.0  #: Spacing of `SHIFTS_M` on either side [m].
+_FREEDOM: Final = 8.0  #: Degrees of freedom of Student's t for position errors.
+#: Negative logarithms of transition probabilities per position: to a track without connection, from the map to an
+#: unmapped track and back, and from the map to a parallel unmapped track and back. A train is then on unmapped track
+#: for the fraction `UNMAPPED_PRIOR` of the time, in periods of a quarter of an hour. A change of track by way of
+#: unmapped track is as improbable as a change without connection.
 _JUMP_COST: Final = 17.0
 _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
-#: Negative logarithm of the probability of passing an open end, at which the map ends. A position lies beyond an open
-#: end if it is this many standard deviations beyond it, limited to these distances [m].
+#: Negative logarithm of the probability of passing an open end, where the map ends.
 _OPEN_COST: Final = 2.0
+#: Distance beyond an open end at which a position is off the map: in standard deviations, and its limits [m].
 _BEYOND_SIGMAS: Final = 5.0
 _BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
-#: Length by which a connection may exceed the straight distance of two positions, as in a bend [m], and fraction of
-#: that distance.
+#: Excess of the path length over the straight distance of two positions that is allowed, for example in a bend:
+#: constant part [m], and fraction of the distance.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
-#: Difference of path length and distance at which a joint is half as probable as with equal lengths [m].
+#: Difference of path length and distance that halves the probability of a transition over joints [m].
 _PASSING_M: Final = 5.0
-#: Least gain of a change of track, in positions on the right track; less at a joint, which is identified by its
-#: probability: on a short track of a switch there are one or two positions.
+#: Minimum gain of a change of track, in expected positions on the right track. At a joint, where the transition
+#: probability is at least `_AT_JOINT`, it is smaller, because a short track of a switch has only one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
 COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
-#: Balls of the urn of one horizontal axis, and of the vertical one: a quarter of them is the variance in steps.
+#: Number of balls of the urn of a horizontal axis, and of the vertical axis; a quarter of it is the variance in steps.
 _BALLS: Final = 12
 _BALLS_UP: Final = 8
-_BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, if heights are not used.
+_BLOCK: Final = 1024  #: Number of positions whose probabilities are in memory at once, if heights are not used.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Positions with their candidates, n rows with up to m candidates each.
+    """Positions relative to their candidate tracks, n positions with up to m candidates and S `SHIFTS_M`."""
 
-    `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
-    without a candidate; `beyond_m` the distance of the position beyond an end; `above_m` its height above the track,
-    NaN without a height (n, m). `clear` flags the `SHIFTS_M` from the nearest track that are clear of all tracks (n,
-    S), `moved_m` is the distance of that track to the right of the previous position's nearest track, and `turned`
-    flags an opposite direction (n,). `weight` is the fraction of the correlation time that a position covers, `seconds`
-    the time since the previous position; `sigma_m` and `common_m` are per horizontal axis, `common_up_m` is 0 where
-    heights are not used.
-    """
-
-    across: Floats
-    offset_m: Floats
-    beyond_m: Floats
-    above_m: Floats
-    clear: Masks
-    moved_m: Floats
-    turned: Masks
-    sigma_m: Floats
-    sigma_up_m: Floats
-    weight: Floats
-    seconds: Floats
-    common_m: float
-    common_up_m: float
+    across: Floats  #: Unit vector to the right of the track, east and north, shape (n, m, 2).
+    offset_m: Floats  #: Distance to the right of the track, shape (n, m); infinite without a candidate.
+    beyond_m: Floats  #: Distance of the position beyond an end of the track, shape (n, m); 0 if not beyond.
+    above_m: Floats  #: Height of the position above the expected antenna height, shape (n, m); NaN without a height.
+    clear: Masks  #: Whether a track at each of `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
+    moved_m: Floats  #: Distance of the nearest track to the right of the previous position's nearest track, (n,).
+    turned: Masks  #: Whether these two tracks have opposite directions, shape (n,).
+    sigma_m: Floats  #: Standard deviation of a position per horizontal axis, shape (n,).
+    sigma_up_m: Floats  #: Standard deviation of the height, shape (n,).
+    weight: Floats  #: Fraction of the correlation time that a position represents, shape (n,).
+    seconds: Floats  #: Time since the previous position, shape (n,).
+    common_m: float  #: Standard deviation of the common error per horizontal axis.
+    common_up_m: float  #: Standard deviation of the common height error; 0 if heights are not used.
 
 
 class Transitions:
-    """Probability of each transition from the candidates of an epoch to those of the next."""
+    """Transition probabilities between the states of successive positions."""
 
     def __init__(self, network: Network, candidates: Candidates, step_m: Floats, residuals: Residuals) -> None:
         self._network, self._step = network, step_m
         self._track, self._place = candidates.track, candidates.chainage_m
         self._clear, self._moved, self._turned = residuals.clear, residuals.moved_m, residuals.turned
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Path lengths from an end of a track to other tracks' ends, and the search limit.
+        #: Search limit, and path lengths within it from an end of a track to the ends of other tracks [m].
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
-        #: Whether an end of the track is within reach, before and after each passage, shapes (n - 1, m).
+        #: Whether an end of the track is within reach, before and after each transition, shape (n - 1, m).
         self._leaves = to_end[:-1] <= self._reach[:, None]
         self._enters = to_end[1:] <= self._reach[:, None]
         ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
@@ -112,37 +103,40 @@ class Transitions:
         beyond = np.abs(residuals.beyond_m) / np.clip(_BEYOND_SIGMAS * residuals.sigma_m, *_BEYOND_M)[:, None]
         opens = at_end.any(axis=2) & (beyond > 1.0)
         self._same = (self._track[:-1, :, None] == self._track[1:, None, :]) & (self._track[:-1, :, None] >= 0)
-        #: Whether an open end is passed on leaving, or on entering, a track: the next, or previous, position lies
-        #: beyond the end; shapes (n - 1, m).
+        #: Whether the track is left, or entered, over an open end, because the next, or the previous, position is
+        #: beyond that end; shape (n - 1, m).
         self._left = (self._same & opens[1:, None, :]).any(axis=2)
         self._entered = (self._same & opens[:-1, :, None]).any(axis=1)
-        # errors do not change by metres in one step: a position beyond the end next to a position before it is no error
+        # as errors do not change by metres in one step, a single position beyond the end is not explained by an error
         stays = np.where(opens, np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2)), 1.0)
         #: Likelihood of staying on a track if only the previous, or only the next, position is beyond its open end.
         self._stays = np.where(self._left, 1.0, stays[:-1]), np.where(self._entered, 1.0, stays[1:])
 
     @property
     def changes(self) -> Masks:
-        """Whether each passage is to another track, or to or from none, shape (n - 1, m + 1, m + 1)."""
+        """Whether each transition is to another track, or to or from no track, shape (n - 1, m + 1, m + 1)."""
         state = np.column_stack([np.where(self._track < 0, -2, self._track), np.full(len(self._track), -1)])
         return np.asarray(state[:-1, :, None] != state[1:, None, :])
 
     def __call__(self, k: int) -> Floats:
-        """Return probabilities from epoch k to k + 1, shape (m + S + 1, m + S + 1), row by row."""
+        """Return the transition probabilities from position k (row) to k + 1 (column), shape (m + S + 1, m + S + 1).
+
+        The states are the m candidates, the S parallel unmapped tracks, and any other unmapped track.
+        """
         m, free, same = self._track.shape[1], self._clear[k + 1] * _SHARES, self._same[k]
         share = np.full((m + len(SHIFTS_M) + 1, m + len(SHIFTS_M) + 1), np.exp(-_LEAVE_COST))
         left, entered = self._left[k], self._entered[k]
         share[:m, -1] = np.where(left, np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
         share[-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
-        # A train that has passed an open end, or approaches it from beyond, is on unmapped track. As it begins there
-        # with `UNMAPPED_PRIOR`, leaving has this factor, too, so that a run and its return are equally probable.
+        # A train beyond an open end is on unmapped track. Since a log begins on unmapped track with `UNMAPPED_PRIOR`,
+        # leaving a track has this factor, too, so that a run and its return are equally probable.
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
         share[:m, m:-1][left] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
         share[m:-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
-        # of one unmapped track: a part that is parallel to a track, and a part that is parallel to none
+        # an unmapped track can be parallel to a track on one part, and to no track on another part
         share[-1, m:-1], share[m:-1, -1] = UNMAPPED_PRIOR * free, UNMAPPED_PRIOR * np.exp(-_ENTER_COST)
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
             way = self._way(k, i, j)
@@ -153,7 +147,10 @@ class Transitions:
         return share
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Return the path length between two positions over ends of tracks [m], infinite beyond the limit."""
+        """Return the path length from candidate i of position k to candidate j of k + 1 over ends of tracks [m].
+
+        It is infinite beyond the search limit.
+        """
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
         for end, rest in enumerate((float(self._place[k, i]), float(self._rest[k, i]))):
@@ -176,18 +173,21 @@ class Transitions:
 
 
 def _shifted(moved_m: float, turned: bool) -> Floats:
-    """Return passages between `SHIFTS_M`, from row to column, if their reference track moves or turns."""
+    """Return relative transition probabilities between `SHIFTS_M`, from row to column, shape (S, S).
+
+    The reference track of the columns is `moved_m` to the right of that of the rows, and opposite if `turned`.
+    """
     place = (SHIFTS_M - moved_m) * (-1.0 if turned else 1.0)
     apart = np.abs(place[:, None] - SHIFTS_M)
     nearest = apart == apart.min(axis=1, keepdims=True)
     drifted = _DRIFTS * (apart <= apart.min(axis=1, keepdims=True) + _SHIFT_STEP_M)
-    known = apart.min(axis=1, keepdims=True) <= _SHIFT_STEP_M  # else it is the track itself, or too far from it
+    known = apart.min(axis=1, keepdims=True) <= _SHIFT_STEP_M  # otherwise on the reference track, or too far from it
     return np.asarray(np.where(nearest, 1.0, drifted) * known)
 
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return an urn's equilibrium probabilities and transition matrix after a time, from row to column."""
+    """Return the equilibrium probabilities of an urn, and its transition matrix over a time, from row to column."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -203,7 +203,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """Lattice of the common error: C positions in plan by U heights, and its `first` probabilities (C, U)."""
+    """Lattice of the common error, C values in plan by U heights, with initial probabilities `first`, shape (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -214,15 +214,15 @@ class _CommonError:
         self.first = np.outer(np.outer(plan, plan), _urn(self._balls_up, 0.0)[0])
 
     def later(self, share: Floats, seconds: float) -> Floats:
-        """Return probabilities after a time, shape (..., C, U)."""
+        """Return the probabilities of lattice points after a time, shape (..., C, U)."""
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """Return the expectation, a time before, of values of shape (..., C, U)."""
+        """Return the expectation of later values, given the lattice point a time before, shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
-        """Return values multiplied by each axis's matrix: a single matrix for all axes would wait for threads."""
+        """Return values multiplied by the matrix of each axis; with one matrix for all axes, threads would wait."""
         axis, heights = len(plan), len(up)
         east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
         north = np.matmul(plan, east.reshape(-1, axis, axis, heights))
@@ -230,30 +230,30 @@ class _CommonError:
 
 
 def _places(balls: int, sigma_m: float) -> Floats:
-    """Return the states of an urn in metres."""
+    """Return the values of the common error for the states of an urn, shape (balls + 1,) [m]."""
     return np.asarray((np.arange(balls + 1) - balls / 2.0) * (2.0 * sigma_m / np.sqrt(max(balls, 1))))
 
 
 def _student(square: Floats) -> Floats:
-    """Return the negative logarithm of the likelihood of squares of normalized errors, 0 for none."""
+    """Return the negative log likelihood (Student's t) of squared normalised errors, relative to an error of 0."""
     return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p(square / _FREEDOM))
 
 
 def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
-    """Return the likelihood of a position given each state, shape (m + S + 1, C, U), up to a factor."""
+    """Return the likelihood of position k given each state, up to a factor, shape (m + S + 1, C, U)."""
     m, offset = residuals.offset_m.shape[1], residuals.offset_m[k]
     known = np.flatnonzero(np.isfinite(offset))
     across, beyond = residuals.across[k, known], residuals.beyond_m[k, known, None]
     off_track = offset[known, None] - across @ lattice.plan_m.T
     square = off_track**2
     if beyond.any():
-        # the common error may be along the track, too: the remaining distance beyond the end is used
+        # the common error can be along the track, too, so that only the remaining distance beyond the end is an error
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
     cost = np.full((m + len(SHIFTS_M) + 1, *lattice.first.shape), np.inf)
     cost[-1] = _UNMAPPED_COST
     cost[known] = _student(square / residuals.sigma_m[k] ** 2)[..., None]
-    # an unmapped track crosses others, but does not coincide with them for long
+    # an unmapped track can cross mapped tracks, but does not coincide with them
     cost[m:-1] = np.where(residuals.clear[k], 0.0, _UNMAPPED_COST)[:, None, None]
     if len(known):
         cost[m:-1] += _student(((off_track[:1] - SHIFTS_M[:, None]) / residuals.sigma_m[k]) ** 2)[..., None]
@@ -266,7 +266,14 @@ def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
 
 
 def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
-    """Return the most probable track of each position (n,), m for none, and the probability of each (n, m + 1)."""
+    """Return the most probable sequence of tracks, and the probability of each candidate.
+
+    Returns
+    -------
+    tuple
+        Column of the candidate of each position in the sequence with the most expected pairs of right tracks, m for no
+        track, shape (n,); probability of each candidate given the whole log, and of no track, shape (n, m + 1).
+    """
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
     length = _BLOCK // len(lattice.up_m)
@@ -277,7 +284,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     probability, gains, changes = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1)), moves.changes
     after = expected = np.ones((states, *lattice.first.shape))
     move = np.eye(states)
-    none = np.arange(m + 1)  # all states without a mapped track are one
+    none = np.arange(m + 1)  # all unmapped states are added up
     for start in reversed(firsts):
         block = [at for _, at in _forward(residuals, moves, lattice, start, firsts[start], min(start + length, n))]
         for k in reversed(range(start, start + len(block))):
@@ -300,21 +307,20 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
 
 @dataclass(frozen=True)
 class _At:
-    """Forward step at one position.
+    """Result of the forward recursion at one position."""
 
-    It has the probabilities of all states given the positions so far and the likelihood of the position, shapes
-    (m + S + 1, C, U), and the passages to the position, shape (m + S + 1, m + S + 1).
-    """
-
-    share: Floats
-    likelihood: Floats
-    move: Floats
+    share: Floats  #: Probabilities of the states given the positions up to this one, shape (m + S + 1, C, U).
+    likelihood: Floats  #: Likelihood of the position given each state, shape (m + S + 1, C, U).
+    move: Floats  #: Transition probabilities to the position, shape (m + S + 1, m + S + 1).
 
 
 def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
-    """Yield the forward states from one position, with given probabilities, to before another."""
+    """Yield the forward recursion from position `start`, with the probabilities `first`, to the one before `stop`.
+
+    With `first` None the recursion begins with the prior.
+    """
     m = residuals.offset_m.shape[1]
     states = m + len(SHIFTS_M) + 1
     share, move = first, np.eye(states)
@@ -335,7 +341,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """Return the sequence of largest gain: expected number of right neighbouring pairs, less the cost of changes."""
+    """Return the sequence with the largest expected number of right successive pairs less the cost of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

@@ -1,4 +1,4 @@
-"""Positions of a run on a network of tracks: the track of each position, and its probability."""
+"""Matching of the positions of a run to the tracks of a network, with the probability of each track."""
 
 from __future__ import annotations
 
@@ -21,57 +21,58 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, Ca
 from railfix.track.network_decode import SHIFTS_M, Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
-#: Standard deviation of the distance of a position from its track where its log states none and none can be estimated,
-#: and its least estimate [m].
+#: Standard deviation of the distance of positions from their track, if it is neither stated nor can be estimated [m].
 SIGMA_M: Final = 4.0
-_LEAST_SIGMA_M: Final = 1.0
-_ALONE_M: Final = 15.0  #: Distance of the next track from a position by which sigmas are estimated [m].
-#: Positions farther from the track than this, and than this multiple of their noise, are off it for another reason [m].
+_LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimate of this standard deviation [m].
+_ALONE_M: Final = 15.0  #: Least additional distance of the second track for a position to be used in the estimate [m].
+#: Median distance of positions from their track, in metres and as a multiple of their noise, beyond which the positions
+#: are not on that track.
 _LARGEST_LEVEL_M: Final = 5.0
 _BESIDE: Final = 3.0
-_ENOUGH: Final = 30  #: Number of positions that an estimate requires.
-_COMMON_M: Final = 2.0  #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map.
-#: Fraction of the stated standard deviation that is assumed for the common error, if this is smaller.
+_ENOUGH: Final = 30  #: Minimum number of positions for the estimate.
+_COMMON_M: Final = 2.0  #: Largest standard deviation of the common error of positions: satellites, atmosphere, map [m].
+#: Ratio of the standard deviation of the common error to the stated standard deviation, up to `_COMMON_M`.
 _COMMON_SHARE: Final = 0.7
-_BEST: Final = 0.1  #: Quantile of the stated standard deviations that is used for the common error.
-#: Least search distance for tracks [m], and larger search distances in standard deviations and metres.
+_BEST: Final = 0.1  #: Quantile of the stated standard deviations from which the common error is computed.
+#: Minimum search distance for tracks [m], search distance in standard deviations, and its maximum [m].
 _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
 _FARTHEST_M: Final = 100.0
-#: Positions farther from all tracks than this multiple of the search distance, for less than a time [s], are wrong.
+#: Distance from all tracks, as a multiple of the search distance, beyond which positions are wrong if the train is back
+#: near a track within this time [s].
 _FAR: Final = 6.0
 _WRONG_S: Final = 60.0
-#: Number of tracks near such positions that are examined, and the placeholder for no track.
-_MOST_FAR: Final = 8
+_MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position far from all tracks.
+#: Values of `Candidates` without a track.
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
-#: Placeholder of a position that was not matched.
+#: Values of `Matched` for a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
-_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
-_ROUNDED_M: Final = 0.1  #: Resolution of the distances of tracks [m].
-_STEP_S: Final = 0.4  #: Time step of positions without a time, or with a time before the last [s].
-_MOST_TRACKS: Final = 16  #: Tracks near a position that are examined.
-_APART_UP_M: Final = 1.0  #: Least height difference of two tracks near each other for which heights are used [m].
+_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
+_ROUNDED_M: Final = 0.1  #: Tolerance of the distance between tracks [m].
+_STEP_S: Final = 0.4  #: Time step assumed where times are missing or decrease [s].
+_MOST_TRACKS: Final = 16  #: Largest number of candidate tracks for a position.
+_APART_UP_M: Final = 1.0  #: Least height difference of candidate tracks for which heights are used [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog(RowArrays):
-    """Positions in plan, n rows, NaT or NaN where unknown; `sigma_m` is per axis; heights may be None or NaN.
-
-    Heights are at an antenna `antenna_up_m` above the rails, None if unknown [m].
-    """
+    """Positions of a log in plan, n rows; shapes (n,), NaN or NaT where unknown."""
 
     path: str
     time: Datetimes
     latitude_deg: Floats
     longitude_deg: Floats
-    sigma_m: Floats
-    height_m: Floats | None = None
-    sigma_up_m: Floats | None = None
-    antenna_up_m: float | None = None
+    sigma_m: Floats  #: Standard deviation per horizontal axis.
+    height_m: Floats | None = None  #: Height of the antenna; None if the log has no heights.
+    sigma_up_m: Floats | None = None  #: Standard deviation of the height.
+    antenna_up_m: float | None = None  #: Height of the antenna above the rails; None if unknown.
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return positions moved from the satellites' frame to the network's; MismatchError if impossible."""
+        """Return the positions transformed from the frame of the satellites to that of the network, and the shift.
+
+        Raise MismatchError if the log is far from the network, or has no times although the shift depends on time.
+        """
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -90,7 +91,7 @@ class PlanLog(RowArrays):
 
 
 def _check_region(network: Network, log: PlanLog) -> None:
-    """Raise MismatchError where every position is farther than `ANOTHER_PLACE_M` from the network."""
+    """Raise MismatchError if all positions are farther than `ANOTHER_PLACE_M` from the network."""
     known = np.isfinite(log.latitude_deg) & np.isfinite(log.longitude_deg)
     if not known.any():
         return
@@ -110,22 +111,20 @@ def _check_region(network: Network, log: PlanLog) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
-    the right; `probability` is conditional on the whole log, NaN without a position or with a wrong one;
-    `probabilities`, shape (n, m), are per candidate, and their complement to 1 is for unmapped track; `notes` state
-    assumptions on the log.
-    """
+    """Positions of a log matched to the tracks of a network, n rows; shapes (n,) unless stated."""
 
-    track: Indices
-    chainage_m: Floats
-    offset_m: Floats
+    track: Indices  #: Track in the most probable sequence of tracks; -1 if on no track of the network.
+    chainage_m: Floats  #: Chainage on the track.
+    offset_m: Floats  #: Distance from the track in plan, positive to the right.
+    #: Probability of `track` given the whole log; NaN without a position, or for a position rejected as wrong.
     probability: Floats
-    candidates: Candidates
+    candidates: Candidates  #: Tracks near each position.
+    #: Probability of each candidate, shape (n, m); the complement of the sum is the probability of an unmapped track.
     probabilities: Floats
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: Assumptions made on the log.
 
     def take(self, rows: Indices) -> Matched:
-        """Return some of the positions."""
+        """Return the matched positions of selected rows."""
         return replace(take_rows(self, rows), candidates=self.candidates.take(rows))
 
 
@@ -136,12 +135,12 @@ def read_plan_positions(
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> PlanLog:
-    """Read positions in plan from any log of positions (`railfix.io.read_positions`), with its heights and sigmas."""
+    """Read positions in plan, heights and sigmas from a position log (`railfix.io.read_positions`)."""
     return plan_log(read_positions(path, broken_lines=broken_lines, date=date, columns=columns, heights="optional"))
 
 
 def plan_log(log: PositionLog, *, antenna_up_m: float | None = None) -> PlanLog:
-    """Return the positions of a log in plan, with its heights and standard deviations north, east and up."""
+    """Convert a position log to `PlanLog`; the sigma in plan is the root mean square of both horizontal axes."""
     latitude, longitude, height = log.geodetic
     return PlanLog(
         path=log.path,
@@ -164,9 +163,24 @@ def match(
     within_m: float | None = None,
     correlation_s: float = 20.0,
 ) -> Matched:
-    """Match positions of a run, in the order of travel and in the frame of the network, to its tracks no farther than
-    `within_m`; `sigma_m` is the standard deviation of the distance from the track, `correlation_s` the correlation time
-    of errors.
+    """Match positions of a run to the tracks of a network.
+
+    Parameters
+    ----------
+    network : Network
+    log : PlanLog
+        Positions in the order of travel, in the frame of the network.
+    sigma_m : float, optional [m]
+        Standard deviation of the distance of positions from their track; by default as stated in the log, or estimated.
+    within_m : float, optional [m]
+        Largest distance of a position from its track; by default five sigmas, but 30 to 100 m.
+    correlation_s : float [s]
+        Correlation time of the position errors.
+
+    Raises
+    ------
+    NoPositionError
+        The log has no position.
     """
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
@@ -200,7 +214,7 @@ def match(
 
 
 def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None) -> tuple[Floats, tuple[str, ...]]:
-    """Return standard deviations of the distances of positions from their track, and a note if they are assumed."""
+    """Return standard deviations of the positions' distances from their track [m], and a note if they are assumed."""
     if sigma_m is not None:
         return np.full(len(given), sigma_m), ()
     stated = np.isfinite(log.sigma_m[given])
@@ -213,9 +227,10 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 
 
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
-    """Return the standard deviation of distances from their median where only one track is near, and its basis.
+    """Estimate the standard deviation of the distances from a track [m], and return it with a clause on its basis.
 
-    With parallel tracks, errors of the positions cannot be distinguished from another track.
+    It is computed from the median distance of positions near a single track, because with parallel tracks an error
+    cannot be distinguished from a position on another track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
     near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)
@@ -231,7 +246,7 @@ def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[floa
 
 
 def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
-    """Return a note on decreasing times."""
+    """Return a note if times decrease."""
     back = np.flatnonzero(np.diff(log.time[given]) < np.timedelta64(0))
     if not len(back):
         return ()
@@ -240,7 +255,7 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Find tracks near each position, and farther tracks if it is far from all."""
+    """Find the tracks within a distance of each position, and within a larger distance of positions far from tracks."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -252,8 +267,9 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 
 
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
-    """Return whether a position far from all tracks is wrong: the last position near a track before it, and the first
-    one after it, are at most `_WRONG_S` apart.
+    """Return a mask of the positions far from all tracks that are wrong, shape (n,).
+
+    These are positions between two positions near a track that are at most `_WRONG_S` apart.
     """
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):
@@ -265,7 +281,7 @@ def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
 
 
 def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
-    """Return the ratio of actual to stated errors, at least 1, from changes of the distance over `correlation_s`."""
+    """Estimate the ratio of actual to stated sigmas, at least 1, from changes of the distance over `correlation_s`."""
     seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
     rows = np.arange(len(seconds))
     later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)
@@ -277,7 +293,7 @@ def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
 
 
 def _median_scale(ratio: Floats) -> float:
-    """Return the ratio of values to the standard normal distribution by their median, at least 1."""
+    """Return the scale of values relative to a standard normal distribution, at least 1, from their absolute median."""
     ratio = np.abs(ratio[np.isfinite(ratio)])
     return max(1.0, float(np.median(ratio)) / _NORMAL_MEDIAN) if len(ratio) else 1.0
 
@@ -291,7 +307,7 @@ def _residuals(
     sigma_m: Floats,
     correlation_s: float,
 ) -> Residuals:
-    """Return the positions of some rows of a log with their candidates."""
+    """Compute the residuals of the positions in the rows `given` relative to their candidate tracks."""
     known = candidates.track >= 0
     row = np.nonzero(known)[0]
     track, chainage = candidates.track[known], candidates.chainage_m[known]
@@ -313,7 +329,7 @@ def _residuals(
     spread = np.nanmax(above, axis=1, initial=-np.inf) - np.nanmin(above, axis=1, initial=np.inf)
     counts = not np.isnan(network.height_m).any() and bool((spread > _APART_UP_M).any())
     seconds = np.concatenate([[0.0], np.diff(log.time[given]) / np.timedelta64(1, "s")])
-    # where the time is missing or decreases, rows are in the order of travel, `_STEP_S` apart
+    # where the time is missing or decreases, rows are assumed to be `_STEP_S` apart
     seconds = np.round(np.where(seconds >= 0.0, seconds, _STEP_S), 1).astype(np.float64)
     weight = np.clip(seconds / correlation_s, 1e-3, 1.0)
     weight[0] = 1.0
@@ -341,11 +357,11 @@ def _residuals(
 
 
 def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) -> dict[str, Any]:
-    """Return the possible positions of unmapped tracks: `clear`, `moved_m` and `turned` of `Residuals`."""
+    """Compute the fields `clear`, `moved_m` and `turned` of `Residuals`, for unmapped tracks parallel to a track."""
     cosine = np.einsum("nmi,ni->nm", across, across[:, 0])
     offset = np.where(np.isfinite(offset_m), offset_m, 0.0)
-    right_m = offset[:, :1] - offset * cosine  # of the nearest track
-    there = np.isfinite(offset_m) & (np.abs(beyond_m) <= CLEARANCE_M)  # not beyond its end
+    right_m = offset[:, :1] - offset * cosine  # distance of each candidate to the right of the nearest track
+    there = np.isfinite(offset_m) & (np.abs(beyond_m) <= CLEARANCE_M)  # the position is not beyond the track's end
     apart = np.where(there, np.abs(SHIFTS_M[:, None, None] - right_m), np.inf).min(axis=2)
     clear = (apart.T > CLEARANCE_M - _ROUNDED_M) & there[:, :1]
     before = np.concatenate([track[:1, :1], track[:-1, :1]])  # the nearest track of the previous position
@@ -357,7 +373,7 @@ def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) 
 
 
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
-    """Return the matched positions at their rows of a log, the other rows without a match."""
+    """Expand matched positions to all rows of a log; rows that are not in `rows` have no match."""
 
     def over(values: Any, empty: float) -> Any:
         full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)

@@ -1,4 +1,4 @@
-"""Networks of tracks read from map files and connected, and their quality: gaps, dead ends, kinks."""
+"""Reading and connecting networks of tracks from map files, and checks for gaps, dead ends and kinks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from railfix.track.route import MapReading, Segment, check_order, first_gap, ori
 from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
-TOLERANCE_M: Final = 0.5  #: Ends nearer than this are one point if the file states no connection [m].
+TOLERANCE_M: Final = 0.5  #: Largest distance of two connected ends if the file states no connections [m].
 #: Largest change of direction between two tracks that a train passes [rad]; the legs of a switch differ by about pi.
 _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
@@ -31,14 +31,18 @@ _LARGEST_TURN_RAD: Final = np.radians(60.0)
 def read_network(
     paths: Sequence[FilePath], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> Network:
-    """Read a network from map files, connected as stated there, else where ends, or an end and a track, meet."""
+    """Read a network of tracks from map files.
+
+    Tracks are connected as the files state. Without such statements they are connected where ends, or an end and
+    another track, are within `tolerance_m`. Raise InputFileError or SettingsError as `railfix.track.read_track`.
+    """
     tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]
     check_order(tracks)
     return connect_network(tracks, paths, tolerance_m=tolerance_m)
 
 
 def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
-    """Connect tracks to a network: as stated by their files, otherwise by their ends; see `read_network`."""
+    """Connect tracks to a network, as stated by their files or by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
@@ -55,7 +59,7 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
 
 
 def _of_nodes(tracks: list[Segment]) -> Network:
-    """Connect ways of OpenStreetMap at their shared nodes, including inner nodes, and nowhere else."""
+    """Connect OpenStreetMap ways at the nodes that they share; ways are divided at shared inner nodes."""
     used = Counter(node for track in tracks for node in track.nodes)
     inner = [[i for i, node in enumerate(t.nodes[1:-1], start=1) if used[node] > 1] for t in tracks]
     whole = Network(tracks=tuple(tracks), links=())
@@ -80,7 +84,7 @@ def _of_nodes(tracks: list[Segment]) -> Network:
 
 
 def _relations(path: FilePath) -> list[Relation]:
-    """Return the connections stated by a file, empty if there are none."""
+    """Return the connections stated by a file; an empty list if it states none."""
     kind = find_kind(path)
     if kind == "xml":
         return read_railml_relations(path)
@@ -116,12 +120,15 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
     links = tuple(Link(**{**vars(r), "first": number[r.first], "second": number[r.second]}) for r in known)
     note = f"connections as {len(known)} net relations of the file state them"
     if len(known) < len(relations):
-        note += f"; {len(relations) - len(known)} relations name a track that it does not have"
+        note += f"; {len(relations) - len(known)} relations name a track that is not in the file"
     return Network(tracks=tuple(tracks), links=links, notes=(note,))
 
 
 def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
-    """Return connections of ends within a tolerance, navigable where the direction changes by less than 60 deg."""
+    """Return the connections of ends within `tolerance_m` of each other.
+
+    They are navigable if the direction changes by less than 60 deg. Ends on different levels are not connected.
+    """
     ends, outward = end_points(network)
     pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
     level = np.array([track.metadata.get("level", "") for track in network.tracks])
@@ -139,7 +146,7 @@ def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tupl
 
 
 def is_route(segments: Sequence[Segment]) -> bool:
-    """Return whether segments in their order form one route: ends meet, and no train has to turn back."""
+    """Return whether segments in their order form one route, with ends that meet and without reversals."""
     if first_gap(segments) is not None:
         return False
     _, outward = end_points(Network(tracks=tuple(orient(segments)), links=()))
@@ -147,7 +154,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
 
 
 def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]]:
-    """Return the inner chainages of tracks at which another track ends, in order [m], by track number."""
+    """Return by track index the ascending inner chainages at which another track ends within `tolerance_m` [m]."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -165,7 +172,7 @@ def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]
 
 
 def _divide(whole: Network, places: Mapping[int, Sequence[float]]) -> tuple[Network, list[int]]:
-    """Return the network with tracks divided at inner chainages [m], and the undivided track's number of each part."""
+    """Return the network with tracks divided at inner chainages [m], and the original track's index for each part."""
     parts: list[tuple[Segment, int]] = []
     for k, track in enumerate(whole.tracks):
         way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
@@ -195,20 +202,20 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
     )
 
 
-_GAP_M: Final = 5.0  #: Ends nearer than this without a connection are a gap [m].
-_JOINT_M: Final = 0.5  #: Connected ends farther apart than this do not meet [m].
-#: Largest change of direction over a navigable connection [deg]; a switch of 1:4.5 turns 12.5 deg over its length.
+_GAP_M: Final = 5.0  #: Distance of two unconnected ends below which they are a gap in one track [m].
+_JOINT_M: Final = 0.5  #: Largest distance of two connected ends that is not reported [m].
+#: Largest change of direction over a navigable connection [deg]; a 1:4.5 switch turns by 12.5 deg over its length.
 _KINK_DEG: Final = 15.0
-#: Least spacing of parallel tracks [m]: a smaller spacing leaves no clearance between vehicles.
+#: Smallest spacing of parallel tracks [m], which leaves clearance between vehicles.
 _LEAST_SPACING_M: Final = 2.5
-#: Tracks may be nearer than this within this distance of their ends, where they join in a switch [m].
+#: Distance from the end of a track within which its spacing is not checked, because tracks join in a switch [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Least length of tracks too near to each other that is reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Minimum length over which too small a spacing is reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkFinding:
-    """A fault of a network: kind, tracks, location and a sentence."""
+    """Fault of a network: kind, names of the tracks, location, and description."""
 
     kind: str
     tracks: tuple[str, ...]
@@ -219,14 +226,14 @@ class NetworkFinding:
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkQuality:
-    """Counts and faults: `switches` lead to several tracks, `ends` to none, `parts` are not joined."""
+    """Size and faults of a network."""
 
-    tracks: int
-    switches: int
-    ends: int
-    parts: int
-    length_m: float
-    findings: tuple[NetworkFinding, ...]
+    tracks: int  #: Number of tracks.
+    switches: int  #: Number of track ends from which a train can pass to several tracks.
+    ends: int  #: Number of track ends without a navigable connection.
+    parts: int  #: Number of parts of the network that are not connected with each other.
+    length_m: float  #: Total length of the tracks.
+    findings: tuple[NetworkFinding, ...]  #: Faults, those of the kinds `FAULTS` first.
 
 
 #: Kinds of findings that are errors of the network; they are listed first.
@@ -252,7 +259,7 @@ def check_network(network: Network) -> NetworkQuality:
 
 
 def _finding(network: Network, kind: str, tracks: Sequence[int], point: int, sentence: str) -> NetworkFinding:
-    """Return a fault at a point of the first of some tracks, whose names replace {0} and {1} in the sentence."""
+    """Create a finding at a point of the first track; {0} and {1} in the sentence are replaced by track names."""
     names, segment = tuple(network.names[track] for track in tracks), network.tracks[tracks[0]]
     return NetworkFinding(
         kind=kind,
@@ -264,13 +271,13 @@ def _finding(network: Network, kind: str, tracks: Sequence[int], point: int, sen
 
 
 def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFinding]:
-    """Yield gaps between two ends without a connection, and all other ends without a connection as dead ends."""
+    """Yield gaps between two unconnected ends, and the remaining unconnected ends as dead ends."""
     if not loose:
         return
     ends, outward = end_points(network)
     points = np.array([ends[t, e] for t, e in loose])
     facing = np.array([outward[t, e] for t, e in loose])
-    # two adjacent track ends point in the same direction
+    # the outward directions of the two ends at a gap are opposite
     near = [(a, b) for a, b in cKDTree(points).query_pairs(_GAP_M) if facing[a] @ facing[b] < 0.0]
     for a, b in sorted(near):
         (t, e), (u, _) = loose[a], loose[b]
@@ -285,7 +292,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
 
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
-    """Yield connections whose ends do not meet, and navigable connections with a kink."""
+    """Yield connections of ends that are apart, and navigable connections with a kink."""
     ends, outward = end_points(network)
     for link in network.links:
         first, second, tracks = (link.first, link.first_end), (link.second, link.second_end), (link.first, link.second)
@@ -300,7 +307,7 @@ def _joints(network: Network) -> Iterator[NetworkFinding]:
 
 
 def _too_near(network: Network) -> Iterator[NetworkFinding]:
-    """Yield the pairs of tracks nearer than vehicles' clearance away from their ends."""
+    """Yield pairs of tracks that are nearer than `_LEAST_SPACING_M`, away from their ends."""
     latitude = np.concatenate([t.latitude_deg for t in network.tracks])
     longitude = np.concatenate([t.longitude_deg for t in network.tracks])
     track = np.repeat(np.arange(len(network.tracks)), np.diff(network.first_point))
@@ -319,6 +326,6 @@ def _too_near(network: Network) -> Iterator[NetworkFinding]:
         if a < b and places.max() - places.min() >= _LEAST_WAY_M:
             sentence = (
                 f"{{0}} and {{1}} are {min(d for _, d in points):.2f} m apart over "
-                f"{places.max() - places.min():.0f} m away from their ends; the same track twice, or a crossing?"
+                f"{places.max() - places.min():.0f} m away from their ends; check whether a track is in the map twice"
             )
             yield _finding(network, "too near", (a, b), points[0][0] - int(network.first_point[a]), sentence)

@@ -1,4 +1,4 @@
-"""Route of a run through a network of tracks, and filling of gaps in its log by the shortest route."""
+"""Route of a run through a network of tracks, and filling of gaps in its log along the shortest route."""
 
 from __future__ import annotations
 
@@ -17,27 +17,30 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 
-#: Rows to be filled: rows without a position between known positions, or also rows with positions off the map.
+#: Rows to be filled: only rows without a position ("gaps"), or also rows with positions off the map ("off-map").
 Rows = Literal["gaps", "off-map"]
-#: Largest distance of a track from a drifting position, and largest difference of a route from the distance travelled
-#: [m]; number of steps whose median is the speed.
+#: Largest distance of a track from a drifting position, and largest difference between the length of a route and the
+#: distance travelled [m].
 _DRIFT_M = 500.0
-_STEPS = 15
+_STEPS = 15  #: Number of steps of which the median is taken, because positions jump.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Positions of all rows, shapes (n,); `track` is -1 without a position or route; `bound_m` is the largest
-    distance of a train on this route from a filled position [m], infinite before and after known positions.
-    """
+    """Positions of all rows of a log on a network, shapes (n,)."""
 
-    track: Indices
-    chainage_m: Floats
+    track: Indices  #: Index of the track; -1 without a position or a route.
+    chainage_m: Floats  #: Chainage on the track.
+    #: Largest distance between the train and a filled position if the train is on the route; infinite outside known
+    #: positions, and NaN where the position is not filled.
     bound_m: Floats
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
-    """Fill rows without usable position along the shortest route at even speed; "off-map" includes rows off the map."""
+    """Fill rows without a usable position along the shortest route between known positions.
+
+    The speed on the route is constant, or that of the positions if they are off the map; see `Rows`.
+    """
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
     )
@@ -66,7 +69,7 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
 def _fill_before(
     network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
 ) -> None:
-    """Fill rows outward from a known position, as far as they have positions."""
+    """Fill rows before the first or after the last known position, as far as the log has positions off the map."""
     rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
     if len(rows) < 2:
         return
@@ -83,7 +86,7 @@ def _fill_before(
 
 
 def _excess_m(legs: tuple[Indices, Floats, Floats], way_m: Floats) -> float:
-    """Return the difference of a route's length from the distance travelled."""
+    """Return the absolute difference between the length of a route and the distance travelled [m]."""
     return abs(float(np.abs(legs[2] - legs[1]).sum()) - float(way_m[-1] - way_m[0]))
 
 
@@ -92,7 +95,10 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 
 
 def _distance_m(log: PlanLog) -> Floats:
-    """Return the distance by steps, each a median over `_STEPS`, as positions jump; NaN without a position."""
+    """Return the distance travelled, shape (n,) [m]; NaN without a position.
+
+    It is the sum of the steps between positions, each replaced by the median over `_STEPS` because positions jump.
+    """
     from scipy.ndimage import median_filter
 
     ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(log.time)))
@@ -105,7 +111,10 @@ def _distance_m(log: PlanLog) -> Floats:
 def _put_on(
     filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
 ) -> None:
-    """Place rows on a route in proportion to `at`, whose first and, with known ends, last rows are its ends."""
+    """Place rows on a route in proportion to `at`, of which the first value is at the start of the route.
+
+    The last value of `at` is at the end of the route. With `ends_known` the position at the end is known, too.
+    """
     numbers, enter, leave = legs
     share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
     share = share[1 : len(rows) + 1]
@@ -120,7 +129,10 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Return tracks of the shortest route between two positions, and chainages where each is entered and left."""
+    """Return the tracks of the shortest route between two positions, and the chainages at entry and exit; None if none.
+
+    The positions are given by track index and chainage [m].
+    """
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])
     length = network.length_m
@@ -139,9 +151,10 @@ def _fill_legs(
 
 
 def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:
-    """Return the tracks passed by a run in order of travel, each once, and passed tracks that no route joins to them.
+    """Return the indices of the tracks passed by a run in order of travel, and of tracks that cannot be joined to them.
 
-    MismatchError: no position lies on a track; the message names the log and the location of its positions.
+    Each track is in the route once. Raise MismatchError if no position lies on a track; the message names the log and
+    the location of its positions.
     """
     seen = matched.track[matched.track >= 0]
     if not len(seen):
@@ -153,23 +166,23 @@ def find_route(network: Network, matched: Matched, path: str = "the log") -> tup
         # the train turned back, the map has a gap, or positions are on a track that was not passed
         routes = [_choose_route(network, order, share) for order in (passed, passed[::-1])]
     once = [part for route in routes if route is not None for part in _once(network, route)]
-    # `fsum` is independent of the order: the return over the same tracks has the same length
+    # `fsum` does not depend on the order, so that the return over the same tracks has an equal sum
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
 
 
 def left_out_note(network: Network, left_out: Sequence[int]) -> str:
-    """Return the note on tracks that no route joins to the tracks of a run, see `find_route`."""
+    """Return the note on the tracks that cannot be joined to the route of a run; see `find_route`."""
     beside = ", ".join(network.names[k] for k in left_out)
     return f"no route joins these tracks to {beside}: the train turned back there, or the map has a gap"
 
 
 def _beside(network: Network, matched: Matched) -> str:
-    """Return the end of a sentence on the positions' distance from tracks that they are near but not on."""
+    """Return a clause on the distance of positions from the tracks, for the message that they are on no track."""
     track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
     near = track >= 0
     if not near.any():
-        return "; is it the map of this region, and its CRS right?"
+        return "; check whether the map is of this region, and its CRS is right"
     most = int(np.bincount(track[near]).argmax())
     away = float(np.median(offset[track == most]))
     side = "right" if away > 0.0 else "left"
@@ -177,7 +190,7 @@ def _beside(network: Network, matched: Matched) -> str:
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:
-    """Return the longest parts of a route that visit no joint twice, except at their end."""
+    """Return the longest parts of a route that pass no joint twice, except at their end."""
     joints = _joints(network, route)
     parts: list[list[int]] = []
     last = 0
@@ -206,7 +219,10 @@ def _joints(network: Network, route: list[int]) -> list[int]:
 
 
 def _choose_route(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
-    """Choose a route over the most probable tracks, in the order of first passage; its parts are routes."""
+    """Return a route over the most probable tracks in the order of first passage.
+
+    In descending order of probability, a track is left out if no route joins it to the tracks kept before.
+    """
     rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
 
     def is_none(count: int) -> int:

@@ -1,4 +1,4 @@
-"""Track maps as CSV with named columns, and as GeoJSON (RFC 7946): LineString, MultiLineString, or their features."""
+"""Readers of track maps in CSV with named columns, and in GeoJSON (RFC 7946), and writer of CSV track maps."""
 
 from __future__ import annotations
 
@@ -32,17 +32,20 @@ from railfix.track.vector_file import (
     with_left_out,
 )
 
-#: RFC 7946, section 4: longitude and latitude on WGS 84 if the file names no CRS.
+#: CRS of a GeoJSON file that does not name it: longitude and latitude on WGS 84 (RFC 7946, section 4).
 RFC_CRS: Final = "OGC:CRS84"
-#: Property of features that are connections of tracks, not tracks (`railfix.track.network_read`).
+#: Property that identifies a connection of two tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
-#: All properties of a line's feature, and its id.
+#: Key under which all properties and the id of a line's feature are kept.
 _FEATURE: Final = "@feature"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
 def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_GeojsonLine]:
-    """Yield every LineString below a GeoJSON object, with the members that apply to the line."""
+    """Yield every LineString in a GeoJSON object, with the members of its parents that apply to it.
+
+    Raise InputFileError if an object has no lines or no geometry.
+    """
     kind = node.get("type")
     own = {key: node[key] for key in _MEMBERS if key in node}
     if kind == "FeatureCollection":
@@ -83,7 +86,7 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
 
 
 def _is_no_line(feature: dict[str, Any]) -> bool:
-    """Return whether one of several features is a point, an area such as a station, or has no geometry."""
+    """Return whether a feature is a point, an area such as a station, or has no geometry."""
     geometry = feature.get("geometry")
     if geometry is None and "geometry" in feature:
         return True
@@ -91,7 +94,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name of one of several features, or its id."""
+    """Return the name of a feature, or its id, as property "name"; an empty dictionary without either."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -135,7 +138,7 @@ class _GeojsonLine:
         raise self.error(f"{key} is {value!r}; a text was expected")
 
     def array(self, key: str, blank: float) -> Floats | None:
-        """Return a property with one value per point; null is `blank`."""
+        """Return a property with one value per point, shape (n,), or None if it is missing; null becomes `blank`."""
         value = self.properties.get(key)
         if value is None:
             return None
@@ -151,7 +154,7 @@ class _GeojsonLine:
 
 
 def _crs_member(path: str, document: dict[str, Any]) -> str | None:
-    """Return the CRS of the old ``crs`` member (GeoJSON 2008, section 3), still written by many programs."""
+    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs still write; None without."""
     member = document.get("crs")
     if member is None:
         return None
@@ -162,21 +165,27 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
 
 
 def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
-    """Return the positions of coordinates in easting-northing or longitude-latitude order."""
+    """Return the positions of coordinates in the order easting, northing or longitude, latitude, shape (n, 2) or more.
+
+    Raise InputFileError if coordinates of a geographic CRS are not degrees of longitude and latitude.
+    """
     if find_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
             point = values[int(np.argmax(over))]
             raise InputFileError(
                 path,
-                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; are they swapped, or is the CRS a "
-                "projected one (give crs, --crs)?",
+                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; check their order, or give a "
+                "projected CRS (crs, --crs)",
             )
     return georeference(crs, values[:, 0], values[:, 1], path=path)
 
 
 def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a GeoJSON file as segments; `reading` gives options that the file leaves out."""
+    """Read the lines of a GeoJSON file as segments; `reading` has options that the file does not state.
+
+    An Overpass JSON file (OpenStreetMap) is read, too. Raise InputFileError if the file is not valid.
+    """
     text = read_text(path)
     try:
         document = json.loads(text)
@@ -198,14 +207,14 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _without_geometry(document: dict[str, Any]) -> list[int]:
-    """Return the numbers of features whose geometry is null (RFC 7946, 3.2) and that are not connections."""
+    """Return the numbers, from 1, of features without geometry (null, RFC 7946, 3.2) that are no connections."""
     features = [f if isinstance(f, dict) else {} for f in document.get("features") or ()]
     empty = [f.get("geometry", ...) is None and RELATION not in (f.get("properties") or {}) for f in features]
     return [number for number, without in enumerate(empty, start=1) if without]
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Return the ways of an Overpass JSON document, which is not GeoJSON."""
+    """Return the ways of an Overpass JSON document as segments; ways that are no tracks are left out, with a note."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
@@ -239,24 +248,27 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     )
 
 
-#: Attribute of the track, factor, and value of an empty cell, by column of the file.
+#: Attribute of the track, conversion factor, and value of an empty cell for each optional column.
 OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "kilometrage_m": ("kilometrage_m", 1.0, np.nan),
     "cant_mm": ("cant_m", 1e-3, np.nan),
     "radius_m": ("radius_m", 1.0, np.inf),
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
-#: Standard deviations of each point, for information: positioning uses the standard deviations of the whole map.
+#: Columns with standard deviations of each point. They are informative: positioning uses those of the whole map.
 SIGMA_COLUMNS: Final = ("sigma_plan_m", "sigma_height_m")
 KNOWN_COLUMNS: Final = (
     "latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS, *SIGMA_COLUMNS,
 )  # fmt: skip
-#: ``# key: value`` lines above the header that are used; others are ignored.
+#: Keys of the ``# key: value`` lines above the header that are used; other lines are ignored.
 KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
 
 
 def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]:
-    """Read optional attributes of points by `read(name, blank)`; radii of 0, straight track, become infinite."""
+    """Return the optional attributes of points, each from `read(column, blank)`, in the units of `Track`.
+
+    An attribute for which `read` returns None is left out. A radius of 0, for straight track, becomes infinite.
+    """
     found: dict[str, Floats] = {}
     for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
         if (values := read(column, blank)) is not None:
@@ -265,7 +277,11 @@ def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]
 
 
 def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
-    """Read a CSV track map as one segment of a route; its CRS is geographic."""
+    """Read a CSV track map as one segment of a route.
+
+    The coordinates are latitude and longitude. Raise InputFileError or SettingsError if the file is not valid or
+    contradicts `reading`.
+    """
     check_height_datum(reading.height_datum)
     table = _with_map_names(read_named_columns(path), reading.height_datum)
     notes = (*_check_columns(table), *filter(None, table.metadata.get("note", "").split("; ")))
@@ -297,7 +313,10 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
 
 
 def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColumns:
-    """Return the table with usual column names replaced by railfix names; the height column is named by the datum."""
+    """Return the table with column names of other programs replaced by the names of railfix.
+
+    The height column is named by its datum. Raise InputFileError if the datum is not given.
+    """
     places = with_usual_names(table, ("latitude_deg", "longitude_deg"))
     named = with_usual_names(places, ("height_m",))
     theirs = named.usual.get("height_m")
@@ -305,8 +324,8 @@ def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColum
         return places
     if height_datum is None:
         raise table.header_error(
-            f"the column {theirs!r} does not say above what its heights are; give height_datum (--height-datum): "
-            "ellipsoidal or orthometric, or name it height_m (ellipsoidal) or elevation_m (orthometric)"
+            f"the column {theirs!r} does not state the datum of its heights; give height_datum (--height-datum), "
+            "ellipsoidal or orthometric, or name the column height_m (ellipsoidal) or elevation_m (orthometric)"
         )
     cells = {("elevation_m" if height_datum == "orthometric" and name == "height_m" else name): column
              for name, column in named.cells.items()}  # fmt: skip
@@ -330,7 +349,7 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
             raise table.header_error(message)
     if ("height_m" in table) == ("elevation_m" in table):
         what = "both 'height_m' and 'elevation_m'" if "height_m" in table else "neither 'height_m' nor 'elevation_m'"
-        message = f"{what}; one is needed: height_m is ellipsoidal, elevation_m is orthometric (levelling)"
+        message = f"{what}; exactly one is needed, height_m (ellipsoidal) or elevation_m (orthometric, from levelling)"
         raise table.header_error(message)
     used = [name for name in KNOWN_COLUMNS if name != "geoid_m" or "elevation_m" in table]
     extra = [name for name in table.cells if name not in used]
@@ -348,12 +367,12 @@ def _datum(table: NamedColumns, asked: str | None) -> str:
 
 
 def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floats) -> None:
-    """Reject coordinates that cannot be degrees of latitude and longitude."""
+    """Raise InputFileError if coordinates cannot be degrees of latitude and longitude."""
     outside = np.abs(latitude_deg) > 90.0
     if outside.any():
         row = int(np.argmax(outside))
         value = latitude_deg[row]
-        hint = "are latitude and longitude swapped?"
+        hint = "check whether latitude and longitude are swapped"
         if abs(value) > 360.0:
             hint = "degrees were expected, not metres of a grid (read from GeoJSON), minutes or seconds"
         raise table.error(row, f"latitude_deg {value:g} is over 90; {hint}")
@@ -366,7 +385,10 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
 
 
 def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:
-    """Return the positions of degrees in a geographic system."""
+    """Return the positions of latitudes and longitudes in a geographic CRS; WGS 84 is assumed if it is None.
+
+    Raise SettingsError if the CRS is not geographic or its unit is not the degree.
+    """
     if crs is None:
         return Georeference(latitude_deg=latitude, longitude_deg=longitude)
     system = find_crs(crs, path=path)
@@ -382,11 +404,10 @@ def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -
 
 
 def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = None) -> None:
-    """Write a track as CSV with ellipsoidal heights; a failed write leaves no file.
+    """Write a track as CSV with ellipsoidal heights; if writing fails, no file is left.
 
-    Attributes without any value are omitted. The file reads back equal to the track within
-    1e-10 degrees and 0.1 mm. Standard deviations of each point, plan and height, shape (V, 2) [m], are additional
-    columns.
+    Attributes without any value are omitted. Coordinates are written to 1e-10 degrees and 0.1 mm. `sigma_m` are
+    standard deviations of each point in plan and height, shape (V, 2) [m], which become additional columns.
 
     Raises
     ------

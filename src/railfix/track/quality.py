@@ -1,6 +1,7 @@
-"""Quality checks of a track map: spacing, mid-chord deviation, kinks, duplicates, kilometrage, gradient, cant.
+"""Quality checks of a track map: spacing, mid-chord deviation, kinks, duplicates, kilometrage, gradient and cant.
 
-A map error affects all satellites alike, so observation screening cannot detect it (P1 2.2(1), 4.1(3)).
+The checks are necessary because a map error affects all satellites alike, so that no screen of the observations can
+detect it (P1 2.2(1), 4.1(3)).
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this have errors of up to half of it [deg]: 0.6 m.
-_LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere is in another unit [m].
-_NEAR_DUPLICATE_M: Final = 0.10  #: Points nearer than this are the same point measured twice.
-_CURVED_1PM: Final = 1 / 3000  #: Curvature of less than this is straight [1/m].
-_ADVERSE_M: Final = 0.005  #: The side of cant of less than this is not checked [m].
-_CENTIMETRE_M: Final = 0.01  #: Largest distance of a chord from its arc, from which `needed_spacing_m` follows [m].
-#: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
+_COARSE_DEG: Final = 1e-5  #: Rounding of coordinates that is reported [deg]; errors are up to half of it, 0.6 m.
+_LEAST_CANT_M: Final = 5e-4  #: Maximum cant of a map below which the unit must be wrong [m].
+_NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are probably the same point measured twice [m].
+_CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
+_ADVERSE_M: Final = 0.005  #: Cant below which its sign is not checked [m].
+_CENTIMETRE_M: Final = 0.01  #: Largest distance of chord and arc for `needed_spacing_m` [m].
+#: Largest change of direction at a point, if it is also sharper than `least_radius_m`, that is not a kink.
 _KINK_DEG: Final = 3.0
-_SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, otherwise a warning.
+_SHARP_KINK_DEG: Final = 15.0  #: Largest kink that is a warning; a sharper kink is an error.
 #: Largest deviation of the height of a point from the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
 #: Largest difference of the gradient attribute from the heights, over `_GRADIENT_WINDOW_M`.
@@ -39,32 +40,32 @@ _GRADIENT_WINDOW_M: Final = 100.0
 class MapLimits(Settings):
     """Limits of a track map; a value on the limit passes."""
 
-    mid_chord_m: float = Field(default=0.30, gt=0)  #: Chord from arc at the middle of a segment (P1 4.1(3): 0.30 m).
-    spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment (P1 2.2(1): some tens of metres on straight track).
-    #: A longer segment indicates a point that does not belong to the line, or a missing piece of the line.
+    mid_chord_m: float = Field(default=0.30, gt=0)  #: Largest distance of chord and arc in mid-segment (P1 4.1(3)).
+    spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment; tens of metres on straight track in P1 2.2(1).
+    #: Longest segment that is not a gap: a longer one has a point off the line, or part of the line is missing.
     gap_m: float = Field(default=2000.0, gt=0)
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
-    gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest segment.
-    cant_m: float = Field(default=0.20, gt=0)  #: Largest absolute cant.
+    gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest gradient of a segment.
+    cant_m: float = Field(default=0.20, gt=0)  #: Largest absolute value of the cant.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One fault of the map at a range of neighbouring points or segments."""
+    """Fault of the map in a range of consecutive points or segments."""
 
     severity: Severity
-    kind: str
-    #: First and last point of the range.
+    kind: str  #: Kind of the fault, a key of `_FAULTS` without "small".
+    #: Indices of the first and last point of the range.
     first: int
     last: int
-    #: Values of the first point; the kilometrage may be NaN.
+    #: Chainage and kilometrage of the first point; the kilometrage may be NaN.
     chainage_m: float
     kilometrage_m: float
-    #: The worst value and its limit; NaN for faults without a number.
+    #: Worst value in the range and its limit; NaN if the fault has no value or no limit.
     value: float
     limit: float
 
-    sentence: str
+    sentence: str  #: Location and description of the fault for the user.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -74,7 +75,7 @@ class TrackQuality(NotebookTable):
     track: Track
     limits: MapLimits
     geometry: Geometry  #: Spacing, turns, mid-chord deviations and gradients that were checked.
-    findings: tuple[Finding, ...]  #: In order of chainage, errors first.
+    findings: tuple[Finding, ...]  #: Faults found: first the errors, then the warnings, each in order of chainage.
 
     @property
     def errors(self) -> tuple[Finding, ...]:
@@ -88,7 +89,7 @@ class TrackQuality(NotebookTable):
 
 
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
-    """Check the quality of a map that was read with ``duplicates="keep"``: duplicates are findings and no error."""
+    """Check the quality of a map, which should have been read with ``duplicates="keep"`` to report duplicate points."""
     check_type(track, Track, "track")
     limits = limits or MapLimits()
     geometry = compute_geometry(track)
@@ -104,7 +105,7 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
 
 
 def error_note(quality: TrackQuality) -> tuple[str, ...]:
-    """Return a note on the errors of a map, with the first one; none without errors."""
+    """Return a note with the number of errors of a map and the first error; an empty tuple without errors."""
     if not quality.errors:
         return ()
     return (
@@ -113,7 +114,7 @@ def error_note(quality: TrackQuality) -> tuple[str, ...]:
     )
 
 
-#: Severity and sentence of each fault; ``{value}`` is the worst value, ``{limit}`` its limit.
+#: Severity and description of each kind of fault; ``{value}`` is the worst value, ``{limit}`` its limit.
 _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "duplicate": ("warning", "the same point twice or more, which other commands read once"),
     "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),
@@ -136,7 +137,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "kilometrage absent": ("warning", "the map has no kilometrage here"),
     "height": (
         "error",
-        "a height of {value:,.0f} m, where no railway is; is it in millimetres, or does it mean that there is none?",
+        "a height of {value:,.0f} m is impossible; check whether it is in millimetres, or a code for a missing height",
     ),
     "gradient": ("warning", "the gradient of the heights is {value:.1f} per mille (limit {limit:g})"),
     "height spike": (
@@ -150,7 +151,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres"),
     "small cant": (
         "error",
-        "cant of {value:.2g} m, and nowhere more; is it in metres, where millimetres were expected?",
+        "cant of {value:.2g} m, and nowhere more; check whether it is in metres, where millimetres are expected",
     ),
     "cant side": (
         "error",
@@ -174,7 +175,7 @@ def _runs(
     *,
     severity: Severity | None = None,
 ) -> Iterator[Finding]:
-    """Yield a finding for each range of neighbours in a mask over V points or V - 1 segments."""
+    """Yield a finding for each range of consecutive True values in a mask over V points or V - 1 segments."""
     usual, text = _FAULTS[fault]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     over = 1 if len(mask) == len(track) - 1 else 0
@@ -225,7 +226,11 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 
 
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
-    """Yield curves with negative cant: errors if all curves, or all to one side, have it; else warnings (turnouts)."""
+    """Yield the curves with negative cant.
+
+    They are errors if all curves to one side have negative cant, and otherwise warnings, as negative cant is usual in
+    turnouts.
+    """
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))
     side = np.where(np.isnan(track.radius_m), of_points, of_map)
@@ -237,7 +242,7 @@ def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
 
 
 def needed_spacing_m(quality: TrackQuality) -> float:
-    """Return the spacing of points whose chords stay within 1 cm of the sharpest curve [m]; infinite without curves."""
+    """Return the spacing at which chords are within 1 cm of the sharpest curve [m]; infinite without curves."""
     geometry = quality.geometry
     bend = np.where(np.isnan(geometry.map_curvature), geometry.point_curvature, geometry.map_curvature)
     sharpest = float(np.nanmax(np.abs(bend), initial=0.0))

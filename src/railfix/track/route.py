@@ -1,4 +1,4 @@
-"""Segments as read from files, and joining them to a route (P1 4.2(1))."""
+"""Segments of track that are read from files, and their joining to a route (P1 4.2(1))."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
 from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, Provenance, Track
 
-NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights, which are NaN or from a second source.
-#: Optional attributes of each point of a map.
+NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights.
+#: Names of the optional attributes of map points.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
-#: Names of ERA RINF files that have no tracks, in small letters, with the message.
+#: Column names, in lower case, of ERA RINF files without track geometry, and the message on such files.
 RINF_NAMES = ("sectionofline", "operationalpoint", "solopstart", "uniqueopid", "uopid", "opstart")
 RINF_SECTIONS = (
     "sections of line and operational points of ERA RINF have no geometry of tracks; export the register's topology as "
@@ -29,7 +29,7 @@ RINF_SECTIONS = (
 
 
 class MapOptions(TypedDict, total=False):
-    """Fields of `MapReading` by their names."""
+    """Keyword arguments for `MapReading`."""
 
     crs: str | None
     height_datum: str | None
@@ -40,7 +40,7 @@ class MapOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class MapReading:
-    """Options for reading a map file, as the arguments of `railfix.track.read_track` of the same names."""
+    """Options for reading a map file, which are arguments of `railfix.track.read_track`."""
 
     crs: str | None = None
     height_datum: str | None = None
@@ -51,30 +51,30 @@ class MapReading:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """Points of one file or feature, with ellipsoidal heights, or NaN where the file has none (`NO_HEIGHTS`)."""
+    """Points of one file or feature, with ellipsoidal heights; heights are NaN if the file has none (`NO_HEIGHTS`)."""
 
-    source: str  #: The file, or the file and the feature in it.
-    file: str  #: The file alone.
-    #: Shape (n,).
+    source: str  #: Name of the file, and of the feature in it if there are several.
+    file: str  #: Name of the file.
+    #: Coordinates of the points in `frame`, shape (n,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    #: NaN where the file has none, shape (n,).
+    #: Attributes of the points as in `Track`, shape (n,); NaN where the file has none.
     kilometrage_m: Floats
     cant_m: Floats
     radius_m: Floats
     gradient_permille: Floats
-    #: Height datum of the file, and the geoid used.
+    #: CRS and height datum of the file, and the geoid used.
     crs: str
     height_datum: str
     geoid: str
-    metadata: dict[str, str]  #: Name, accuracy and origin, where the file has them.
-    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates here.
-    #: Standard deviations of the coordinates' transformations, in addition to the map's accuracy [m]; NaN if unknown.
+    metadata: dict[str, str]  #: Name, accuracy and origin, if the file states them.
+    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the segment.
+    #: Standard deviations of coordinate transformations, which are added to the accuracy of the map; NaN if unknown.
     datum_plan_m: float = 0.0
     datum_height_m: float = 0.0
     notes: tuple[str, ...] = ()
-    nodes: tuple[str, ...] = ()  #: Ids of the points as nodes of OpenStreetMap; empty where the file has none.
+    nodes: tuple[str, ...] = ()  #: OpenStreetMap node ids of the points; empty if the file has none.
 
     def reverse(self) -> Segment:
         """Return the segment in the opposite direction; the signs of radius and gradient change."""
@@ -97,7 +97,10 @@ def make_segment(
     notes: tuple[str, ...] = (),
     attributes: Mapping[str, Floats] = MappingProxyType({}),
 ) -> Segment:
-    """Return a segment of points in plan and, where it has any, of heights."""
+    """Create a segment from coordinates in plan, heights, and attributes.
+
+    `heights` is None for a segment without heights. An attribute that is not given is NaN.
+    """
     absent = np.full(len(place.latitude_deg), np.nan)
     of_points: dict[str, Any] = {**dict.fromkeys(ATTRIBUTES, absent), **attributes}
     above = heights or EllipsoidalHeights(height_m=absent, datum=NO_HEIGHTS)
@@ -109,18 +112,18 @@ def make_segment(
     )  # fmt: skip
 
 
-SAME_POINT_M = 0.05  #: Ends of two segments nearer than this are the same point [m].
-MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that is bridged by a straight line [m].
+SAME_POINT_M = 0.05  #: Distance below which the ends of two segments are the same point [m].
+MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that a straight line bridges [m].
 
 
 def _ends(segments: Sequence[Segment]) -> Floats:
-    """Return first and last points, shape (n, 2, 3) [m]; in plan where a segment has no heights."""
+    """Return the ECEF positions of first and last points, shape (n, 2, 3) [m]; missing heights count as 0."""
     columns = ("latitude_deg", "longitude_deg", "height_m")
     ends = np.array([[getattr(s, name)[[0, -1]] for name in columns] for s in segments])
     return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
 
 
-#: Largest fraction of points at which a line may turn back, as where trains reverse.
+#: Largest fraction of points at which a line may turn by more than 90 degrees, for example where trains reverse.
 _MOST_BACK: Final = 0.05
 
 
@@ -139,7 +142,10 @@ def check_order(segments: Iterable[Segment]) -> None:
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Orient segments in route order so that each begins, within `max_gap_m`, where the previous one ends."""
+    """Return segments in the same order, reversed where necessary, so that each begins at the previous segment's end.
+
+    Raise InputFileError if a gap is wider than `max_gap_m`.
+    """
     gap = first_gap(segments, max_gap_m=max_gap_m)
     if gap is not None:
         k, size = gap
@@ -166,7 +172,10 @@ def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
 
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
-    """Return the first segment that does not meet the previous one, and the gap [m]; None where all meet."""
+    """Return the index of the first segment that does not meet the previous segment, and the gap [m]; None if all meet.
+
+    Segments meet if the gap between their ends is at most `max_gap_m`.
+    """
     ends = _ends(segments)
     backwards = np.array(_turn(ends, max_gap_m), dtype=np.intp)
     rows = np.arange(1, len(ends))
@@ -183,7 +192,11 @@ def join(
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """Join segments to one track; a shared point is kept once, with the attributes of the earlier segment first."""
+    """Join segments to one track.
+
+    A point shared by two segments is kept once. Its attributes are from the earlier segment or, where that has none,
+    from the later segment. Raise InputFileError if segments do not meet, MismatchError if their frames differ.
+    """
     pieces = orient(segments, max_gap_m=max_gap_m)
     ends = _ends(pieces)
     kept: list[dict[str, Floats]] = []
@@ -221,7 +234,7 @@ def join(
 
 
 def one_frame(pieces: Sequence[Segment]) -> str:
-    """Return the frame of all pieces; pieces in two frames would be joined with a step of up to 2 m."""
+    """Return the frame of all pieces; raise MismatchError if frames differ, which would make a step of up to 2 m."""
     frames = {piece.frame: piece.source for piece in pieces}
     if len(frames) > 1:
         what = "; ".join(f"{source} in {frame}" for frame, source in frames.items())
@@ -234,9 +247,10 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the worst accuracy of the pieces, as stated by the files, or the default of P1 4.1(3).
+    """Return the worst standard deviation of the pieces [m], including the transformation from their datum.
 
-    It includes the accuracy of the transformation from their datum.
+    It is the value of the files' metadata `key`, or `default` where a file states none. Raise InputFileError if a value
+    is not a positive number.
     """
     sigmas: list[float] = []
     for piece in pieces:

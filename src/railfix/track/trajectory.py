@@ -32,7 +32,7 @@ def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
 
 
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
-    """Find the nearest point of segments, broadcast (..., 3): fraction in [0, 1], and distance."""
+    """Return the fraction (0 to 1) of a segment at its nearest point, and the distance; shapes (..., 3) broadcast."""
     offset = points_m - start_m
     squared = np.einsum("...i,...i->...", step_m, step_m)
     share = np.minimum(np.maximum(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0), 1.0)

@@ -1,7 +1,7 @@
 """Vehicle with two bogies and roof antennas, and the trajectories of its antennas (P1 3.1(1)).
 
-Axes: origin midway between the bogie centres at the height of the rail tops; ``along_m`` toward the vehicle's front,
-``across_m`` to the right, ``up_m`` perpendicular to the floor.
+The origin of the vehicle frame is midway between the bogie centres at the height of the rail tops. ``along_m`` points
+toward the vehicle's front, ``across_m`` to the right, and ``up_m`` perpendicular to the floor.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from railfix.track.trajectory import Trajectory, joins_m
 
 Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 
-#: Distance between the contact points of the wheels minus the gauge [m]: about the width of a rail head.
+#: Distance between the contact points of the wheels less the gauge, about the width of a rail head [m].
 RAIL_HEAD_M: Final = 0.070
 PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
 _INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment at which its chord is compared with the path.
 #: Shortest segment of the path [m].
 _SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
-_CONVERGED_M: Final = 1e-7
+_CONVERGED_M: Final = 1e-7  #: Change at which iterations end [m].
 
 
 class AntennaOffset(Settings):
-    """Phase centre of one antenna in the vehicle frame [m]."""
+    """Position of the phase centre of one antenna in the vehicle frame [m]."""
 
     model_config = ConfigDict(strict=True)
     along_m: float = Field(ge=-30.0, le=30.0)
@@ -49,15 +49,15 @@ class Vehicle(Settings):
 
     model_config = ConfigDict(strict=True)
     name: str = "vehicle"
-    bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight distance between the two bogie centres.
+    bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight-line distance between the two bogie centres.
     #: Track gauge; cant is measured over the gauge plus `RAIL_HEAD_M`.
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
     #: Length over the ends (buffers or couplers); None where unknown.
     length_m: float | None = Field(default=None, gt=0.0, le=1000.0)
-    #: Distance of the front end ahead of the middle between the bogies; None: half of `length_m`.
+    #: Distance of the front end ahead of the middle between the bogies; half of `length_m` if None.
     front_end_m: float | None = Field(default=None, ge=0.0, le=1000.0)
-    antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)  #: Offsets by name.
+    antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)  #: Positions of the antennas by name.
 
     @property
     def contact_spacing_m(self) -> float:
@@ -78,27 +78,28 @@ class Vehicle(Settings):
     @model_validator(mode="after")
     def _front_end_on_vehicle(self) -> Self:
         if self.length_m is not None and self.front_end_m is not None and self.front_end_m > self.length_m:
-            raise ValueError("front_end_m is at most length_m: both ends are not on the same side of the bogies")
+            raise ValueError("front_end_m must be at most length_m, so that the middle is between the two ends")
         return self
 
 
 def read_vehicle(path: FilePath) -> Vehicle:
     """Read a vehicle file (TOML).
 
-    InputFileError: the file does not exist or is not TOML. SettingsError: a key is unknown, missing or out of range.
+    Raise InputFileError if the file does not exist or is not TOML, SettingsError if a key is unknown, missing or out of
+    range.
     """
     return load_settings(Vehicle, path, what="a vehicle file")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Position and attitude of the car body at n chainages, facing rising chainage."""
+    """Positions and attitudes of the car body at n chainages, with axes for a vehicle facing rising chainage."""
 
-    #: Chainage of the bogie centres, the lower first; shape (n,).
+    #: Lower and higher chainage of the two bogie centres, shape (n,).
     lower_m: Floats
     upper_m: Floats
-    origin: Floats  #: Midway between the bogie centres, ECEF; shape (n, 3) [m].
-    #: Unit vectors of the body, shape (n, 3).
+    origin: Floats  #: ECEF position midway between the bogie centres, shape (n, 3) [m].
+    #: Unit vectors of the body axes in ECEF, shape (n, 3).
     forward: Floats
     right: Floats
     up: Floats
@@ -106,7 +107,7 @@ class Body:
 
 
 class _VehicleLine:
-    """Centreline and roll of a bogie by cant, as functions of chainage; a closed line continues beyond its ends."""
+    """Centreline and roll by cant as functions of chainage; a closed line continues beyond its ends."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
         self.chainage = track.chainage_m
@@ -119,7 +120,7 @@ class _VehicleLine:
         cant, self.notes = _sign_cant(track)
         if (np.abs(cant) >= contact_spacing_m).any():
             raise MismatchError(
-                f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; is it in mm?"
+                f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; check its unit"
             )
         self.ramps = with_breaks(track.chainage_m, np.arcsin(cant / contact_spacing_m))
         self.joins = joins_m(self.chainage, self.points)
@@ -130,7 +131,7 @@ class _VehicleLine:
         return bool(np.isnan(self.joins[0])), bool(np.isnan(self.joins[1]))
 
     def at(self, chainage: Floats) -> Floats:
-        """Return points, shape (n, 3); at an open end the last segment is extended straight."""
+        """Return ECEF points, shape (n, 3) [m]; at an open end the last segment is extended straight."""
         points = self._straight_on(chainage)
         before, after = self.joins
         ends = (
@@ -147,7 +148,7 @@ class _VehicleLine:
         return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
-        """Return the roll by cant, shape (n,) [rad]; beyond an open end the roll at the end."""
+        """Return the roll by cant, shape (n,) [rad]; beyond an open end the roll is that at the end."""
         before, after = self.joins
         last = self.chainage[-1]
         open_start, open_end = self.open_ends
@@ -157,7 +158,11 @@ class _VehicleLine:
 
 
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
-    """Return the cant, positive for roll to the right, by the radius or nearest curve, and notes."""
+    """Return the cant, positive for roll to the right, shape (V,) [m], and notes.
+
+    The sign is that of the radius, or of the bend of the points where the map has no radius; on straight track it is
+    the sign in the nearest curve. Raise MismatchError if there is cant but no curve.
+    """
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
     canted = cant != 0.0
     notes: list[str] = []
@@ -181,7 +186,7 @@ def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
 
 
 def _side_of_bends(track: Track) -> Floats:
-    """Return +1 where the centreline bends to the right, -1 to the left, 0 where straight, shape (V,)."""
+    """Return the direction of curves, shape (V,): 1 to the right, -1 to the left, 0 on straight track."""
     steps = np.diff(track.ecef_m, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     up = enu_axes(track.latitude_deg, track.longitude_deg)[1:-1, 2]
@@ -190,7 +195,7 @@ def _side_of_bends(track: Track) -> Floats:
 
 
 def _bogies(line: _VehicleLine, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
-    """Find the chainages of the bogies, symmetric about `middle`, at the bogie distance as a chord."""
+    """Return the chainages of the bogies, at equal distances from `middle` and with the bogie distance as chord [m]."""
     half = np.full(len(middle), distance_m / 2.0)
     active = np.arange(len(middle))
     for _ in range(_MAX_ITERATIONS):
@@ -229,7 +234,7 @@ def _pose(line: _VehicleLine, track: Track, vehicle: Vehicle, middle: Floats) ->
 
 
 def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
-    """Return the antenna, ECEF, shape (n, 3) [m]."""
+    """Return the ECEF positions of the antenna, shape (n, 3) [m]."""
     sign = 1.0 if vehicle.facing == "rising" else -1.0
     return np.asarray(
         body.origin + sign * offset.along_m * body.forward + sign * offset.across_m * body.right + offset.up_m * body.up
@@ -237,7 +242,7 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Find the chainage of the centreline point abeam the antenna: in the plane perpendicular to the body."""
+    """Return the chainage of the centreline point abeam the antenna, in the plane through it across the body [m]."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
@@ -248,7 +253,11 @@ def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> F
 
 
 def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
-    """Choose chainages of the body's middle: at the track's points, and more where the path bends between them."""
+    """Return chainages of the body's middle at which the antenna's path is computed [m].
+
+    They are the chainages of the track's points, and more where the path deviates from a chord by more than
+    `PATH_TOLERANCE_M`.
+    """
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
     if not last - first > 0.0:
@@ -279,7 +288,7 @@ def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaO
 
 
 def _end_halves(line: _VehicleLine, track: Track, vehicle: Vehicle) -> tuple[float, float]:
-    """Find the distance of the body's middle from either end at which both bogies are on the track."""
+    """Return the distances from both ends of the track at which the body's middle has both bogies on the track [m]."""
     first, last = 0.0, line.chainage[-1]
     half = np.where(line.open_ends, vehicle.bogie_distance_m / 2.0, 0.0)
     for _ in range(_MAX_ITERATIONS):
@@ -297,11 +306,11 @@ def antenna_trajectory(
 ) -> Trajectory:
     """Compute the trajectory of a roof antenna of a vehicle on the track.
 
-    Both bogie centres are on the centreline at the bogie distance (a chord). At each bogie the track
-    rolls by ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean
-    of the two (P1 3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the
-    vertical rotated by the roll. The path begins and ends where a bogie reaches the end of the track; on a closed
-    track, where the body's middle reaches its end, so that the path is closed too.
+    Both bogie centres are on the centreline, with the bogie distance as chord. At each bogie the track rolls by
+    ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean of both rolls (P1
+    3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the vertical rotated by the roll. The
+    path begins and ends where a bogie reaches the end of the track. On a closed track it begins and ends where the
+    body's middle reaches the end of the map, so that the path is closed, too.
 
     Parameters
     ----------
@@ -309,14 +318,14 @@ def antenna_trajectory(
     vehicle : Vehicle
     antenna : {"front", "rear"}
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
-        Point of the vehicle to which the chainage refers: the centreline point abeam the antenna
-        (beyond the outer bogies the centreline is extended straight), the middle between the bogies,
-        or a bogie centre; front and rear are relative to the vehicle.
+        Point of the vehicle to which the chainage refers: the centreline point abeam the antenna, the middle between
+        the bogies, or the centre of the bogie at the vehicle's front or rear. Beyond the ends of the track the
+        centreline is extended straight.
 
     Returns
     -------
     Trajectory
-        One point where the body's middle passes each point of the track, and more where the path
+        Path with a point for each point of the track that the body's middle passes, and more points where the path
         deviates from a chord by more than `PATH_TOLERANCE_M`.
 
     Raises

@@ -1,7 +1,7 @@
-"""XML files of alignments (LandXML) and railML 3 track centrelines, and ERA RINF topology as RDF.
+"""Readers of LandXML alignments, railML 3 track centrelines, and ERA RINF topology in RDF.
 
-The RINF ontology (http://data.europa.eu/949/, version 3) has each `LinearElement` with its geometry (GeoSPARQL, WKT)
-and a `NetRelation` for each pair of ends that meet, as in railML 3.
+In the RINF ontology (http://data.europa.eu/949/, version 3) a `LinearElement` has a geometry (GeoSPARQL, WKT), and a
+`NetRelation` connects two ends that meet, as in railML 3.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Relation:
-    """Connection of two net elements as in railML 3 and RailTopoModel."""
+    """Connection of two net elements, as in railML 3 and RailTopoModel."""
 
-    #: Names of the elements.
+    #: Names of the two elements.
     first: str
     second: str
-    #: 0 for the start of the element, 1 for its end.
+    #: Connected end of each element: 0 for its start, 1 for its end.
     first_end: int
     second_end: int
     navigable: bool  #: Whether trains can pass from one element to the other.
 
 
 def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a LandXML or railML 3 file as segments; InputFileError if it is neither, or has no line."""
+    """Read the lines of a LandXML or railML 3 file as segments; InputFileError for other files, or without lines."""
     root = read_root(path)
     kind = tag(root)
     if kind == "LandXML":
@@ -96,7 +96,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
 
 
 def read_railml_relations(path: FilePath) -> list[Relation]:
-    """Read the net relations of a railML 3 file; empty for other XML files."""
+    """Read the net relations of a railML 3 file; the result is empty for other XML files."""
     root = read_root(path)
     relations = []
     for item in root.iterfind(".//{*}netRelation"):
@@ -124,13 +124,13 @@ _ERA: Final = "http://data.europa.eu/949/"
 _GEO: Final = "http://www.opengis.net/ont/geosparql#"
 _LABEL: Final = "http://www.w3.org/2000/01/rdf-schema#label"
 _TYPE: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type"
-#: WKT line, preceded by its CRS in GeoSPARQL.
+#: LINESTRING in WKT, which in GeoSPARQL can be preceded by its CRS.
 _WKT: Final = re.compile(r"\s*(?:<(?P<crs>[^>]+)>)?\s*LINESTRING\s*Z?\s*\((?P<points>[^)]*)\)\s*", re.IGNORECASE)
 _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the linear elements with a geometry as segments; InputFileError if there are none."""
+    """Read the linear elements of a RINF file that have a geometry as segments; raise InputFileError without any."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [
@@ -155,7 +155,10 @@ def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def read_rinf_relations(path: FilePath) -> list[Relation]:
-    """Read the net relations of the register; a navigability of None joins two ends without a passage for trains."""
+    """Read the net relations of a RINF file.
+
+    A relation with the navigability "none" joins two ends between which trains cannot pass.
+    """
     graph, relations = _graph(path), []
     for item in _all(graph, "NetRelation"):
         found = {key: _values(graph, item, _ERA + key) for key in (
@@ -182,12 +185,12 @@ def _graph(path: FilePath) -> Graph:
 
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
-    """Return the triples of a file, cached because its relations are read by a second call."""
+    """Return the triples of a file, cached because segments and relations are read in separate calls."""
     with needs_extra(f"{path}: RDF"):
         from rdflib import Graph
     data = read_bytes(path)
     begin = data.lstrip()[:5]
-    # N-Triples is a part of Turtle
+    # N-Triples is a subset of Turtle
     name = "json-ld" if begin[:1] in (b"{", b"[") else "turtle" if begin[:1] != b"<" or begin == b"<http" else "xml"
     try:
         with warnings.catch_warnings():

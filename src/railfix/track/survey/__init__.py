@@ -1,1 +1,1 @@
-"""A track map from several runs of ordinary receivers: adjustment of their positions and steps to one line."""
+"""Track maps from several runs of ordinary receivers, by adjustment of the positions of all runs to one line."""

@@ -1,4 +1,4 @@
-"""Observation equations of a survey, linear about approximate positions of runs, clocks and the line."""
+"""Observation equations of a survey, linearised about approximate positions of the runs and the line."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the bend of the line relative to the reference line at a point [m]; larger by this much for a
-#: squared turn of 1 rad at corners, where a lateral shift bends the line.
+#: Standard deviation of the second difference of the line relative to the reference line [m]. Across the line it is
+#: larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends the line.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceLine:
-    """Points of the line before the adjustment, and the directions in which they move, J points."""
+    """Line before the adjustment, J points."""
 
-    #: Shape (J, 3).
+    #: ECEF positions of the points, and unit vectors across the line and upward, in which points move; shape (J, 3).
     ecef_m: Floats
     across: Floats
     up: Floats
-    closed: bool = False  #: The last point is joined to the first.
+    closed: bool = False  #: Whether the last point is joined to the first.
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -36,29 +36,29 @@ class ReferenceLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Equations of one kind, n observations of `size` rows each, in units of their standard deviations."""
+    """Equations of one kind: n observations of `size` rows each, divided by their standard deviations."""
 
-    matrix: sp.csr_array  #: Shape (n * size, unknowns).
-    value: Floats  #: Shape (n * size,).
-    size: int
-    share: Floats  #: Weight of an observation as a fraction of an independent observation; 1 by default; shape (n,).
+    matrix: sp.csr_array  #: Design matrix, shape (n * size, unknowns).
+    value: Floats  #: Observed values, shape (n * size,).
+    size: int  #: Number of rows per observation.
+    share: Floats  #: Weight of each observation relative to an independent observation, shape (n,).
     robust: bool = True  #: Whether outliers are down-weighted.
     scaled: bool = False  #: Whether the standard deviations are scaled by the residuals.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunColumns:
-    """Columns of one run's unknowns: rows, offset, clocks of the rows, clock offsets, clocks of the steps."""
+    """Columns of the unknowns of one run."""
 
-    row: Indices
-    offset: int
-    clock: Indices
-    further: Indices
-    step: Indices
+    row: Indices  #: First of three columns of each row's coordinates.
+    offset: int  #: First of three columns of the run's offset.
+    clock: Indices  #: Column of the receiver clock at each row.
+    further: Indices  #: Columns of the clock offsets of further constellations.
+    step: Indices  #: Column of the clock change in each step between rows.
 
     @classmethod
     def from_first(cls, run: SurveyRun, first: int) -> RunColumns:
-        """Number the unknowns of a run from a first column on."""
+        """Assign the columns of a run's unknowns, from the column `first` on."""
         count, signals = len(run), run.signals
         offset = first + 3 * count
         rows, further = (0, 0) if signals is None else (count, int(signals.clock.max(initial=0)))
@@ -78,7 +78,7 @@ class RunColumns:
 
 
 def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -> sp.csr_array:
-    """Return the sparse matrix; a part is the observations' columns, shape (n,), and coefficients, shape (n, size)."""
+    """Build a sparse matrix from parts, each a column per observation (n,) and its coefficients (n, size)."""
     count = len(parts[0][0])
     row = np.arange(count * size)
     rows = np.concatenate([row for _ in parts])
@@ -88,14 +88,14 @@ def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -
 
 
 def _point(first: Indices, factor: Floats) -> list[tuple[Indices, Floats]]:
-    """Return the parts of the coordinates in columns from `first` on by a matrix, shape (n, size, 3)."""
+    """Return the parts of `_matrix` for coordinates in three columns from `first` on; `factor` is (n, size, 3)."""
     return [(first + axis, factor[:, :, axis]) for axis in range(3)]
 
 
 def position_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> Equations:
-    """Return the equations of positions: the row's coordinates and the offset of the run."""
+    """Return the equations of measured positions, each the sum of the row's coordinates and the run's offset."""
     rows = np.flatnonzero(np.isfinite(run.ecef_m).all(axis=1))
     white = axes[None] / run.sigma_m[rows][:, :, None]
     value = np.einsum("nij,nj->ni", white, run.ecef_m[rows] - origin)
@@ -108,7 +108,10 @@ def position_equations(
 def code_equations(
     signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> Equations:
-    """Return the equations of codes: coordinates, run offset, clock per epoch, offset per further constellation."""
+    """Return the equations of pseudoranges.
+
+    Unknowns are the coordinates, the run's offset, the clock of the row, and a clock offset per further constellation.
+    """
     row, sigma = signals.row, signals.sigma_m
     distance, sight = range_with_rotation(signals.sat_ecef_m, near[row] + origin)
     white = (-sight / sigma[:, None])[:, None, :]
@@ -128,7 +131,10 @@ def code_equations(
 def change_equations(
     signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> list[Equations]:  # fmt: skip
-    """Return changes of ranges, phases and Dopplers (for lost phases): both rows' coordinates, a clock per step."""
+    """Return the equations of range changes by carrier phase, and by Doppler where the phase was lost.
+
+    Unknowns are the coordinates of both rows, and a clock change per step.
+    """
     step, sigma = signals.step, signals.change_sigma_m
     before, sight_before = range_with_rotation(signals.before_ecef_m, near[step] + origin)
     after, sight_after = range_with_rotation(signals.after_ecef_m, near[step + 1] + origin)
@@ -147,7 +153,7 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Return the median of each value's group; the residual clock without this median is small."""
+    """Return the median of the group of each value; it approximates the clock, so that the estimated clock is small."""
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
     middle = np.minimum((first[:-1] + first[1:]) // 2, len(value) - 1)
@@ -157,7 +163,7 @@ def _group_medians(value: Floats, group: Indices) -> Floats:
 def motion_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, limits: SurveyLimits, unknowns: int
 ) -> Equations:  # fmt: skip
-    """Return the equations of smooth motion: the velocity changes little between neighbouring steps."""
+    """Return the pseudo-observations of smooth motion: the velocity changes little between successive steps."""
     dt = np.diff(run.seconds)
     rows = np.arange(1, len(run) - 1)
     mean = 0.5 * (dt[:-1] + dt[1:])
@@ -175,7 +181,7 @@ def motion_equations(
 
 
 def offset_equations(run: SurveyRun, columns: RunColumns, axes: Floats, unknowns: int) -> Equations:
-    """Return the equations of the offset of a run: zero within the common error of its positions."""
+    """Return the prior of the offset of a run: zero, with the standard deviation of the common error."""
     plan, height = run.common_sigma_m
     white = (axes / np.array([plan, plan, height])[:, None])[None]
     parts = _point(np.array([columns.offset]), white)
@@ -188,7 +194,7 @@ def tie_equations(
     line: ReferenceLine, ties: Ties, runs: Sequence[RunColumns], start: int, origin: Floats, limits: SurveyLimits,
     unknowns: int,
 ) -> Equations:  # fmt: skip
-    """Return the equations of passes, across and above: a run is on the line within an error correlated along it."""
+    """Return the equations of passes: a run is on the line within an error correlated along the line."""
     share = np.full(len(ties.point), min(1.0, limits.spacing_m / max(limits.correlation_m, 1e-9)))
     white = np.stack([line.across[ties.point], line.up[ties.point]], axis=1) / limits.apart_m
     first = np.array([columns.row[0] for columns in runs])[ties.run]
@@ -204,7 +210,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Return the equations of a smooth line, which bends as the reference line does."""
+    """Return the pseudo-observations of a smooth line: its bends are those of the reference line."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]

@@ -1,6 +1,7 @@
-"""Survey of a line: all runs of ordinary receivers adjusted to one map with its standard deviations.
+"""Survey of a line: adjustment of several runs of ordinary receivers to one map with standard deviations.
 
-Errors follow Student's t distribution: iteratively reweighted least squares (Lange, Little and Taylor 1989).
+Errors are assumed to follow Student's t distribution, for which the adjustment uses iteratively reweighted least
+squares (Lange, Little and Taylor 1989).
 """
 
 from __future__ import annotations
@@ -33,30 +34,31 @@ from railfix.track.survey.passes import (
 from railfix.track.survey.runs import SurveyLimits, SurveyRun
 from railfix.track.track import Provenance, Track
 
-#: Largest number of reweighting rounds, and the change of the solution that ends them [m].
-_ADJUSTMENT_ROUNDS: Final = 15
-_SETTLED_M: Final = 0.02
+_ADJUSTMENT_ROUNDS: Final = 15  #: Largest number of reweighting iterations.
+_SETTLED_M: Final = 0.02  #: Change of the solution at which the iterations end [m].
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Limits of the scale of stated standard deviations by residuals, which do not show errors common to satellites.
+#: Limits of the scale of stated standard deviations. Residuals do not show errors common to all satellites.
 _SCALES: Final = (0.5, 10.0)
-_ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
-#: Largest number of points with computed standard deviations, others are interpolated; and columns at a time.
+_ANYWHERE_M: Final = 1e5  #: Standard deviation of a loose prior of every unknown, for conditioning [m].
+#: Largest number of points with computed standard deviations; those of the other points are interpolated.
 _SIGMAS: Final = 200
-_COLUMNS: Final = 20
+_COLUMNS: Final = 20  #: Number of columns of the inverse that are computed at once.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adjusted:
     """Result of an adjustment."""
 
-    ecef_m: tuple[Floats, ...]  #: Positions of each run without its offset; shape (n, 3).
-    #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not requested.
+    ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, without the offset of the run; shape (n, 3).
+    #: Distances of the points of the line from the reference line, across and upward, and their standard deviations;
+    #: shape (J, 2), or (0, 2) if not requested.
     line_m: Floats
     line_sigma_m: Floats
-    #: Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any; shape (n,).
+    #: Mean weight of the positions or codes in each row of each run, shape (n,); about 1 without outliers, 0 without
+    #: an observation.
     weight: tuple[Floats, ...]
-    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run relative to the stated value.
+    scale: tuple[float, ...]  #: Ratio of actual to stated standard deviation of the positions or codes of each run.
 
 
 def adjust(
@@ -69,7 +71,11 @@ def adjust(
     limits: SurveyLimits | None = None,
     sigmas: Literal["none", "line"] = "none",
 ) -> Adjusted:
-    """Adjust the positions of all runs, with the line if passes are known; `repeats` of a row count as one."""
+    """Adjust the positions of all runs, and the points of the line if `line` and `ties` are given.
+
+    `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` is the number of times that the run
+    passes the position of each row; the weight of the row is divided by it. ``sigmas="line"`` computes `line_sigma_m`.
+    """
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
     columns: list[RunColumns] = []
@@ -106,7 +112,10 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Return each row's fraction of an independent position, by time and distance since the last row, shape (n,)."""
+    """Return the weight of each row as a fraction of an independent position, shape (n,).
+
+    It increases with the time and the distance since the previous row, up to 1 at twice the correlation time or length.
+    """
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
@@ -117,7 +126,7 @@ def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> F
 def _solve(
     systems: Sequence[Equations], unknowns: int, limits: SurveyLimits
 ) -> tuple[Floats, list[Floats], list[float]]:
-    """Solve by reweighting; return the solution, and weights and scale of each kind of equations."""
+    """Solve by iterative reweighting; return the solution, and the weights and scale of each kind of equations."""
     weights = [np.ones(len(system.share)) for system in systems]
     scales = [1.0 for _ in systems]
     solution = np.zeros(unknowns)
@@ -164,7 +173,11 @@ def _line_sigmas(
     unknowns: int,
     limits: SurveyLimits,
 ) -> Floats:
-    """Compute sigmas of the line (J, 2) [m]; Student's t informs by (freedom + size) / (freedom + size + 2)."""
+    """Compute the standard deviations of the line, across and in height, shape (J, 2) [m].
+
+    The expected information of an observation with Student's t errors is ``(freedom + size) / (freedom + size + 2)``
+    times that with normal errors; the smaller of this and the weight is used.
+    """
     expected = [
         np.full(len(weight), (limits.freedom + system.size) / (limits.freedom + system.size + 2.0))
         if system.robust
@@ -187,38 +200,42 @@ def _line_sigmas(
 
 
 def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
-    """Return the mean weight of each row, shape (n,)."""
+    """Return the mean weight of the observations in each row, shape (n,)."""
     rows = np.flatnonzero(np.isfinite(run.ecef_m).all(axis=1)) if run.signals is None else run.signals.row
     count = np.bincount(rows, minlength=len(run))
     return np.asarray(np.bincount(rows, weights=weight, minlength=len(run)) / np.maximum(count, 1))
 
 
-_ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes are searched again.
-#: The two directions are on separate tracks if their distance exceeds this many standard deviations of a run's offset:
+_ROUNDS: Final = 3  #: Number of adjustments with the line; passes are searched before each of them.
+#: Distance of the two directions, in standard deviations of a run's offset, beyond which they are on separate tracks:
 #: three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Distance over which a change of direction is searched for [m].
-_END_POINTS: Final = 8  #: Number of points that determine the direction at an end of the line.
-_OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that represents the whole map.
+_TURN_M: Final = 40.0  #: Distance over which a reversal is searched for [m].
+_END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
+_OF_THE_MAP: Final = 95.0  #: Percentile of the standard deviations along the line that is stated for the whole map.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Survey:
-    """A surveyed line."""
+    """Result of the survey of a line."""
 
-    track: Track  #: Its standard deviations are 95th percentiles along the line.
+    track: Track  #: Surveyed map; its standard deviations are the 95th percentiles along the line.
     #: Standard deviations of each point across the line and in height, shape (V,).
     sigma_plan_m: Floats
     sigma_height_m: Floats
     passes: Integers  #: Number of passes at each point, shape (V,).
     runs_ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, shape (n, 3).
-    scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run relative to the stated value.
-    beside_m: float  #: Length of the runs off the line.
-    closed: bool
+    scale: tuple[float, ...]  #: Ratio of actual to stated standard deviation of the positions or codes of each run.
+    beside_m: float  #: Total length of the parts of runs that are off the line.
+    closed: bool  #: Whether the line is closed.
 
 
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
-    """Adjust runs to the map of one line, individually, then as passes. ValueError: runs never move, or are apart."""
+    """Adjust runs to the map of one line.
+
+    Each run is adjusted on its own first, then all runs are adjusted together as passes of the line. Raise ValueError
+    if no run moves, or the runs have no line in common.
+    """
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)
     axes = axes_at(origin)
@@ -273,16 +290,16 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
 
 
 def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
-    """Return the sigmas in plan and height of the error common to all positions of a single run, shape (2,) [m].
+    """Return additional standard deviations of the common error of a single run, plan and height, shape (2,) [m].
 
-    It is in addition to `SurveyRun.common_sigma_m`, and doubles it if no other run shows the common error: without it
-    the sigmas of single runs of low-cost receivers were half of their errors.
+    If there is no second run, the common error is not observable. The addition then doubles
+    `SurveyRun.common_sigma_m`: without it, sigmas of single runs of low-cost receivers were half of their errors.
     """
     return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
 
 def _interpolate_positions(run: SurveyRun) -> Floats:
-    """Return positions, missing positions interpolated in time, shape (n, 3) [m]."""
+    """Return the positions of a run, with missing positions interpolated in time, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
     return np.stack([np.interp(run.seconds, run.seconds[known], run.ecef_m[known, i]) for i in range(3)], axis=1)
 
@@ -295,7 +312,7 @@ def _reference_line(course: Course, origin: Floats, axes: Floats) -> ReferenceLi
 
 
 def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
-    """Return how often each run passes each of its rows, shape (n,) each."""
+    """Return for each run the number of times that it passes the position of each row, shape (n,)."""
     found = []
     for r, run in enumerate(runs):
         mine = ties.run == r
@@ -307,7 +324,7 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return the points of an open line without the noise of standing runs at its ends."""
+    """Return the range of points of an open line without end points that do not advance, which are noise at rest."""
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
@@ -322,7 +339,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return points that advance from the last by half a spacing or more: noise of standing runs adds others."""
+    """Return the indices of the points that advance by at least half a spacing; others are noise at rest."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
@@ -336,7 +353,10 @@ def _points_ahead(plan_m: Floats) -> Indices:
 
 
 def _points_of_line(course: Course, ties: Ties) -> tuple[Indices, Integers]:
-    """Return the points of the line crossed by passes (a closed line ends where it began), and the passes at each."""
+    """Return the indices of the line's points with at least one pass, and the number of passes at each.
+
+    The first point of a closed line is repeated at the end. Raise ValueError if fewer than three points are left.
+    """
     count = np.bincount(ties.point, minlength=len(course))
     kept = np.flatnonzero(count > 0)
     closed = course.closed and len(kept) == len(course)
@@ -359,7 +379,7 @@ def _notes(
     beside: float,
     apart: float,
 ) -> tuple[str, ...]:
-    """Return sentences on the runs and their line."""
+    """Return the notes of the map on its runs, accuracy and gaps."""
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
     length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())

@@ -1,4 +1,4 @@
-"""Common line of several runs: its course without repetitions, and the position of each pass on the line."""
+"""Common line of several runs: its course without repetitions, and the positions of the runs' passes on it."""
 
 from __future__ import annotations
 
@@ -14,29 +14,31 @@ from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between two passes of one line.
-#: Parts of a leg nearer than this many widths (`same_line_m`) along the leg are no repetition of each other.
+#: Minimum distance along a leg between two parts that can be repetitions, in widths of the line (`same_line_m`).
 _APART_WIDTHS: Final = 3.0
-_MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
-_SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is smoothed [m].
-#: Longest gap without rows [s]; a longer gap is bridged up to a distance [m], and only if the run continues in its
-#: direction, within an angle of this cosine.
-_GAP_S: Final = 10.0
+_MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must fulfil a condition.
+_SEAM_M: Final = 200.0  #: Distance over which the difference of two passes is distributed where they are joined [m].
+_GAP_S: Final = 10.0  #: Time without rows that is a gap [s].
+#: Longest gap within a leg [m], and cosine of the largest change of direction over it; otherwise the leg ends.
 BRIDGED_M: Final = 500.0
 _GOES_ON: Final = 0.9
-_NEIGHBOURS: Final = 24  #: Number of neighbouring vertices that a point is compared with.
+_NEIGHBOURS: Final = 24  #: Number of nearest vertices that are compared with a point.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Leg:
-    """Part of a run without a change of direction, m selected rows at least a spacing apart."""
+    """Part of a run without a reversal, given by m selected rows at least a spacing apart."""
 
-    run: int
-    row: Indices  #: Shape (m,).
-    arc_m: Floats  #: Shape (m,).
-    point_m: Floats  #: East, north, up in the frame of the survey; shape (m, 3).
+    run: int  #: Index of the run.
+    row: Indices  #: Index of each selected row in the run, shape (m,).
+    arc_m: Floats  #: Distance from the first to each selected row, shape (m,).
+    point_m: Floats  #: East, north and up in the frame of the survey, shape (m, 3).
 
     def nodes_at(self, arc_m: Floats) -> tuple[Indices, Floats]:
-        """Return four rows about each arc length and their weights, shapes (q, 4): cubic, linear at the ends."""
+        """Return four rows around each arc length and their interpolation weights, shape (q, 4) each.
+
+        The interpolation is cubic, and linear at the ends of the leg.
+        """
         count = len(self.row)
         k = np.clip(np.searchsorted(self.arc_m, arc_m, side="right") - 1, 0, count - 2)
         nodes = np.clip(k[:, None] + np.arange(-1, 3), 0, count - 1)
@@ -54,7 +56,7 @@ class Leg:
         return self.row[nodes], weight
 
     def at(self, arc_m: Floats) -> Floats:
-        """Interpolate points, shape (q, 3) [m]."""
+        """Interpolate the positions at arc lengths, shape (q, 3) [m]."""
         rows, weight = self.nodes_at(arc_m)
         index = np.searchsorted(self.row, rows)
         return np.asarray(np.einsum("qi,qij->qj", weight, self.point_m[index]))
@@ -62,33 +64,33 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """The line as a polyline, J points; the last point of a closed line is joined to the first."""
+    """Line as a polyline of J points."""
 
-    point_m: Floats
-    closed: bool = False
+    point_m: Floats  #: East, north and up of the points in the frame of the survey, shape (J, 3).
+    closed: bool = False  #: Whether the last point is joined to the first.
 
     def __len__(self) -> int:
         return len(self.point_m)
 
     @property
     def direction(self) -> Floats:
-        """Horizontal direction at each point, unit vectors, shape (J, 2)."""
+        """Horizontal unit vector along the line at each point, shape (J, 2)."""
         return directions(self.point_m, closed=self.closed)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pass:
-    """Piece of a leg that lies on the line."""
+    """Part of a leg that is on the line, given at p positions."""
 
-    leg: int
-    sign: int  #: 1 along the line, -1 against it.
-    arc_m: Floats  #: Along the leg, rising; shape (p,).
-    #: Number of the point of the line with its fraction, monotone; beyond the last point on a closed line; shape (p,).
+    leg: int  #: Index of the leg.
+    sign: int  #: 1 in the direction of the line, -1 against it.
+    arc_m: Floats  #: Rising arc lengths along the leg, shape (p,).
+    #: Monotone fractional indices of points of the line; they go beyond the last point of a closed line; shape (p,).
     place: Floats
 
 
 def directions(point_m: Floats, *, closed: bool = False) -> Floats:
-    """Return the horizontal direction at each point of a polyline by its neighbours, unit vectors, shape (J, 2)."""
+    """Compute horizontal unit vectors along a polyline at its points, from the neighbouring points, shape (J, 2)."""
     plan = point_m[:, :2]
     step = np.roll(plan, -1, axis=0) - np.roll(plan, 1, axis=0) if closed else np.gradient(plan, axis=0)
     length = np.linalg.norm(step, axis=1, keepdims=True)
@@ -96,7 +98,10 @@ def directions(point_m: Floats, *, closed: bool = False) -> Floats:
 
 
 def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
-    """Divide a run where it turns back or was not observed; omit rows nearer than the spacing to the last row."""
+    """Divide a run into legs at reversals, within `turn_m`, and at gaps over which it is not straight.
+
+    Rows nearer than the spacing to the previous selected row are left out.
+    """
     spacing_m = limits.spacing_m
     rows = [0]
     for k in range(1, len(point_m)):
@@ -130,7 +135,7 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
 
 
 def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
-    """Return whether a run continues in its direction over the gap before a point."""
+    """Return whether a run continues in its direction over the gap before point `after`, of `BRIDGED_M` at most."""
     if not 0 < after < len(plan_m) - 1:
         return False
     gap = plan_m[after] - plan_m[after - 1]
@@ -144,13 +149,16 @@ def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
 
 
 def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
-    """Return arc lengths and points of a leg at even spacing."""
+    """Return arc lengths and positions of a leg at a constant spacing."""
     arc = np.arange(0.0, leg.arc_m[-1], spacing_m)
     return arc, leg.at(arc)
 
 
 def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
-    """Find the course of the line: the longest leg until it repeats itself, extended by the other legs at its ends."""
+    """Find the course of the line.
+
+    The course is the longest leg up to where it repeats itself, extended at its ends by the remaining legs.
+    """
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     order = sorted(range(len(legs)), key=lambda i: -float(legs[i].arc_m[-1]))
     first = _sample(legs[order[0]], spacing_m)[1]
@@ -167,7 +175,7 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
-    """Return the beginning of a polyline up to where it runs parallel to itself for some widths."""
+    """Return the course up to where a polyline runs parallel to an earlier part of itself for `_APART_WIDTHS`."""
     least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
@@ -191,14 +199,14 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return one turn of a closed line: from point `start` to the equal point `end`; the misclosure is distributed."""
+    """Return the closed course from point `start` to the same location at point `end`; distribute the misclosure."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
     gap[:2] -= along * float(along @ gap[:2])
     count = min(len(turn), int(_SEAM_M / spacing_m))
     turn[-count:] += gap * np.linspace(0.0, 1.0, count)[:, None]
-    # the last point is a spacing before the first
+    # drop points at the end so that the last point is about one spacing before the first
     ahead = (turn[:, :2] - turn[0, :2]) @ along
     near = np.linalg.norm(turn[:, :2] - turn[0, :2], axis=1) < 4.0 * spacing_m
     past = np.flatnonzero(near & (ahead > -0.5 * spacing_m) & (np.arange(len(turn)) > len(turn) // 2))
@@ -206,7 +214,7 @@ def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Cou
 
 
 def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) -> Course | None:
-    """Return the course extended by the part of a leg beyond one of its ends, None if there is none."""
+    """Return the course extended by the part of a leg beyond one of its ends; None if no part is beyond its ends."""
     place, sign, _ = match_points(course, points, width_m)
     least = int(_APART_WIDTHS * width_m / spacing_m)
     near_end = 2.0 * width_m / spacing_m
@@ -244,7 +252,11 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Return the fractional course point, direction (0: off the course) and distance to its right [m], shapes (q,)."""
+    """Match the points of a polyline to the course, shapes (q,).
+
+    Return the fractional index of the course point (NaN off the course), the direction of travel (1 along the course,
+    -1 against it, 0 off the course), and the distance to the right of the course [m].
+    """
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))
@@ -271,7 +283,7 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
 
 
 def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:
-    """Find the pieces of all legs that are on the course, and the length off the course [m]."""
+    """Find the parts of all legs that are on the course, and the total length off the course [m]."""
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     passes: list[Pass] = []
     beside = 0.0
@@ -313,7 +325,11 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Return the passes of the more frequent direction on its own track, and the tracks' distance, else 0 [m]."""
+    """Remove the passes of one direction if both directions are on separate tracks.
+
+    Return the passes of the more frequent direction and the distance of the tracks [m], or all passes and 0 if the
+    median distance is at most `tolerance_m`.
+    """
     across: dict[int, Floats] = {}
     for sign in (1, -1):
         found = [
@@ -335,17 +351,17 @@ def without_other_track(
 
 @dataclass(frozen=True, kw_only=True)
 class Ties:
-    """Ties of runs to the points of the line, m ties."""
+    """Connections of m positions interpolated in runs to points of the line."""
 
-    run: Indices  #: Shape (m,).
-    row: Indices  #: Rows of the run about the point, shape (m, 4).
-    weight: Floats  #: Weights of these rows, with the sum 1; shape (m, 4).
-    point: Indices  #: Shape (m,).
-    number: Indices  #: Number of the pass, shape (m,).
+    run: Indices  #: Index of the run, shape (m,).
+    row: Indices  #: Rows of the run between which the position is interpolated, shape (m, 4).
+    weight: Floats  #: Interpolation weights of the rows, with a sum of 1, shape (m, 4).
+    point: Indices  #: Index of the point of the line, shape (m,).
+    number: Indices  #: Index of the pass, shape (m,).
 
 
 def find_ties(course: Course, legs: Sequence[Leg], passes: Sequence[Pass]) -> Ties:
-    """Find where each pass crosses the points of the line."""
+    """Compute the interpolated position at which each pass goes by each point of the line."""
     parts: list[tuple[Indices, Indices, Floats, Indices, Indices]] = []
     for number, each in enumerate(passes):
         place, arc = each.sign * each.place, each.arc_m

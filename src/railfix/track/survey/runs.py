@@ -1,4 +1,4 @@
-"""Runs of a survey: positions of one receiver, and its steps between them."""
+"""Runs of a survey: positions of one receiver, and the observations behind them."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 
-#: Standard deviation of the common error of all positions of a run, by their quality (RTKLIB), plan and height [m]:
-#: orbits, ionosphere and reference frame, not reduced by averaging over the run.
+#: Standard deviations of the common error of all positions of a run, plan and height, by RTKLIB quality number [m]. The
+#: common error is due to orbits, ionosphere and reference frame, and is not reduced by averaging over the run.
 COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
-#: Standard deviation of the change of the vertical velocity in one second; 0.02 to 0.07 for road vehicles.
+#: Standard deviation of the change of vertical velocity in one second [m/s]; it is 0.02 to 0.07 for road vehicles.
 CLIMB_MPS2: Final = 0.05
 
 
 class SurveyLimits(Settings):
     """Assumptions of a survey."""
 
-    interval_s: float = Field(default=1.0, gt=0)  #: Least time between the positions used; faster logs are thinned.
-    #: Correlation of position errors, in time at standstill and in distance; positions within it count as one.
+    interval_s: float = Field(default=1.0, gt=0)  #: Minimum time between two positions; faster logs are thinned.
+    #: Correlation time at standstill and correlation length of position errors.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)
-    #: Standard deviation of the change of the horizontal velocity in one second, east and north: over five seconds, the
-    #: duration of curves and braking, the changes of three road vehicles are 1.2 to 1.8 times the root of the time.
+    #: Standard deviation of the change of horizontal velocity per axis in one second. Over five seconds, the duration
+    #: of curves and braking, the changes of three road vehicles were 1.2 to 1.8 m/s times the root of the time in s.
     acceleration_mps2: float = Field(default=1.5, gt=0)
-    freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t errors, which down-weight outliers.
+    freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t, which down-weights outliers.
     same_line_m: float = option(
         "Passes nearer to each other than this, in the same or the opposite direction, are on one line.",
         20.0,
@@ -59,22 +59,22 @@ class SurveyLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSignals(FrozenArrays):
-    """Ranges of a run and their changes, M ranges and C changes."""
+    """Observations of a run: M pseudoranges, and C changes of ranges between successive rows."""
 
     row: Indices  #: Row of the run, shape (M,).
-    sat_ecef_m: Floats  #: Satellites at transmission, shape (M, 3).
-    #: Corrected pseudoranges, and their standard deviations; shape (M,).
+    sat_ecef_m: Floats  #: Position of the satellite at transmission, shape (M, 3).
+    #: Corrected pseudoranges and their standard deviations, shape (M,).
     code_m: Floats
     sigma_m: Floats
-    clock: Indices  #: Number of the receiver clock, shape (M,).
-    step: Indices  #: Row at which each change begins; it ends at the next row; shape (C,).
-    #: The satellite at transmission, at both rows; shape (C, 3).
+    clock: Indices  #: Index of the receiver clock, shape (M,).
+    step: Indices  #: Row before each change, which is up to the next row; shape (C,).
+    #: Positions of the satellite at transmission for the rows before and after the change, shape (C, 3).
     before_ecef_m: Floats
     after_ecef_m: Floats
-    #: Change of the range by the carrier phase or Dopplers, shape (C,).
+    #: Change of the range from carrier phases or Dopplers, and its standard deviation; shape (C,).
     change_m: Floats
     change_sigma_m: Floats
-    by_doppler: Masks  #: Whether Dopplers give the change, shape (C,).
+    by_doppler: Masks  #: Whether the change is from Dopplers, shape (C,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,12 +82,12 @@ class SurveyRun(FrozenArrays):
     """Positions of one antenna in one run, n rows in order of time."""
 
     name: str
-    time: Datetimes  #: Shape (n,).
-    ecef_m: Floats  #: NaN without a position, shape (n, 3).
-    sigma_m: Floats  #: Standard deviations east, north, up; shape (n, 3).
-    #: Observations behind the positions: used instead of the positions, with several epochs at a time.
+    time: Datetimes  #: Times of the rows, strictly rising, shape (n,).
+    ecef_m: Floats  #: Positions, shape (n, 3); NaN without a position.
+    sigma_m: Floats  #: Standard deviations east, north and up, shape (n, 3).
+    #: Observations from which the positions were computed; if given, they are adjusted instead of the positions.
     signals: RunSignals | None = None
-    #: Standard deviation, plan and height, of the common error of all positions.
+    #: Standard deviations of the common error of all positions, in plan and height.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
 
     def __post_init__(self) -> None:
@@ -109,7 +109,11 @@ class SurveyRun(FrozenArrays):
 
 
 def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
-    """Return the positions of a log as a run, thinned, with sigmas of at least a third of `SIGMA_OF_QUALITY`."""
+    """Convert a position log to a run of a survey.
+
+    The positions are sorted and thinned to `limits.interval_s`; their sigmas are at least a third of
+    `SIGMA_OF_QUALITY`. Raise ValueError if fewer than three positions are left.
+    """
     rows = np.flatnonzero(np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time))
     rows = rows[np.argsort(log.time[rows], kind="stable")]
     rows = rows[rows_apart(log.time[rows], limits.interval_s)]
@@ -130,7 +134,7 @@ def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
 
 
 def rows_apart(time: Datetimes, interval_s: float) -> Indices:
-    """Select rows at least an interval apart, with a tolerance of a twentieth of the interval."""
+    """Return the indices of rows at least an interval apart, with a tolerance of a twentieth of the interval."""
     since = seconds(time - time[0]) if len(time) else np.zeros(0)
     kept: list[int] = []
     for k, at in enumerate(since.tolist()):
