@@ -355,7 +355,7 @@ def test_landxml_of_inframodel_is_read(tmp_path: Path) -> None:
 <CantStation station="260" appliedCant="0.150" curvature="cw"/></Cant></Alignment></Alignments></LandXML>"""
     )
     (segment,) = read_xml_segments(path, MapReading(height_datum="ellipsoidal"))
-    assert any("at most 0.15 in the file; taken in its unit of length" in note for note in segment.notes)
+    assert any("at most 0.15 in the file; assumed in its unit of length" in note for note in segment.notes)
     assert not any("do not meet" in note for note in segment.notes)
     assert segment.cant_m[-1] == pytest.approx(0.150)
     assert segment.radius_m[-1] == pytest.approx(800.0)
@@ -392,7 +392,7 @@ def test_landxml_cant_of_an_unknown_transition_is_refused(tmp_path: Path) -> Non
     )
     path = tmp_path / "line.xml"
     path.write_text(text)
-    with pytest.raises(InputFileError, match=r"alignment 'T1': cant of transition type 'wienerBogen' is not read"):
+    with pytest.raises(InputFileError, match=r"alignment 'T1': cant of transition type 'wienerBogen' is not supported"):
         read_track(path, height_datum="ellipsoidal")
 
 

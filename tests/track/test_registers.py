@@ -179,7 +179,7 @@ def test_segments_that_do_not_meet_and_broken_rows_are_sentences(tmp_path: Path)
     with pytest.raises(InputFileError, match=r"edge 'e1': segment 5 begins .* m from the previous one"):
         read_segments(path, MapReading())
     path.write_text(text.replace("circle", "spline"))
-    with pytest.raises(InputFileError, match=r"'spline'; line, circle and clothoid are read"):
+    with pytest.raises(InputFileError, match=r"'spline'; line, circle or clothoid was expected"):
         read_segments(path, MapReading())
     path.write_text(text.replace(f",{RADIUS},", ",,"))
     with pytest.raises(InputFileError, match=r"a circle has RADIUS ''; a number was expected"):

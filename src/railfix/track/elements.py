@@ -1,8 +1,8 @@
-"""Elements of an alignment in plan, profile and cant, as in design files (IFC, LandXML), and their segments.
+"""Elements of an alignment in plan, profile and cant, as in design files (IFC, LandXML), and points on them.
 
-The direction is the integral of the curvature in closed form, the position is the integral of the direction by
-Gauss-Legendre quadrature. Lengths are in plan, directions counter-clockwise from the x axis (easting), curvature
-positive to the left, as in IFC 4.3 and LandXML.
+The direction is the integral of the curvature in closed form. The position is the integral of the direction, by
+Gauss-Legendre quadrature. As in IFC 4.3 and LandXML, lengths are in plan, directions are counter-clockwise from the x
+axis (easting), and curvature is positive to the left.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 from railfix.track.transitions import OrdinateElement
 
-#: Fraction of the change of curvature or cant at a fraction t of the element, and its integral from 0 (IFC 4.3.2).
+#: Fraction of the change of curvature or cant at a fraction t of the length, and its integral from 0 to t (IFC 4.3.2).
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     "linear": (lambda t: t, lambda t: t**2 / 2.0),
     "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
@@ -44,49 +44,48 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
     ),
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_PIECE_RAD: Final = 0.5  #: Longest piece of one quadrature [rad of direction]; 12 nodes are exact to rounding below it.
-#: Spacing of an alignment's points: chords stay within 1 cm of arcs down to 100 m radius.
-_CHORD_M: Final = 0.01
-_LONGEST_M: Final = 25.0
-_CLOTHOID_POINTS: Final = 2001  #: Points of a profile clothoid, between which it is linear within 1 um.
-_JOINT_M: Final = 0.01  #: Elements that begin farther than this from the previous element's end are reported [m].
+_PIECE_RAD: Final = 0.5  #: Largest turn within one quadrature interval, for which 12 nodes are exact to rounding [rad].
+_CHORD_M: Final = 0.01  #: Largest distance of chords between an alignment's points from its arcs [m].
+_LONGEST_M: Final = 25.0  #: Largest spacing of an alignment's points [m].
+_CLOTHOID_POINTS: Final = 2001  #: Number of points of a profile clothoid, which is linear between them within 1 um.
+_JOINT_M: Final = 0.01  #: Largest distance between the end of an element and the start of the next without a note [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanElement:
-    """One element in plan."""
+    """Element in plan, whose curvature follows a law over its length."""
 
-    #: First point, easting and northing.
+    #: Easting and northing of the first point.
     x_m: float
     y_m: float
-    direction_rad: float  #: At the first point, counter-clockwise from the x axis.
-    #: Curvature at the ends, positive to the left [1/m].
+    direction_rad: float  #: Direction at the first point, counter-clockwise from the x axis.
+    #: Curvature at the first and the last point, positive to the left [1/m].
     first: float
     last: float
 
     length_m: float
-    law: str = "linear"  #: Key of `LAWS`.
-    #: For a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
-    #: rail rises. The law describes the path of the centre of gravity, at this distance from the track.
+    law: str = "linear"  #: Law of the curvature, a key of `LAWS`.
+    #: For a Viennese bend, height of the centre of gravity times the change of the cant angle, positive where the right
+    #: rail rises; 0 otherwise. The law then describes the path of the centre of gravity.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
-        """Return the curvature [1/m] at distances from the first point."""
+        """Return the curvature, positive to the left [1/m], at distances from the first point [m]."""
         t = way_m / self.length_m
         bend = self.lean_m / self.length_m**2 * 420.0 * t**2 * (1.0 - t) ** 2 * (1.0 - 2.0 * t)
         return np.asarray(self.first + (self.last - self.first) * LAWS[self.law][0](t) - bend)
 
     def direction_at(self, way_m: Floats) -> Floats:
-        """Return the direction [rad] at distances from the first point."""
+        """Return the direction, counter-clockwise from the x axis [rad], at distances from the first point [m]."""
         t = way_m / self.length_m
         change = (self.last - self.first) * self.length_m * LAWS[self.law][1](t)
         change = change - self.lean_m / self.length_m * 140.0 * t**3 * (1.0 - t) ** 3
         return np.asarray(self.direction_rad + self.first * way_m + change)
 
     def place_at(self, way_m: Floats) -> Floats:
-        """Return the easting and northing at distances from the first point, shape (n, 2) [m]."""
+        """Return easting and northing, shape (n, 2) [m], at distances from the first point [m]."""
         turn = max(abs(self.first), abs(self.last)) * self.length_m
-        pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even: Helmert's law has its knot in the middle
+        pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even, as Helmert's law has a knot in the middle
         knots = np.linspace(0.0, self.length_m, pieces + 1)
         whole = np.concatenate([np.zeros((1, 2)), np.cumsum(self._integral(knots[:-1], knots[1:]), axis=0)])
         piece = np.clip(np.searchsorted(knots, way_m, side="right") - 1, 0, pieces - 1)
@@ -98,26 +97,27 @@ class PlanElement:
         return np.stack([(half * _WEIGHTS * part(direction)).sum(axis=1) for part in (np.cos, np.sin)], axis=-1)
 
 
-#: An element in plan: by a law of the curvature over its length, or by ordinates over the tangent.
+#: Element in plan, defined by a law of the curvature over its length, or by ordinates over the tangent.
 Plan = PlanElement | OrdinateElement
 
 
 @dataclass(frozen=True)
 class Stations:
-    """Kilometrage of an alignment: distances in plan with the station just before and just after each, rising [m]."""
+    """Stations (kilometrage) of an alignment with jumps."""
 
+    #: Distance in plan of the start and of each jump, in rising order, and the stations just before and after it [m].
     rows: tuple[tuple[float, float, float], ...]
-    last_sign: float = 1.0  #: 1 where stations rise after the last row, -1 where they fall.
-    jump_m: float = 0.05  #: Half the length over which the kilometrage of points jumps.
+    last_sign: float = 1.0  #: Direction of the stations after the last row: 1 rising, -1 falling.
+    jump_m: float = 0.05  #: Half length of the interval between points in which the kilometrage jumps.
 
     @property
     def places_m(self) -> Floats:
-        """Distances in plan of points on both sides of each jump."""
+        """Distances in plan of the points on both sides of each jump [m]."""
         place = np.array([row[0] for row in self.rows[1:]])
         return np.concatenate([place - self.jump_m, place + self.jump_m])
 
     def at(self, place_m: Floats) -> Floats:
-        """Return the stations at distances in plan."""
+        """Return the stations at distances in plan, shape (n,) [m]."""
         place, _, ahead = np.array(self.rows).T
         row = np.clip(np.searchsorted(place, place_m, side="right") - 1, 0, len(place) - 1)
         signs = [*(np.sign(b[1] - a[2]) or 1.0 for a, b in pairwise(self.rows)), self.last_sign]
@@ -126,21 +126,21 @@ class Stations:
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileElement:
-    """One element of the profile: gradient, circular arc, parabola or clothoid."""
+    """Element of the profile: constant gradient, circular arc, parabola or clothoid."""
 
-    #: Distance and length in plan.
+    #: Start and length of the element, measured in plan along the alignment.
     start_m: float
     length_m: float
-    height_m: float  #: At the start.
-    #: Gradient at the ends [m/m].
+    height_m: float  #: Height at the start.
+    #: Gradient at start and end [m/m].
     first: float
     last: float
-    #: ``"circle"``, ``"clothoid"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
+    #: Shape: "circle", "clothoid" or "parabola"; a constant gradient is a parabola with equal gradients at both ends.
     arc: str = "parabola"
-    bend: float = 0.0  #: For a clothoid: curvature at the start, positive in a sag [1/m].
+    bend: float = 0.0  #: Curvature of a clothoid at the start, positive in a sag [1/m].
 
     def height_at(self, place_m: Floats) -> Floats:
-        """Return the height [m] at distances in plan."""
+        """Return the height at distances in plan, shape (n,) [m]."""
         way = place_m - self.start_m
         if self.arc == "parabola" or self.first == self.last:
             bend = (self.last - self.first) * way**2 / (2.0 * self.length_m)
@@ -153,7 +153,7 @@ class ProfileElement:
         return np.asarray(self.height_m - radius * (np.sqrt(1.0 - sine**2) - np.sqrt(1.0 - _sine(self.first) ** 2)))
 
     def gradient_at(self, place_m: Floats) -> Floats:
-        """Return the gradient [m/m] at distances in plan."""
+        """Return the gradient [m/m] at distances in plan, shape (n,) [m]."""
         share = (place_m - self.start_m) / self.length_m
         if self.arc == "parabola" or self.first == self.last:
             return np.asarray(self.first + (self.last - self.first) * share)
@@ -165,10 +165,13 @@ class ProfileElement:
 
     @cached_property
     def _clothoid(self) -> tuple[Floats, Floats, Floats]:
-        """Return distances, heights above the start and gradients of a clothoid, its angle as the square of length."""
+        """Distances in plan, heights above the start, and gradients at points of a clothoid.
+
+        The slope angle is a quadratic function of the length along the curve.
+        """
         start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
         length = self.length_m
-        for _ in range(20):  # the length along the curve whose projection is the length in plan
+        for _ in range(20):  # iterate the length along the curve until its projection is the length in plan
             way = np.linspace(0.0, length, _CLOTHOID_POINTS)
             angle = start + self.bend * way + (turn - self.bend * length) * (way / length) ** 2
             place, height = (
@@ -180,16 +183,18 @@ class ProfileElement:
 
 @dataclass(frozen=True, kw_only=True)
 class CantElement:
-    """One element of the cant: heights of both rails over the profile at its ends, by a law of `LAWS` [m]."""
+    """Element of the cant, in which the heights of both rails follow a law."""
 
+    #: Start and length of the element, measured in plan along the alignment.
     start_m: float
     length_m: float
+    #: Heights of the left and the right rail above the profile, at start and end.
     left_m: tuple[float, float]
     right_m: tuple[float, float]
-    law: str = "linear"
+    law: str = "linear"  #: Law of the heights, a key of `LAWS`.
 
     def rails_at(self, place_m: Floats) -> tuple[Floats, Floats]:
-        """Return the heights of the left and the right rail over the profile [m]."""
+        """Return the heights of left and right rail above the profile at distances in plan, shape (n,) each [m]."""
         share = LAWS[self.law][0](np.clip((place_m - self.start_m) / self.length_m, 0.0, 1.0))
         left, right = (np.asarray(a + (b - a) * share) for a, b in (self.left_m, self.right_m))
         return left, right
@@ -203,18 +208,21 @@ def _sine(gradient: float) -> float:
 class AlignmentPoints:
     """Points of an alignment in grid coordinates, n points."""
 
-    place_m: Floats  #: Length in plan from the start of the alignment, shape (n,).
+    place_m: Floats  #: Distance in plan from the start of the alignment, shape (n,).
     xy_m: Floats  #: Easting and northing, shape (n, 2).
-    height_m: Floats  #: Middle between the rail tops; NaN without a profile; shape (n,).
-    curvature: Floats  #: Positive to the left, shape (n,) [1/m].
-    cant_m: Floats  #: Right rail above left rail; NaN without cant; shape (n,).
-    gradient: Floats  #: NaN without a profile, shape (n,).
+    height_m: Floats  #: Height of the middle between the rail tops, shape (n,); NaN without a profile.
+    curvature: Floats  #: Curvature, positive to the left, shape (n,) [1/m].
+    cant_m: Floats  #: Height of the right above the left rail, shape (n,); NaN without cant.
+    gradient: Floats  #: Gradient of the profile [m/m], shape (n,); NaN without a profile.
 
 
 def alignment_at(
     place_m: Floats, plan: Sequence[Plan], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
 ) -> AlignmentPoints:
-    """Return points of an alignment at lengths in plan (n,), each by the first point of its own element."""
+    """Compute the points of an alignment at distances in plan, shape (n,) [m].
+
+    Each position is computed from the first point of its element, so that open joints do not add up.
+    """
     starts = plan_starts(plan)
     xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
     for rows, k in _by_start(place_m, starts):
@@ -235,12 +243,15 @@ def alignment_at(
 
 
 def plan_starts(plan: Sequence[Plan]) -> Floats:
-    """Return the length in plan at the start of each element, shape (elements,) [m]."""
+    """Return the distance in plan from the start of the alignment to each element, shape (elements,) [m]."""
     return np.cumsum([0.0, *(element.length_m for element in plan)])[:-1]
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return rows and numbers of the elements at the distances: the last that begins before, or the first."""
+    """Return for each element that is needed the mask of the distances within it, and its index.
+
+    A distance belongs to the last element that begins before it, or to the first element.
+    """
     if not len(starts):
         return []
     index = np.maximum(np.searchsorted(starts, place_m, side="right") - 1, 0)
@@ -253,7 +264,10 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Return points of an alignment with chords within 1 cm of its arcs, further points, and notes on open joints."""
+    """Compute points of an alignment whose chords are within 1 cm of its arcs, and notes on open joints.
+
+    `at_m` are distances in plan of additional points [m].
+    """
     starts = plan_starts(plan)
     length = starts[-1] + plan[-1].length_m
     places = [np.array([0.0, length]), np.asarray(at_m, dtype=np.float64)]
@@ -274,17 +288,17 @@ def alignment_points(
     return alignment_at(place, plan, profile, cant), notes
 
 
-_PROFILE_BEYOND_M: Final = 50.0  #: Longest part of an alignment to which its profile is extended [m].
+_PROFILE_BEYOND_M: Final = 50.0  #: Largest length of an alignment beyond its profile, which is extended there [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Design:
-    """Elements of one alignment, in the order of the line, and its stations."""
+    """Elements of one alignment in the order of the line, and its stations."""
 
     plan: Sequence[Plan]
     profile: Sequence[ProfileElement] = ()
     cant: Sequence[CantElement] = ()
-    stations: Stations | None = None
+    stations: Stations | None = None  #: Stations; None if the file has none.
 
 
 def segment_of_design(
@@ -296,7 +310,12 @@ def segment_of_design(
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
-    """Return the points of one alignment; `grid`: easting, northing, height, cosine, sine, scale of the file."""
+    """Create a segment of points on one alignment.
+
+    `grid` is the transformation from the file's coordinates to the grid: easting, northing and height of the origin
+    [m], cosine and sine of the rotation, and scale. Raise InputFileError or SettingsError if plan, profile or CRS are
+    not valid.
+    """
     plan, profile, stations = design.plan, design.profile, design.stations
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
@@ -316,7 +335,7 @@ def segment_of_design(
     xy /= unit
     curvature = points.curvature
     if grid is None and is_within(crs, xy[:, ::-1]) and not is_within(crs, xy):
-        # northing before easting turns the plane over, so a curve to the left in the file is a curve to the right
+        # exchanging easting and northing mirrors the plane, so that curves to the left become curves to the right
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
     source, heights = f"{path} ({name})", None
@@ -346,7 +365,10 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Reject a profile that lacks more of the plan than `_PROFILE_BEYOND_M`; note the missing part."""
+    """Check that a profile covers the plan up to `_PROFILE_BEYOND_M`; return a note if it is shorter than the plan.
+
+    Raise InputFileError otherwise.
+    """
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)
     left_out = max(low, 0.0) + max(length - high, 0.0)
@@ -357,7 +379,10 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
 
 
 def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> None:
-    """Reject an alignment whose length on the map differs from its design length, as in a wrong grid."""
+    """Raise InputFileError if the length of an alignment on the map differs from its design length.
+
+    This occurs with a wrong CRS, or elements that do not meet.
+    """
     designed = sum(element.length_m for element in plan)
     geod = CRS.from_user_input(place.frame).get_geod()
     found = float(geod.line_length(place.longitude_deg, place.latitude_deg)) if geod is not None else designed
@@ -370,7 +395,10 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
 
 
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
-    """Return the side of the curve at each point; on straight track, as at the foot of a ramp, of the nearest curve."""
+    """Return the sign of the curvature at each point, shape (n,); on straight track that of the nearest curve.
+
+    A cant ramp can begin on straight track. Without any curve the sign is 1.
+    """
     if not bent.any():
         return np.ones(len(curvature))
     place = np.arange(len(curvature))
@@ -381,7 +409,7 @@ def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
 
 
 def is_within(crs: str, xy: Floats) -> bool:
-    """Return whether coordinates lie in the area of use of a CRS; True for a CRS without an area."""
+    """Return whether all coordinates (n, 2) are in the area of use of a CRS; True for a CRS without an area."""
     system = CRS.from_user_input(crs)
     if system.area_of_use is None:
         return True

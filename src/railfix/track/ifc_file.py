@@ -1,4 +1,4 @@
-"""Alignments of IFC 4.3 files: the segments in plan, profile and cant, evaluated as `railfix.track.elements`."""
+"""Reader of IFC 4.3 alignments, whose segments in plan, profile and cant become `railfix.track.elements`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _LAWS: Final = {
 _ARCS: Final = {
     "CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle", "CLOTHOID": "clothoid",
 }  # fmt: skip
-#: Least gain in the distance to the next element for which another form of the cubic parabola is used [m].
+#: Minimum reduction of the distance to the next element by another form of the cubic parabola [m].
 _SIMILAR_M: Final = 1e-3
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
 _PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
@@ -53,7 +53,7 @@ class _Entity:
 
 @dataclass(frozen=True)
 class _Placement:
-    """Location and direction of axes in the project."""
+    """Origin and direction of coordinate axes in the project."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -61,7 +61,7 @@ class _Placement:
     turn_rad: float = 0.0
 
     def then(self, x: float, y: float, z: float, turn: float) -> _Placement:
-        """Return axes given relative to these axes."""
+        """Return the placement of axes that are given relative to this placement."""
         cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
         return _Placement(
             float(self.x_m + cosine * x - sine * y),
@@ -72,7 +72,7 @@ class _Placement:
 
 
 class _Step:
-    """Entities of a STEP physical file (ISO 10303-21) by number."""
+    """Entities of a STEP physical file (ISO 10303-21), by their number."""
 
     def __init__(self, path: FilePath) -> None:
         self.path = str(path)
@@ -89,7 +89,7 @@ class _Step:
     def at(self, reference: Any, *, what: str) -> _Entity:
         if isinstance(reference, str) and reference.startswith("#") and int(reference[1:]) in self.entities:
             return self.entities[int(reference[1:])]
-        raise InputFileError(self.path, f"{what} refers to {reference}, which the file does not have")
+        raise InputFileError(self.path, f"{what} refers to {reference}, which is not in the file")
 
 
 def _values(text: str) -> list[Any]:
@@ -112,7 +112,11 @@ def _values(text: str) -> list[Any]:
 
 
 def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read alignments of an IFC file; heights are of the middle between the rail tops (IfcSegmentedReferenceCurve)."""
+    """Read the alignments of an IFC file as segments.
+
+    Heights are of the middle between the rail tops (IfcSegmentedReferenceCurve). Raise InputFileError if there is no
+    alignment with a horizontal layout, or an element is not valid or not supported.
+    """
     step = _Step(path)
     nested = {entity.values[4]: entity.values[5] for _, entity in step.of_kind("IFCRELNESTS")}
     scale, angle = _units(step)
@@ -141,11 +145,11 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
         uneven = sum(_is_uneven(e) for e in elements.get("IFCALIGNMENTCANT", []))
         notes: tuple[str, ...] = ()
         if uneven:
-            notes = (f"{uneven} segments of constant cant have two values and are taken as linear transitions",)
+            notes = (f"{uneven} segments of constant cant have two values and are read as linear transitions",)
         vertical = [entity.values for entity in elements.get("IFCALIGNMENTVERTICAL", [])]
         graded = sum(v[-1] == ".CONSTANTGRADIENT." and v[5] != v[6] for v in vertical)
         if graded:
-            notes += (f"{graded} segments of constant gradient have two values, of which the first is taken",)
+            notes += (f"{graded} segments of constant gradient have two values, of which the first is used",)
         xy, system = _map_conversion(step, scale)
         placement = _place(step, alignment, step.at(layouts["IFCALIGNMENTHORIZONTAL"], what="a layout"), scale)
         moved, profile = _move(_with_cubics(plan, path=str(path), name=str(name)), profile, placement)
@@ -169,7 +173,7 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _units(step: _Step) -> tuple[float, float]:
-    """Return the file's units of length [m] and angle [rad]."""
+    """Return the units of length [m] and of angle [rad] of the file."""
     length = angle = 1.0
     assigned = {r for _, e in step.of_kind("IFCUNITASSIGNMENT") for r in e.values[0]}
     for number, entity in step.entities.items():
@@ -193,7 +197,10 @@ def _units(step: _Step) -> tuple[float, float]:
 def _map_conversion(
     step: _Step, unit: float
 ) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
-    """Return easting, northing, height, cosine, sine and scale of the IfcMapConversion, and the CRS it names."""
+    """Return easting, northing, height [m], cosine, sine and scale of the IfcMapConversion, and the name of its CRS.
+
+    Both are None without an IfcMapConversion. Raise InputFileError if the scale does not match the units.
+    """
     found = step.of_kind("IFCMAPCONVERSION")
     if not found:
         return None, None
@@ -213,7 +220,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of its layout in plan if this is relative to the alignment."""
+    """Return the placement of an alignment, or of its horizontal layout if that is relative to the alignment."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative
@@ -226,20 +233,20 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
             directions = [None, directions[0]]
         axis, towards = directions
         if axis is not None and not np.allclose(axis[:2], 0.0, atol=1e-9):
-            raise InputFileError(step.path, "an alignment is placed on axes that are not vertical, which is not read")
+            raise InputFileError(step.path, "an alignment is placed on axes that are not vertical: not supported")
         turn = 0.0 if towards is None else float(np.arctan2(towards[1], towards[0]))
         at = at.then(x * scale, y * scale, z * scale, turn)
     return at
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return placements from an object to the world; InputFileError if a placement is not local."""
+    """Return the references of placements from an object to the world; InputFileError if a placement is not local."""
     found: list[Any] = []
     while reference is not None and reference not in found:
         entity = step.at(reference, what="ObjectPlacement")
         if entity.kind != "IFCLOCALPLACEMENT":
             raise InputFileError(
-                step.path, f"an alignment is placed by {entity.kind}, which is not read; IfcLocalPlacement is"
+                step.path, f"an alignment is placed by {entity.kind}, which is not supported; IfcLocalPlacement is"
             )
         found.append(reference)
         reference = entity.values[0]
@@ -249,8 +256,8 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
     """Return the elements, with cubic parabolas as ordinates over the tangent.
 
-    They are as in IFC 4.3 (``y = x^3 / (6 R L)``), or by the projected length or with Japan's correction if the next
-    element begins at the end of that form.
+    A parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``), unless the next element begins at the end of the form
+    with the projected length, or of the form with the Japanese correction.
     """
     result: list[Plan] = []
     for element, after in zip(plan, [*plan[1:], None], strict=True):
@@ -258,7 +265,7 @@ def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]
             result.append(element)
             continue
         if (element.first == 0.0) == (element.last == 0.0):
-            raise InputFileError(path, f"alignment {name!r}: a cubic transition between two curves is not read")
+            raise InputFileError(path, f"alignment {name!r}: a cubic transition between two curves is not supported")
         own = {key: getattr(element, key) for key in ("x_m", "y_m", "direction_rad", "first", "last", "length_m")}
         forms = [cubic_of_length(**own, variant=variant) for variant in ("length", "tangent", "corrected")]
         gaps = [0.0] * len(forms)
@@ -271,7 +278,7 @@ def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]
 
 
 def _with_bends(profile: list[ProfileElement]) -> list[ProfileElement]:
-    """Return the elements, clothoids with the curvature of the element before them at their start."""
+    """Return the elements of a profile; a clothoid begins with the curvature at the end of the previous element."""
     result: list[ProfileElement] = []
     bend = 0.0
     for element in profile:
@@ -286,7 +293,7 @@ def _with_bends(profile: list[ProfileElement]) -> list[ProfileElement]:
 
 
 def _move(plan: list[Plan], profile: list[ProfileElement], at: _Placement) -> tuple[list[Plan], list[ProfileElement]]:
-    """Return the elements in the coordinates of the project."""
+    """Return the elements transformed from the placement of the alignment to the coordinates of the project."""
     moved = []
     for element in plan:
         placed = at.then(element.x_m, element.y_m, 0.0, element.direction_rad)
@@ -297,7 +304,7 @@ def _move(plan: list[Plan], profile: list[ProfileElement], at: _Placement) -> tu
 def _law(step: _Step, entity: _Entity, kinds: dict[str, str]) -> str:
     kind = str(entity.values[-1]).strip(".")
     if kind not in kinds:
-        raise InputFileError(step.path, f"{entity.kind} of kind {kind} is not read; known are {', '.join(kinds)}")
+        raise InputFileError(step.path, f"{entity.kind} of kind {kind} is not supported; expected one of {', '.join(kinds)}")
     return kinds[kind]
 
 
@@ -305,10 +312,10 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
     point, direction, first, last, length = entity.values[2:7]
     x, y, *rest = step.at(point, what=entity.kind).values[0]
     if len(rest) > 1:
-        raise InputFileError(step.path, f"point {point} has {2 + len(rest)} coordinates; are there commas in numbers?")
+        raise InputFileError(step.path, f"point {point} has {2 + len(rest)} coordinates; check for commas in numbers")
     law = _law(step, entity, {k: v for k, v in _LAWS.items() if "CANT" not in k and k != "LINEARTRANSITION"})
     if entity.values[-1] == ".CIRCULARARC.":
-        last = first  # some programs write 0, or the radius of the next element (IFC 4.3.2: both are the same)
+        last = first  # some programs write 0, or the radius of the next element; in IFC 4.3.2 both radii are equal
     return PlanElement(
         x_m=x * scale,
         y_m=y * scale,
@@ -321,7 +328,10 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
 
 
 def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
-    """Return the elements in plan, Viennese bends with the lean of their cant; `leans` are metres per metre of cant."""
+    """Return the elements in plan, with `lean_m` of Viennese bends from the change of cant over them.
+
+    `leans` are the heights of the centre of gravity divided by the gauge, one per element.
+    """
     result = []
     for element, lean, start in zip(plan, leans, plan_starts(plan), strict=True):
         if element.law == "viennese":

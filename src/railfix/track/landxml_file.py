@@ -1,4 +1,4 @@
-"""Alignments of LandXML 1.2: elements in plan, profile, cant and stations, evaluated as `railfix.track.elements`."""
+"""Reader of LandXML 1.2 alignments, whose elements in plan, profile and cant become `railfix.track.elements`."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ _UNITS: Final = {
     "inch": 0.0254,
     "mile": 1609.344,
 }
-#: Transitions given by ordinates over the tangent (`railfix.track.transitions`): with End, which every spiral has, the
-#: cubics are one curve, with and without Japan's correction.
+#: Transitions given by ordinates over the tangent (`railfix.track.transitions`). All cubic types are equal, with and
+#: without the Japanese correction, because every spiral has an End, which determines the ordinate.
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
-#: The biquadratic parabola (of InfraModel, Finland) is Helmert's law: the curvature follows two parabolas.
+#: Laws of curvature of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve, whose
+#: curvature consists of two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
     "bloss": "bloss",
@@ -46,16 +47,16 @@ _SPIRALS: Final = {
     "biquadraticParabola": "helmert",
 }
 _CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHalfWave": "cosine"}
-_SAME_M: Final = 1e-6  #: Elements shorter than this have no direction and are left out [m].
-#: Half the length over which the kilometrage jumps at a station equation [m].
+_SAME_M: Final = 1e-6  #: Length below which an element has no direction and is left out [m].
+#: Half length of the interval in which the kilometrage jumps at a station equation [m].
 _JUMP_M: Final = 0.05
-#: Least and largest fraction of the ordinate of a cubic parabola at the end of a spiral.
+#: Smallest and largest ratio of the curvature of a transition at its end to the reciprocal of the stated radius.
 _ORDINATE_SHARE: Final = (0.9, 1.25)
-_BROKEN_RAD: Final = 0.1  #: Change of direction at a joint above which the order of the coordinates is wrong [rad].
+_BROKEN_RAD: Final = 0.1  #: Change of direction at a joint that indicates a wrong order of coordinates [rad].
 
 
 def finite_number(text: Any) -> float:
-    """Return the finite number in a text; ValueError if there is none."""
+    """Return a text as a finite number; raise ValueError if it is not a number or not finite."""
     value = float(text)
     if not np.isfinite(value):
         raise ValueError(f"{text} is not finite")
@@ -63,7 +64,10 @@ def finite_number(text: Any) -> float:
 
 
 def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Segment]:
-    """Read the alignments below the root of a LandXML file as segments."""
+    """Read the alignments of a LandXML file, given its root element, as segments.
+
+    Raise InputFileError if there is no alignment, or an element is not valid or not supported.
+    """
     unit = root.find(".//{*}Metric")
     unit = root.find(".//{*}Imperial") if unit is None else unit
     of_length = "meter" if unit is None else unit.get("linearUnit", "meter")
@@ -88,7 +92,8 @@ def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Seg
             stations = _read_stations(path, alignment, scale, start)
         except KeyError as error:
             raise InputFileError(
-                path, f"alignment {name!r}: cant of transition type {error} is not read; {', '.join(_CANT_LAWS)} are"
+                path,
+                f"alignment {name!r}: cant of transition type {error} is not supported; {', '.join(_CANT_LAWS)} are",
             ) from None
         except (TypeError, ValueError, AttributeError):
             raise InputFileError(
@@ -110,7 +115,7 @@ def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Seg
 
 
 def _notes(alignment: Any, name: str) -> tuple[str, ...]:
-    """Return the notes on unused parts of an alignment."""
+    """Return notes on the parts of an alignment that are not used."""
     notes = []
     if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
         notes.append(f"{name}: the first of {count} profiles is used")
@@ -118,12 +123,15 @@ def _notes(alignment: Any, name: str) -> tuple[str, ...]:
 
 
 def _elements(parent: Any) -> list[Any]:
-    """Return the children that are neither comments nor extensions of a country or program (`Feature`)."""
+    """Return the child elements, without comments and without national or program extensions (`Feature`)."""
     return [e for e in parent if isinstance(e.tag, str) and e.tag.rsplit("}", 1)[-1] != "Feature"]
 
 
 def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Stations:
-    """Return distances in plan, with the stations just before and after, of the start and of station equations."""
+    """Return the stations of an alignment, from its start and its station equations.
+
+    Raise InputFileError if the station equations are not in the order of the line.
+    """
     rows, before, sign = [(0.0, start, start)], (0.0, start), 1.0
     for equation in alignment.iterfind("{*}StaEquation"):
         ahead = finite_number(equation.get("staAhead")) * scale
@@ -141,16 +149,16 @@ def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Sta
 
 
 def _point(element: Any, name: str, scale: float, easting_first: bool) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the easting and northing of a child."""
+    """Return the easting and northing of a child element, shape (2,) [m]."""
     first, second = (finite_number(v) for v in element.find(f"{{*}}{name}").text.split()[:2])
     return np.array([first, second] if easting_first else [second, first]) * scale
 
 
 def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -> tuple[list[Plan], tuple[str, ...]]:
-    """Return the elements in plan, and a note where the file has easting before northing, against LandXML.
+    """Return the elements in plan, and a note if the file has easting before northing, which violates LandXML.
 
-    With the chosen order the coordinates lie in the area of the CRS; if both orders do, elements continue the direction
-    of their predecessors.
+    The order is that in which the coordinates are in the area of the CRS. If both are, it is the order with fewer
+    breaks of direction between elements. Raise InputFileError if the two criteria contradict each other.
     """
     plans, broken, inside = [], [], []
     for easting_first in (False, True):
@@ -164,8 +172,8 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             orders = ("northing first", "easting first")
             raise InputFileError(
                 path,
-                f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the other side "
-                f"than they say (rot), with {orders[1 - chosen]} the reverse; correct the order of the coordinates",
+                f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the opposite side "
+                f"of rot; with {orders[1 - chosen]} it is the reverse; correct the order of the coordinates",
             )
     else:
         chosen = int(broken[1] < broken[0])
@@ -181,7 +189,7 @@ def _turn_at(before: Plan, after: Plan) -> float:
 
 
 def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Plan | None:
-    """Return an element in plan; None where it has no length."""
+    """Return an element in plan; None if it has no length. Raise InputFileError if its type is not supported."""
     kind = element.tag.rsplit("}", 1)[-1]
     start, end = (_point(element, name, scale, easting_first) for name in ("Start", "End"))
     if kind in ("Line", "Curve", "Spiral") and np.hypot(*(end - start)) < _SAME_M:
@@ -203,17 +211,19 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
         middle = _point(element, "PI", scale, easting_first)
         texts = [element.get(k) for k in ("radiusStart", "radiusEnd")]
         radii = [0.0 if text == "INF" else finite_number(text) * scale for text in texts]
-        first, last = (side / radius if radius else 0.0 for radius in radii)  # programs write 0 for a straight end, too
+        first, last = (side / radius if radius else 0.0 for radius in radii)  # some programs write 0 for a straight end
         if element.get("spiType") in _ORDINATES:
             return _read_ordinates(path, _ORDINATES[element.get("spiType")], (start, middle, end), (first, last))
         length, law = finite_number(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
-        if last == 0.0:  # parabolas are laid out from the tangent at the straight; half the bend is turned by each law
+        if last == 0.0:  # from the tangent at the straight end; each law turns by half of curvature times length
             direction = np.arctan2(*(end - middle)[::-1]) - first * length / 2.0
         else:
             direction = np.arctan2(*(middle - start)[::-1])
     else:
         kind = f"{kind} {element.get('spiType') or ''}".strip()
-        raise InputFileError(path, f"element {kind} is not read; Line, Curve and Spiral ({', '.join(_CANT_LAWS)}) are")
+        raise InputFileError(
+            path, f"element {kind} is not supported; Line, Curve and Spiral ({', '.join(_CANT_LAWS)}) are"
+        )
     return PlanElement(
         x_m=float(start[0]),
         y_m=float(start[1]),
@@ -228,11 +238,16 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
 def _read_ordinates(
     path: str, shape: Shape, points: tuple[Floats, Floats, Floats], curvature: tuple[float, float]
 ) -> OrdinateElement:
-    """Return a transition of ordinates through its ends, with the tangent at its straight end towards its PI."""
+    """Create a transition of ordinates through start and end, whose tangent at the straight end points to the PI.
+
+    Raise InputFileError if no end, or both ends are straight, or the curvature does not match the stated radius.
+    """
     start, middle, end = points
     into = curvature[0] == 0.0
     if (curvature[0] == 0.0) == (curvature[1] == 0.0):
-        raise InputFileError(path, f"a {shape} transition between two curves is not read; one end has to be straight")
+        raise InputFileError(
+            path, f"a {shape} transition between two curves is not supported; one end has to be straight"
+        )
     straight, other = (start, end) if into else (end, start)
     along = (middle - straight) / np.hypot(*(middle - straight))
     tangent, ordinate = along @ (other - straight), along[0] * (other - straight)[1] - along[1] * (other - straight)[0]
@@ -250,20 +265,23 @@ def _read_ordinates(
         raise InputFileError(
             path, f"the curvature at the end of a {shape} transition does not match its radius ({share:.2f} times)"
         )
-    if not into:  # the direction at the curve is the tangent's direction less the turn
+    if not into:  # convert the direction at the straight end to the direction at the curved end
         element = replace(element, direction_rad=element.direction_rad + element.turn_rad)
     return element
 
 
 def _read_profile(path: str, profile: Any, scale: float, start: float) -> list[ProfileElement]:
-    """Return the elements of points of vertical intersection and the curves at them."""
+    """Return the elements of a profile, from its points of vertical intersection (PVI) and the curves at these points.
+
+    The list is empty without a profile. Raise InputFileError if stations do not rise or a type is not supported.
+    """
     if profile is None:
         return []
     points = []
     for element in _elements(profile):
         kind = element.tag.rsplit("}", 1)[-1]
         if kind not in ("PVI", "ParaCurve", "CircCurve"):
-            raise InputFileError(path, f"profile element {kind} is not read; PVI, ParaCurve and CircCurve are")
+            raise InputFileError(path, f"profile element {kind} is not supported; PVI, ParaCurve and CircCurve are")
         place, height = (finite_number(v) * scale for v in element.text.split()[:2])
         points.append((kind, place - start, height, finite_number(element.get("length") or 0.0) * scale))
     if any(b[1] <= a[1] for a, b in pairwise(points)):
@@ -298,8 +316,10 @@ def _read_profile(path: str, profile: Any, scale: float, start: float) -> list[P
 
 
 def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
-    """Return elements between cant stations and notes; the outer rail is raised unless named; units are mm, inches
-    where lengths are imperial (LandXML 1.2), metres in InfraModel.
+    """Return the elements between cant stations, and notes.
+
+    The outer rail is raised unless the file has another rotation point. Cant is in millimetres, or in inches if lengths
+    are imperial (LandXML 1.2); InfraModel has metres.
     """
     if cant is None:
         return [], ()
@@ -311,11 +331,11 @@ def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement]
     if 0.0 < np.abs(applied).max(initial=0.0) < 1.0:
         unit = scale
         notes = (
-            f"cant: at most {np.abs(applied).max():g} in the file; taken in its unit of length, not in millimetres",
+            f"cant: at most {np.abs(applied).max():g} in the file; assumed in its unit of length, not in millimetres",
         )
     stations, laws = [], []
     for element, value in zip(found, applied * unit, strict=True):
-        # clockwise is a curve to the right: the left rail is the outer one
+        # in a clockwise curve, to the right, the left rail is the outer rail
         outer, inner = value * (1.0 - lowered), -value * lowered
         rails = (outer, inner) if element.get("curvature") == "cw" else (inner, outer)
         stations.append((finite_number(element.get("station")) * scale - start, rails))

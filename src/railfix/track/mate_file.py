@@ -1,8 +1,9 @@
-"""Track tables of EGNSS MATE: edges of lines, circles and clothoids, with gradients and cant.
+"""Reader of the track tables of EGNSS MATE: edges of lines, circles and clothoids, with gradients and cant.
 
-https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the arc from its north pole, a
-clothoid by its point of zero curvature, the azimuth there and the arc from it. The tables state neither which side is
-positive, nor the constant of a clothoid: the form with which a segment meets its neighbours on its edge is used.
+The tables are described at https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the
+arc length from its northernmost point. A clothoid is given by its point of zero curvature, the azimuth at this point
+and the arc length from it. The tables define neither the sign of curves nor the constant of a clothoid. Therefore the
+interpretation is used with which a segment meets the adjacent segments of its edge.
 """
 
 from __future__ import annotations
@@ -26,14 +27,17 @@ from railfix.track.elements import CantElement, Design, PlanElement, ProfileElem
 from railfix.track.georeference import EllipsoidalHeights, georeference
 from railfix.track.route import MapReading, Segment, make_segment
 
-#: CRS of coordinates in degrees with their ellipsoidal height (ETRS89).
+#: CRS of the points: latitude, longitude and ellipsoidal height in ETRS89.
 _ETRS89: Final = "EPSG:4937"
 _NUMBERS: Final = ("LATITUDE_ETRS89", "LONGITUDE_ETRS89", "ALTITUDE_ETRS89", "RADIUS", "CANT", "GRADIENT")
 _POINT: Final = ("TRACK_EDGE_ID", "POSITION", *_NUMBERS[:3])
 
 
 def read_edges(path: Path, reading: MapReading) -> list[Segment]:
-    """Read the edges of S_DM_TRACKPOINT, by default in ETRS89, or of S_DM_TRACK_SEGMENT_POSITION."""
+    """Read the track edges of a table S_DM_TRACKPOINT or S_DM_TRACK_SEGMENT_POSITION as segments.
+
+    Points of S_DM_TRACKPOINT are in ETRS89 unless `reading` gives a CRS. Raise InputFileError for an invalid table.
+    """
     if mate_table(path) != "S_DM_TRACKPOINT":
         return _read_segments(path, reading)
     table = read_mate(path, _POINT).sort("TRACK_EDGE_ID", "POSITION", maintain_order=True)
@@ -42,7 +46,10 @@ def read_edges(path: Path, reading: MapReading) -> list[Segment]:
 
 
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
-    """Return the points of one track edge; cant is in millimetres; a missing or zero radius is straight track."""
+    """Create a segment of the points of one track edge.
+
+    The table has cant in millimetres; a missing or zero radius is straight track.
+    """
     values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
     for name in _NUMBERS[:3]:
         if not np.isfinite(values[name]).all():
@@ -68,13 +75,16 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Segments of an edge that are farther apart than this do not meet [m].
+#: Largest distance between two successive segments of an edge [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
 
 def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the edges of the tables as segments, in the order of the file; InputFileError where they do not meet."""
+    """Read edges from S_DM_TRACK_SEGMENT_POSITION, and from the tables of gradient and cant in the same folder.
+
+    Raise InputFileError if the segments of an edge do not meet.
+    """
     gradients, cants = (_rows(path, name) for name in (_GRADIENT, _CANT))
     found = []
     for edge, rows in _rows(path, None).items():
@@ -89,7 +99,10 @@ def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
-    """Return rows of each edge by their distance from its start; also of another table in the same folder."""
+    """Return the rows of each edge, sorted by their distance from its start.
+
+    They are from the file, or from another `table` in its folder; without that table the result is empty.
+    """
     file = Path(path)
     if table is not None:
         names = {entry.name.upper(): entry for entry in file.parent.iterdir()}
@@ -115,7 +128,7 @@ def _number(path: str, row: Row, name: str) -> float:
 
 
 def _find_crs(cell: str) -> str | None:
-    """Return the CRS of a UTM cell ("32T"), or of the Swiss grid."""
+    """Return the CRS of a UTM cell ("32T"), or of the Swiss grid ("LV95"); None for any other text."""
     if cell.strip().upper() == "LV95":
         return "EPSG:2056"
     zone = re.fullmatch(r"\s*(\d{1,2})\s*([C-X])?\s*", cell.upper())
@@ -125,7 +138,7 @@ def _find_crs(cell: str) -> str | None:
 
 
 def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
-    """Return the elements of an edge, each in the form that meets its neighbours best."""
+    """Return the elements of an edge in the interpretations that meet best; raise InputFileError at a gap."""
     forms = [_forms(path, row) for row in rows]
     gaps = (np.array([[_gap(a, b) for a in before] for b in after]) for before, after in pairwise(forms))
     chosen = cheapest_path([np.zeros(len(options)) for options in forms], gaps)
@@ -142,14 +155,14 @@ def _end(element: PlanElement) -> tuple[np.ndarray, float]:
 
 
 def _gap(before: PlanElement, after: PlanElement) -> float:
-    """Return the distance from the end of an element to the next start, plus the change of direction times 10 m."""
+    """Return the distance between the end of an element and the start of the next, plus 10 m per rad of turn [m]."""
     place, direction = _end(before)
     turn = np.angle(np.exp(1j * (direction - after.direction_rad)))
     return float(np.hypot(*(place - (after.x_m, after.y_m))) + 10.0 * abs(turn))
 
 
 def _forms(path: str, row: Row) -> list[PlanElement]:
-    """Return the elements that a row may mean, the likeliest first."""
+    """Return the possible interpretations of a row as elements, the most likely first."""
     kind = row.get("TRACK_SEGMENT_TYPE", "").lower()
     east, north, length = (_number(path, row, name) for name in ("EAST", "NORTH", "TRACK_SEGMENT_LENGTH"))
     if kind == "line":
@@ -172,30 +185,30 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
         rates = [s * rate for rate, s in product(sizes, (side, -side)) if rate * (abs(arc) + length) < 0.1]
         forms = [_clothoid(east, north, azimuth, rate, arc, length) for rate in rates]
     else:
-        raise InputFileError(path, f"a segment is a {kind!r}; line, circle and clothoid are read")
+        raise InputFileError(path, f"a segment has the type {kind!r}; line, circle or clothoid was expected")
     if not forms:
         raise InputFileError(path, f"edge {row.get('TRACK_EDGE_ID')!r}: its clothoid has a radius below 10 m")
     return [_turn(form) for form in forms] if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0 else forms
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
-    """Return an element from clockwise azimuth and curvature, which a design has counter-clockwise from the easting."""
+    """Create an element from azimuth and curvature, both clockwise; a design has them counter-clockwise from east."""
     direction = np.pi / 2.0 - azimuth
     return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
 
 
 def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float, length: float) -> PlanElement:
-    """Return the part of a clothoid that begins at an arc length from its point of zero curvature."""
+    """Create the part of a clothoid that begins at the arc length `arc` from its point of zero curvature."""
     if arc == 0.0:
         return _element(east, north, azimuth, 0.0, rate * length, length)
-    # Backward from the origin a clothoid has the same curvature to the other side, and the opposite direction.
+    # before its origin a clothoid is the curve after the origin, rotated by 180 degrees
     way = _element(east, north, azimuth if arc > 0.0 else azimuth + np.pi, 0.0, rate * abs(arc), abs(arc))
     (x, y), _ = _end(way)
     return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)
 
 
 def _turn(element: PlanElement) -> PlanElement:
-    """Return an element in the reverse direction."""
+    """Return an element passed in the opposite direction."""
     (x, y), direction = _end(element)
     return replace(
         element, x_m=float(x), y_m=float(y), direction_rad=direction + np.pi, first=-element.last, last=-element.first
@@ -216,7 +229,10 @@ def _profile(path: str, row: Row) -> ProfileElement:
 
 
 def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
-    """Return the cant, outer rail above inner rail about the middle, on the side of the element's sharpest curve."""
+    """Create an element of cant, with the rails raised and lowered by half of it.
+
+    The outer rail is that of the sharpest curve within the element.
+    """
     start, length, first, last = (_number(path, row, name) for name in (*_SPAN, "INITIAL_CANT", "END_CANT"))
     if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:
         first, last = last, first

@@ -1,8 +1,8 @@
-"""Lines of map files of geographic information systems, including OpenStreetMap, read through GDAL by `pyogrio`.
+"""Reader of lines in map files of geographic information systems (through GDAL), and of OpenStreetMap files.
 
-OpenStreetMap ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
-write the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class
-(`fclass` of Geofabrik's shapefiles), and the id in a dozen forms.
+OpenStreetMap ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Export
+programs write the tags as columns, as an object or JSON text (`tags`), as hstore text (`other_tags` of GDAL), or as a
+class (`fclass` in the shapefiles of Geofabrik), and the id in a dozen forms.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from railfix.track.georeference import georeference
 from railfix.track.heights import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 
-#: Standard deviation in plan of an OpenStreetMap track, drawn from aerial images, if its file states none [m].
+#: Assumed standard deviation in plan of OpenStreetMap tracks, which are drawn from aerial images [m].
 SIGMA_M: Final = 2.0
-ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Origin of a segment, in its metadata.
-#: Values of the tag railway that are tracks on which trains run.
+ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Metadata entry of a segment from OpenStreetMap.
+#: Values of the tag `railway` for tracks in use.
 _RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail", "rack")
-#: Values of that tag for other features than tracks, which identify a feature of OpenStreetMap.
+#: Values of the tag `railway` for features that are not tracks in use.
 _OTHERS: Final = (
     "abandoned", "construction", "disused", "dismantled", "demolished", "funicular", "historic", "loading_ramp",
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
     "turntable", "yard",
 )  # fmt: skip
-#: Columns of a feature's id; columns that only OpenStreetMap exporters write are first.
+#: Columns that can contain the id of a feature, beginning with those that only OpenStreetMap export programs write.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
 _ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
@@ -48,24 +48,21 @@ _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
 CROSSING: Final = "x"  #: Prefix of the id of a node at which tracks cross without a connection.
-_LEFT_OUT: Final = "@left out"  #: Reason for leaving out a way, besides its tags.
+_LEFT_OUT: Final = "@left out"  #: Key of the reason for which a way with valid tags is left out.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """Way of an OpenStreetMap file: id, tags, points of shape (n, 2), longitude and latitude [deg], and node ids.
+    """Way of an OpenStreetMap file."""
 
-    Node ids are empty if the file has none; ids of nodes at which tracks cross without a connection begin with
-    `CROSSING`.
-    """
-
-    row: dict[str, Any]
-    points_deg: np.ndarray[Any, np.dtype[np.float64]]
+    row: dict[str, Any]  #: Tags and id of the way.
+    points_deg: np.ndarray[Any, np.dtype[np.float64]]  #: Longitude and latitude of the points, shape (n, 2).
+    #: Node ids of the points, empty if the file has none. They begin with `CROSSING` at a crossing without connection.
     nodes: tuple[str, ...] = ()
 
 
 def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tags of a feature, and its other columns."""
+    """Return the OpenStreetMap tags of a feature, together with its columns."""
     tags = dict(row)
     for name in ("tags", "all_tags", "other_tags"):
         value = row.get(name)
@@ -85,7 +82,7 @@ def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
-    """Return whether a feature is from OpenStreetMap, by its id or kind."""
+    """Return whether a feature is from OpenStreetMap, which its id or kind shows."""
     names = (str(row.get(key) or "") for key in ("@id", "id"))
     of_id = any(row.get(key) is not None for key in _IDS[:4])
     of_kind = any(row.get(key) in ("way", "relation") for key in _KINDS)
@@ -93,7 +90,10 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Return why a feature is not a track: for OpenStreetMap if not tagged as an active railway; empty for tracks."""
+    """Return the reason why a feature is not a track in use; "" for a track.
+
+    A feature from OpenStreetMap must have the tag of a railway in use.
+    """
     if row.get(_LEFT_OUT):
         return str(row[_LEFT_OUT])
     railway = get_tags(row).get("railway")
@@ -104,7 +104,7 @@ def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
 
 
 def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return `ORIGIN` and the name of an OpenStreetMap way ("way/7 Main Line"); empty for other features."""
+    """Return origin, name ("way/7 Main Line") and level of an OpenStreetMap way; empty for any other feature."""
     tags = get_tags(row)
     if not is_of_openstreetmap(row):
         return ORIGIN if tags.get("railway") in _RAILWAYS else {}
@@ -118,7 +118,7 @@ def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def find_level(tags: Mapping[str, Any]) -> int:
-    """Return the level of a way by its tags layer, bridge and tunnel; 0 on the ground."""
+    """Return the level of a way from its tags layer, bridge and tunnel; 0 on the ground."""
     try:
         return int(str(tags.get("layer") or ""))
     except ValueError:
@@ -127,7 +127,10 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Return a file's segments, the first with a note on lines that are not tracks; InputFileError if none is left."""
+    """Return the segments of a file, with a note in the first segment on the lines left out.
+
+    Raise InputFileError if there is no segment.
+    """
     left_out = ", ".join(f"{n} {why}" for why, n in reasons.items())
     note = f"{path}: lines left out that are no tracks: {left_out}"
     if not segments:
@@ -137,7 +140,10 @@ def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]
 
 
 def read_osm_xml(path: FilePath) -> list[Way]:
-    """Read the railway ways of an OSM XML file, in any order of its elements; InputFileError."""
+    """Read the railway ways of an OSM XML file, whose elements can be in any order.
+
+    Raise InputFileError if the file is not XML or has no railway way.
+    """
     nodes: dict[str, tuple[float, float]] = {}
     crossings: set[str] = set()
     ways: list[tuple[dict[str, Any], list[Any]]] = []
@@ -163,12 +169,16 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection: a slip has one."""
+    """Return whether a node is a crossing of tracks without a connection, in contrast to a slip."""
     return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
 def read_overpass(path: str, elements: Any) -> list[Way]:
-    """Read the railway ways of the elements of an Overpass JSON file (`out geom`, or ways with their nodes)."""
+    """Read the railway ways from the elements of an Overpass JSON file.
+
+    Ways need a geometry (`out geom`), or their nodes must be in the file. Raise InputFileError if elements are not
+    valid or there is no railway way.
+    """
     if not isinstance(elements, list) or not all(isinstance(e, dict) for e in elements):
         raise InputFileError(path, "elements is not a list of objects, as Overpass writes them")
     nodes = {str(e["id"]): _place(path, e.get("lon"), e.get("lat")) for e in elements if e.get("type") == "node"}
@@ -200,9 +210,10 @@ def _ways(
     nodes: Mapping[str, tuple[float, float]],
     crossings: Set[str],
 ) -> list[Way]:
-    """Return ways with their points, in parts if points are outside the extract; ways without two points are left out.
+    """Return ways with their points; a way that is partly outside the extract is divided into parts.
 
-    InputFileError: no way has two points.
+    A way without two successive points is returned without points and with a reason (`_LEFT_OUT`). Raise InputFileError
+    if no way has two points.
     """
     found, short = [], []
     for row, refs in ways:
@@ -216,17 +227,22 @@ def _ways(
             places = np.array([place for _, place in part], dtype=np.float64)
             found.append(Way(row=row, points_deg=places, nodes=ids if all(ids) else ()))
     if not found and short:
-        raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; ask Overpass for them, too (out geom;)")
+        raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; request the nodes from Overpass, too (out geom;)")
     if not found:
         raise InputFileError(path, "no way in this file has a tag railway")
     return [*found, *short]
 
 
-_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns that name a line, in this order.
+_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns with the name of a line, by rank.
 
 
 def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
-    """Read CRS, properties and geometries of features of a kind ("LineString", "none": any), one entry per layer."""
+    """Read the features of each layer of a file through GDAL.
+
+    Return for each layer the CRS, the properties of the features, and their geometries. Only features whose geometry
+    type ends with `geometry` ("LineString") are read, or all features, without geometry, for "none". Raise
+    InputFileError if GDAL cannot read the file.
+    """
     with needs_extra(f"{path}: {KIND_WORDS[find_kind(path)]}"):
         import pyogrio
         import shapely
@@ -234,7 +250,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
     pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are not heights and are not read
+            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are not heights, and not used
             with unpacked_file(path) as file:
                 found = [
                     pyogrio.raw.read(file, layer=layer, read_geometry=geometry != "none")
@@ -257,7 +273,10 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
 
 
 def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a map file as segments; CRS, height datum and geoid apply to files that name none."""
+    """Read the lines of a map file as segments; options of `reading` apply where the file does not state them.
+
+    Raise InputFileError if the file has no track, or a line is not valid.
+    """
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()
@@ -280,7 +299,7 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 def _features(
     path: FilePath,
 ) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]], list[tuple[str, ...]]]]:
-    """Yield CRS, columns, lines and ids of nodes of the features of each layer; KML, GPX, OSM XML without GDAL."""
+    """Yield CRS, columns, lines and node ids of the features of each layer; KML, GPX and OSM XML do not need GDAL."""
     kind = find_kind(path)
     if kind in ("kml", "gpx"):
         found = read_kml_lines(path) if kind == "kml" else read_gpx_lines(path)
@@ -298,7 +317,7 @@ def _features(
 
 
 def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return the accuracy that a feature states."""
+    """Return the standard deviations that a feature states, as metadata."""
     keys = ("sigma_plan_m", "sigma_height_m")
     return {key: str(row[key]) for key in keys if row.get(key) is not None and row[key] == row[key]}
 
@@ -312,7 +331,11 @@ def plan_segment(
     stated: Mapping[str, str] | None = None,
     nodes: tuple[str, ...] = (),
 ) -> Segment:
-    """Return a segment of coordinates in map order, shape (n, 2 or 3), without points repeated in plan."""
+    """Create a segment from coordinates in easting-northing or longitude-latitude order, shape (n, 2) or (n, 3).
+
+    Points repeated in plan are left out, and heights that are all 0 count as missing. Raise InputFileError if fewer
+    than two points are left, some heights are missing, or coordinates are not valid.
+    """
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():
         raise InputFileError(source, "a coordinate is not finite")
@@ -342,7 +365,7 @@ def plan_segment(
 
 
 def get_name(row: Mapping[str, Any], *, fallback: str) -> str:
-    """Return the name of a feature by the first of `_NAMES` that it has."""
+    """Return the name of a feature from the first of the columns `_NAMES` that has a value; otherwise `fallback`."""
     lower = {key.lower(): value for key, value in row.items()}
     for key in _NAMES:
         value = lower.get(key)
