@@ -304,7 +304,7 @@ def _move(plan: list[Plan], profile: list[ProfileElement], at: _Placement) -> tu
 def _law(step: _Step, entity: _Entity, kinds: dict[str, str]) -> str:
     kind = str(entity.values[-1]).strip(".")
     if kind not in kinds:
-        raise InputFileError(step.path, f"{entity.kind} of kind {kind} is not supported; expected one of {', '.join(kinds)}")
+        raise InputFileError(step.path, f"{entity.kind} of kind {kind} is not supported; expected {', '.join(kinds)}")
     return kinds[kind]
 
 
