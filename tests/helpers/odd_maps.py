@@ -252,7 +252,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("the_same_twice.geojson", geojson(LINE, LINE), "found", "turns by 180.0 degrees"),
     Odd("grid_not_named.geojson", geojson(GRID, crs=None), "refused", "give a projected CRS"),
     Odd("degrees_in_a_grid.geojson", geojson(LINE, crs="EPSG:25832"), "refused", "whether EPSG:25832 is the right CRS"),
-    Odd("northing_first.geojson", geojson(GRID[:, _SWAPPED], crs="EPSG:25832"), "refused", "whether EPSG:25832 is the right"),
+    Odd("northing_first.geojson", geojson(GRID[:, _SWAPPED], crs="EPSG:25832"), "refused", "EPSG:25832 is the right"),
     Odd("next_zone.geojson", geojson(GRID, crs="EPSG:25833"), "elsewhere"),
     Odd("swapped_without_frame.geojson", geojson(LINE[:, _SWAPPED], crs=None), "elsewhere", "swapped"),
     Odd(
