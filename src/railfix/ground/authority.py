@@ -77,7 +77,7 @@ class Authority(Message):
 class BrakeOrder(Authority):
     """Order to brake to a stop, which is sent without a commit and repeated until a report names its number.
 
-    It extends no authority. `number` is the latest authority's number; a later authority without `stopped` ends it.
+    `number` is the latest authority's number. A later authority without `stopped` ends the order.
     """
 
     kind: ClassVar[int] = 2

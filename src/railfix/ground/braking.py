@@ -23,7 +23,7 @@ _TOP_MPS, _HALVINGS = 150.0, 40
 class BrakeLimits(Settings):
     """Brakes of a train, and the delays before they act."""
 
-    #: Deceleration on level track, and the fraction of it that braking curves assume.
+    #: Deceleration on level track, and the fraction of this deceleration that braking curves assume.
     braking_mps2: float = Field(default=0.5, gt=0)
     safety: float = Field(default=0.9, gt=0, le=1)
     least_mps2: float = Field(default=0.05, gt=0)  #: Least deceleration assumed on any downhill gradient.

@@ -85,8 +85,8 @@ class ReferenceCurve:
     def progress(self, chainage_m: float) -> tuple[int, float]:
         """Return the section, by its first station, and the progress in it in running direction [%].
 
-        P5 3.1: a train at a station reports the station, otherwise the section and the progress in percent of its
-        length.
+        In P5 3.1 a train at a station reports the station, otherwise the section and the progress in percent of the
+        section's length.
         """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
@@ -117,7 +117,7 @@ class CentreLimits(Settings):
     #: Largest delay of a train's clock behind the instants of its positions, and largest undetected variation of its
     #: delays.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest lead of a sequence number over the newest number: a constant, and an increase per second since then.
+    #: Largest lead of a sequence number over the newest number, and increase of this lead per second since its arrival.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=20.0, gt=0)
 
@@ -142,8 +142,8 @@ class TrainRecord:
     message: TrainMessage | None = None  #: Newest report with a position.
     heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of `message` [s].
     measured_s: float = 0.0  #: Centre's clock at the instant for which the position of `message` is valid [s].
-    shown_m: float | None = None  #: Displayed position of the front.
-    #: Reported less simulated position at the last resynchronisation, positive in running direction.
+    shown_m: float | None = None  #: Displayed position of the front end.
+    #: Reported minus simulated position at the last resynchronisation, positive in running direction.
     jump_m: float | None = None
 
 

@@ -128,7 +128,7 @@ class ControlCentre:
 
     @property
     def database(self) -> str | None:
-        """Reason why the database rejects the state, None if it accepts it."""
+        """Reason why the database rejects the state, None without a fault."""
         return self.commits.alarm
 
     def log(self, text: str, *, train: int | None = None) -> None:

@@ -78,7 +78,7 @@ def _place(train: TrainInterval) -> tuple[object, ...]:
 
 
 def stop_orders(state: Interlocking) -> dict[int, str]:
-    """Return the reasons of trains to stop, by train: stopped trains, and the nearest trains on either side of each."""
+    """Return the trains that must stop, with reasons: stopped trains, and the nearest trains on either side of each."""
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not found:
         return {}
@@ -203,7 +203,7 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
 
 
 def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str, str] | None:
-    """Return a barred section that shares track with a path, None where the path is free of them."""
+    """Return a barred section that shares track with a path, and its bar; None without one."""
     for name, kind in sorted(state.bars):
         if any(shares(piece, mine) for piece in layout.sections[name] for mine in path):
             return name, kind

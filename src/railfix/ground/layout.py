@@ -140,7 +140,7 @@ class Layout(Settings):
         return station.inner_m[1], station.end_m
 
     def track_end_m(self, station: int, direction: int) -> float:
-        """Return the chainage where the tracks of a station end for a train that runs in a direction [m]."""
+        """Return the chainage at which the tracks of a station end for a train that runs in a direction [m]."""
         first, last = self.stations[station].inner_m
         return last if direction > 0 else first
 
@@ -197,7 +197,7 @@ def overlap(first: Iterable[Piece], second: Sequence[Piece]) -> bool:
 
 #: Distance between centrelines from which two tracks are clear of each other [m].
 CLEAR_M: Final = 3.5
-#: Largest difference of the lengths of two tracks of a station [m]: both have the chainage of the line.
+#: Largest difference of the lengths of a station's two tracks, which have the same chainage [m].
 LENGTHS_M: Final = 20.0
 #: Spacing of the points at which tracks are compared [m].
 _STEP_M: Final = 2.0

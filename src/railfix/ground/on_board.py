@@ -60,7 +60,8 @@ class OnBoard:
     """On-board supervision of a train by its movement authority.
 
     The age of an authority is the time since the train sent the report that the authority answers, on the train's
-    monotonic clock. Delays on the links cannot make it too small, and the clocks of train and centre need not agree.
+    monotonic clock. Delays on the links cannot make this age too small, and the clocks of train and centre need not
+    agree.
     """
 
     direction: int
@@ -181,7 +182,7 @@ class OnBoard:
         return False
 
     def _answers(self, authority: Authority) -> bool:
-        """Return whether an authority answers a report of this start and end, at most `LONGEST_FRESH_S` old."""
+        """Return whether an authority answers a report since the last start and change of ends that is not too old."""
         if authority.session != self.session or authority.report <= self.before_turn:
             return False
         if len(self._sent) == REMEMBERED and authority.report < next(iter(self._sent)):

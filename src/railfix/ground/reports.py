@@ -148,7 +148,7 @@ def unknown_authority(report: PlacedReport) -> str | None:
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
-    """Return the reason if ends are changed while the train runs, or with the new front end outside its interval."""
+    """Return the reason if ends are changed while the train runs, or with an end of the train outside its interval."""
     if not report.turns:
         return None
     if not report.message.standstill:
@@ -348,7 +348,7 @@ def furthest(facing: int, agreed_m: float, known_m: float) -> float:
 
 
 def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float | None) -> float | None:
-    """Return the longest time since the previous position, by the train's clock and the centre's [s]."""
+    """Return the longest time since the previous position, by the clocks of the train and of the centre [s]."""
     if known.measured_ns is None or (message.session or 0) != known.session:
         return by_centre_s
     by_train_s = (message.time_ns - known.measured_ns) / 1e9
@@ -361,7 +361,7 @@ _MOST_NUMBERS: Final = 1 << 62
 
 
 def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state whose next authorities have higher numbers than the train's."""
+    """Return the state whose next authorities have higher numbers than the authority that a report names."""
     held = message.authority or 0
     return replace(state, granted=held) if state.granted < held < _MOST_NUMBERS else state
 

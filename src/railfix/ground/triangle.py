@@ -186,7 +186,7 @@ def _verdicts(
             ~present & all_fallen,
             ~present,
             (outside == 0) & small.all(axis=1),
-            # with noise, a drift exceeds the limit of one side before that of the other side
+            # with noise, a drift exceeds the limit at one side before it exceeds the limit at the other side
             (outside == 0) & ((named >= 0) | (small.sum(axis=1) == 2)),
             (outside == 1) & own_outside,
             (outside == 3) & small.all(axis=1),

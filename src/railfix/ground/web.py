@@ -72,7 +72,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None for a wrong password, or after `MOST_WRONG` from this address."""
+        """Open a session and return its token; None for a wrong password, or after too many from this address."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}

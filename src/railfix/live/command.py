@@ -197,7 +197,7 @@ def _hooks(
 ) -> tuple[Hooks, Mapping[str, Any]]:
     """Return the hooks for result tables, state file, status line and sensor checks, and the streams' stored states.
 
-    There are no stored states without a state file, or if it is not used.
+    There are no stored states without a state file, or if the file is not used.
     """
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
 

@@ -385,7 +385,7 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
 
 
 class PlaceWatch:
-    """Check that 3-D positions lie on the line, once an antenna has `ENOUGH_TO_STOP` of them.
+    """Check that 3-D positions lie on the line, once an antenna has `ENOUGH_TO_STOP` positions.
 
     If they lie elsewhere, `say` is called with the message with which `railfix run` ends in this case.
     """

@@ -32,7 +32,7 @@ from railfix.ranges.sbas import SbasMessages
 
 #: Time after all epochs [ns].
 END_NS: Final = 1 << 62
-#: Largest number of an antenna's epochs that wait; it is exceeded only if the receivers' clocks differ.
+#: Largest number of an antenna's waiting epochs; more epochs wait only if the receivers' clocks differ.
 _LONGEST_QUEUE = 100
 #: Distance after which the order of the antennas is checked again [m].
 _ORDER_STEP_M = 10.0
@@ -65,7 +65,7 @@ class EngineState:
 
 @dataclass(frozen=True, kw_only=True)
 class _FromSatellites:
-    """Navigation records, SBAS messages and base-station epochs; `heard` is the number of arrivals up to the last."""
+    """Navigation records, SBAS messages and base-station epochs; `heard` is the number of the last arrival."""
 
     heard: int
     navigation: Navigation | None = None
@@ -176,7 +176,7 @@ class LiveEngine:
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
         last = self._from_satellites[-1] if self._from_satellites else None
-        if last is not None and last.heard > self._heard_at_push:  # no epoch was received since
+        if last is not None and last.heard > self._heard_at_push:  # no epoch has arrived since the last item
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)
@@ -186,7 +186,7 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session, with a sequence number `reserved` above the last, for a crash."""
+        """Return the state for a restarted session; its sequence number is `reserved` above the last, for a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
@@ -249,7 +249,7 @@ class LiveEngine:
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether an epoch is to be processed; restart after `restart_epochs` rising tags before the last."""
+        """Return whether an epoch is to be processed; restart after several rising tags earlier than the last tag."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1

@@ -33,7 +33,7 @@ _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIV
 
 
 def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, time_ns: int) -> TrainMessage:
-    """Return the message of a period without input; `time_ns` is the tag of the last epoch, the number is set later."""
+    """Return the message of a period without input, with the last epoch's tag; its sequence number is set later."""
     return TrainMessage(
         train=settings.train,
         sequence=0,
@@ -98,7 +98,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     # The bound of a position that failed a check does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
-    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # such a position is sent without a bound
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # a position with another status has no bound
         bound = math.inf
     moving = int(track.direction[-1]) if track is not None and len(track) else 0
     return TrainPlace(
@@ -119,7 +119,7 @@ def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tup
 def create_message(
     result: Result, place: TrainPlace, settings: LiveSettings, frame: TrainFrame, running: int
 ) -> TrainMessage:
-    """Return the message of one processed epoch; its number and time of sending are set later.
+    """Return the message of one processed epoch; its sequence number and time of sending are set later.
 
     `running` is the direction of the train's front end. The message has the front end's chainage and bounds, which are
     wider where either end of the train may be ahead. Where the front end is unknown, the message has the chainage and

@@ -348,7 +348,7 @@ class _Pace:
 
 
 class _InTurn:
-    """Order of reading: delays a file that is ahead of another one, so that its epochs do not accumulate unpaired."""
+    """Order of reading, which delays a file that is ahead of another file, so that epochs do not wait unpaired."""
 
     def __init__(self, read_to_ns: Mapping[str, int]) -> None:
         self._read_to_ns = read_to_ns

@@ -346,7 +346,7 @@ class _Answer:
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """Return a TLS context with the system's certificates, and those of a PEM file; SettingsError: it has none."""
+    """Return a TLS context with the certificates of the system and of a PEM file; SettingsError: it has none."""
     context = ssl.create_default_context()
     if certificates is not None:
         try:
