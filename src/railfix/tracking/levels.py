@@ -146,7 +146,7 @@ def track_with_levels(
     limits: TrackingLimits,
     sensors: SensorEpochs,
 ) -> tuple[Tracked, TrackState, LevelState]:
-    """Return positions with protection levels, the state of the main filter, and that of the filter with sub-filters.
+    """Return positions with protection levels, and the states of the main filter and of the filter with sub-filters.
 
     If the filter with sub-filters processes every epoch, its positions are returned, and the main filter does not run.
     """

@@ -67,7 +67,7 @@ class TrackingLimits(Settings):
     phase_zenith_m: float = Field(default=0.01, gt=0)
     #: Mean innovation over half a minute, in sigmas, above which the map's length error is larger than assumed.
     map_misfit_sigmas: float = Field(default=3.0, gt=0)
-    most_hypotheses: int = Field(default=24, ge=1)  #: Largest number of hypotheses; the most probable ones are kept.
+    most_hypotheses: int = Field(default=24, ge=1)  #: Largest number of hypotheses; the most probable are kept.
     start_separation_m: float = Field(default=60.0, gt=0)  #: Distance within which positions of a search are merged.
     #: Whether a bank of sub-filters computes a protection level. It costs as many filters as there are satellites.
     level: Literal["on", "off"] = "on"
