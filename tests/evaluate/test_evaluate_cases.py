@@ -399,7 +399,7 @@ def test_chainage_is_not_taken_where_it_is_not_the_same(tmp_path: Path):
     for folder, known, told in (
         (run, moved, "not of one map (off by 94.0 m"),
         (run, some, "no chainage at 3 of 20"),
-        (centre, reference(time, place), "is that of the centre"),
+        (centre, reference(time, place), "refers to the centre"),
     ):
         found = evaluate_run(folder, known)
         assert found.runs[0].method == {"front": "trajectory"}

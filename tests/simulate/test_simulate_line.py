@@ -238,11 +238,11 @@ def test_a_line_of_elements_is_what_they_say() -> None:
         (lambda: Element(kind="straight", length_m=10.0, cant_m=0.1), "cant_m"),
         (lambda: LineSettings(kind="generated", file=LineFile(path="x.csv")), "file"),
         (lambda: LineSettings(generated=GeneratedLine(seed=2)), "generated"),
-        (lambda: LineSettings(kind="file", file=LineFile(path="x.csv"), length_m=5.0), "the file's own"),
+        (lambda: LineSettings(kind="file", file=LineFile(path="x.csv"), length_m=5.0), "follows from the file"),
         (lambda: GeneratedLine(terrain=(Terrain(from_m=5.0),)), "begin at 0"),
         (lambda: build_alignment(LineSettings(kind="elements", elements=(
             Element(kind="straight", length_m=100.0), Element(kind="curve", length_m=90.0, radius_m=400.0)))),
-         "without a transition"),
+         "need a transition"),
         (lambda: build_alignment(LineSettings(kind="elements", elements=(Element(kind="straight", length_m=700.0),),
             gradients=(Gradient(from_m=300.0, permille=9.0), Gradient(from_m=310.0, permille=0.0)))), "overlaps"),
     ],

@@ -166,9 +166,9 @@ def test_paths_are_relative_to_the_file_that_names_them(tmp_path: Path) -> None:
     [
         ('base = "demo"', "lists its runs"),
         ("runs = 3", "lists its runs"),
-        ('[[runs]]\nname = "a"\n[[runs]]\nname = "a"', "own name"),
-        ("[[runs]]\nseed = 2", "own name"),
-        ('[[runs]]\nname = "../a"', "own name"),
+        ('[[runs]]\nname = "a"\n[[runs]]\nname = "a"', "unique name"),
+        ("[[runs]]\nseed = 2", "unique name"),
+        ('[[runs]]\nname = "../a"', "unique name"),
         ('seed = 3\n[[runs]]\nname = "a"', "unknown key seed in a recipe"),
         ('base = "p1-commercial"\n[[runs]]\nname = "a"', "recipe itself"),
         ('[[runs]]\nname = "a"\nparts = ["x"]', "parts has no table 'x'"),

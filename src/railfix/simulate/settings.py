@@ -66,7 +66,7 @@ def _gps_time(value: Any) -> np.datetime64:
     with suppress(ValueError):
         if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
             return time
-    raise ValueError("must be a GPS time without a time zone, such as 2024-03-05T03:10:00")
+    raise ValueError("must be a time such as 2024-03-05T03:10:00, in GPS time without a zone")
 
 
 def _toml_time(time: np.datetime64) -> datetime | str:
