@@ -407,8 +407,8 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
     for name, of_antenna in tally.antennas.items():
         if of_antenna.without_budget:
             yield (
-                f"{name}: {of_antenna.without_budget} epochs have no protection level: more simultaneous faults "
-                "than can be left out are more probable than the risk allows, or too many satellites are "
+                f"{name}: {of_antenna.without_budget} epochs have no protection level: simultaneous faults of more "
+                "satellites than can be excluded are more probable than the risk allows, or too many satellites are "
                 "excluded (settings risk)"
             )
     risk = get_risk_budget(config)
