@@ -175,7 +175,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
             point = values[int(np.argmax(over))]
             raise InputFileError(
                 path,
-                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; check their order, or give a "
+                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; they may be swapped, or give a "
                 "projected CRS (crs, --crs)",
             )
     return georeference(crs, values[:, 0], values[:, 1], path=path)

@@ -120,7 +120,7 @@ class _VehicleLine:
         cant, self.notes = _sign_cant(track)
         if (np.abs(cant) >= contact_spacing_m).any():
             raise MismatchError(
-                f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; check its unit"
+                f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; it may be in mm"
             )
         self.ramps = with_breaks(track.chainage_m, np.arcsin(cant / contact_spacing_m))
         self.joins = joins_m(self.chainage, self.points)
