@@ -136,7 +136,7 @@ class Screen(ABC, Generic[Limits]):
         return (f"screen {self.name} was not run: it needs {self.needs}",) if self.unable(limits, setup) else ()
 
     def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the name and data of each picture of the screen; by default those of `observation_pictures`."""
+        """Yield the name and data of each picture of the screen; the default uses `observation_pictures`."""
         for name, title, label, metric, reason, where, sides in self.observation_pictures:
             limit = getattr(limits, where) if hasattr(limits, where) else tables.channels(where)
             if limit is not None:

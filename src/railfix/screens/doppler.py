@@ -57,8 +57,8 @@ class DopplerLimits(Settings):
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Longest interval between two epochs that are compared.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
-    #: Time for which a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back,
-    #: which is exactly P1's test.
+    #: Time for which a satellite remains suspected after a jump. With 0 only the epochs of the jump and of its return
+    #: are affected, as in P1.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
     least_satellites: int = Field(default=3, ge=3)  #: Minimum number of satellites to eliminate the step of a clock.
     #: Whether the sigma of a suspected satellite is increased ("weigh"), or the satellite is rejected ("reject"), as in

@@ -395,7 +395,7 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
 
 
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
-    """Return the sign of the curvature at each point, shape (n,); on straight track that of the nearest curve.
+    """Return the sign of the curvature at each point or, on straight track, of the nearest curve, shape (n,).
 
     A cant ramp can begin on straight track. Without any curve the sign is 1.
     """

@@ -202,9 +202,9 @@ def heights_of_file(
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Return the height datum and geoid that are given, or those of a compound CRS.
+    """Return the height datum and geoid, as given by the user or by a compound CRS; None if neither gives them.
 
-    Raise SettingsError if the two contradict each other.
+    Raise SettingsError if user and CRS contradict each other.
     """
     vertical = get_vertical_datum(crs)
     if vertical is None:

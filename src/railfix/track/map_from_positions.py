@@ -52,7 +52,7 @@ class ThinningLimits(Settings):
     jump_m: float = Field(default=50.0, gt=0)
     gap_m: float = Field(default=2000.0, gt=0)  #: Longest gap that is bridged; a longer gap is an error.
     #: Largest speed of the vehicle. Positions that are reachable only at a higher speed are dropped; without times,
-    #: positions farther than `gap_m` from the others are dropped.
+    #: positions farther than `gap_m` from all remaining positions are dropped.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
@@ -201,8 +201,8 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 def _goes_on(points: Floats, direction: Floats) -> Masks:
     """Return a mask of the inner points about which the path is straight, in the direction between their neighbours.
 
-    Before and after the neighbours one of the next two steps must be in that direction, as a position may be an
-    outlier.
+    Of the two steps before the neighbours, and of the two steps after them, at least one must be in this direction,
+    because a position may be an outlier.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -365,7 +365,7 @@ SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
     """Return the standard deviations of a map in plan and height [m], and a note on their basis.
 
-    They are the largest of those stated in the log, those of the quality numbers, and those of P1.
+    Each is the largest of the value stated in the log, the value of the quality number, and the value of P1.
     """
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]

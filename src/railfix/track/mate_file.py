@@ -231,7 +231,7 @@ def _profile(path: str, row: Row) -> ProfileElement:
 def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
     """Create an element of cant, with the rails raised and lowered by half of it.
 
-    The outer rail is that of the sharpest curve within the element.
+    The sharpest curve within the element determines which rail is the outer rail.
     """
     start, length, first, last = (_number(path, row, name) for name in (*_SPAN, "INITIAL_CANT", "END_CANT"))
     if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:

@@ -187,12 +187,12 @@ class Network(NotebookTable):
 
     @cached_property
     def sigma_plan_m(self) -> float:
-        """Standard deviation of the tracks in plan [m]: the worst stated value, by default that of P1 4.1(3)."""
+        """Standard deviation of the tracks in plan [m]: the worst value stated, or the default of P1 4.1(3)."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
     @cached_property
     def sigma_height_m(self) -> float:
-        """Standard deviation of the tracks' heights [m]: the worst stated value, by default that of P1 4.1(3)."""
+        """Standard deviation of the tracks' heights [m]: the worst value stated, or the default of P1 4.1(3)."""
         return sigma_of_files(self.tracks, "sigma_height_m", SIGMA_HEIGHT_M)
 
     @cached_property

@@ -175,7 +175,8 @@ class Transitions:
 def _shifted(moved_m: float, turned: bool) -> Floats:
     """Return relative transition probabilities between `SHIFTS_M`, from row to column, shape (S, S).
 
-    The reference track of the columns is `moved_m` to the right of that of the rows, and opposite if `turned`.
+    The reference track of the columns is `moved_m` to the right of the reference track of the rows. Their directions
+    are opposite if `turned`.
     """
     place = (SHIFTS_M - moved_m) * (-1.0 if turned else 1.0)
     apart = np.abs(place[:, None] - SHIFTS_M)
@@ -317,9 +318,9 @@ class _At:
 def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
-    """Yield the forward recursion from position `start`, with the probabilities `first`, to the one before `stop`.
+    """Yield the forward recursion at the positions from `start` to before `stop`.
 
-    With `first` None the recursion begins with the prior.
+    It begins with the state probabilities `first` or, if `first` is None, with the prior.
     """
     m = residuals.offset_m.shape[1]
     states = m + len(SHIFTS_M) + 1

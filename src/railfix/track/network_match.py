@@ -69,7 +69,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions transformed from the frame of the satellites to that of the network, and the shift.
+        """Return the positions transformed from the frame of the satellites to the frame of the map, and the shift.
 
         Raise MismatchError if the log is far from the network, or has no times although the shift depends on time.
         """

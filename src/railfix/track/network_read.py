@@ -233,7 +233,7 @@ class NetworkQuality:
     ends: int  #: Number of track ends without a navigable connection.
     parts: int  #: Number of parts of the network that are not connected with each other.
     length_m: float  #: Total length of the tracks.
-    findings: tuple[NetworkFinding, ...]  #: Faults, those of the kinds `FAULTS` first.
+    findings: tuple[NetworkFinding, ...]  #: Faults of the network, beginning with the kinds in `FAULTS`.
 
 
 #: Kinds of findings that are errors of the network; they are listed first.

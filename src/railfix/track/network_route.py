@@ -39,7 +39,7 @@ class Filled:
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
     """Fill rows without a usable position along the shortest route between known positions.
 
-    The speed on the route is constant, or that of the positions if they are off the map; see `Rows`.
+    The speed on the route is constant. If the log has positions off the map, their speed is used; see `Rows`.
     """
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)

@@ -255,7 +255,7 @@ OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "radius_m": ("radius_m", 1.0, np.inf),
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
-#: Columns with standard deviations of each point. They are informative: positioning uses those of the whole map.
+#: Columns with standard deviations of each point, for information; positioning uses the metadata of the whole map.
 SIGMA_COLUMNS: Final = ("sigma_plan_m", "sigma_height_m")
 KNOWN_COLUMNS: Final = (
     "latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS, *SIGMA_COLUMNS,

@@ -18,7 +18,7 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.notebook import NotebookTable, plural
 
 SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
-SIGMA_HEIGHT_M = 0.60  #: Standard deviation of its height, about twice the one in plan [m] (P1 4.1(3)).
+SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about twice `SIGMA_PLAN_M` [m] (P1 4.1(3)).
 #: Note on a section whose points are joined in reverse order; it follows the name of the section.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.

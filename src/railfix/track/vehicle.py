@@ -148,7 +148,7 @@ class _VehicleLine:
         return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
-        """Return the roll by cant, shape (n,) [rad]; beyond an open end the roll is that at the end."""
+        """Return the roll by cant, shape (n,) [rad]; it is constant beyond an open end."""
         before, after = self.joins
         last = self.chainage[-1]
         open_start, open_end = self.open_ends
@@ -160,8 +160,8 @@ class _VehicleLine:
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
     """Return the cant, positive for roll to the right, shape (V,) [m], and notes.
 
-    The sign is that of the radius, or of the bend of the points where the map has no radius; on straight track it is
-    the sign in the nearest curve. Raise MismatchError if there is cant but no curve.
+    The sign follows from the radius, or from the bend of the points where the map has no radius. On straight track it
+    follows from the nearest curve. Raise MismatchError if there is cant but no curve.
     """
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
     canted = cant != 0.0

@@ -210,7 +210,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Return the pseudo-observations of a smooth line: its bends are those of the reference line."""
+    """Return the pseudo-observations of a smooth line, whose bends differ little from the reference line."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]

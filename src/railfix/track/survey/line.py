@@ -41,7 +41,7 @@ _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
 #: Limits of the scale of stated standard deviations. Residuals do not show errors common to all satellites.
 _SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Standard deviation of a loose prior of every unknown, for conditioning [m].
-#: Largest number of points with computed standard deviations; those of the other points are interpolated.
+#: Largest number of points whose standard deviations are computed; between these points they are interpolated.
 _SIGMAS: Final = 200
 _COLUMNS: Final = 20  #: Number of columns of the inverse that are computed at once.
 
@@ -339,7 +339,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return the indices of the points that advance by at least half a spacing; others are noise at rest."""
+    """Return the indices of the points that advance by at least half a spacing; noise at rest causes other points."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
