@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from railfix.core.timescale import timedelta
 from railfix.motion.singer import singer_steps
+from railfix.reference.build import Speeds, _ReferenceBuilder
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, ReferenceSettings
-from railfix.reference.smoother import Evidence, SmoothedReference, smooth
+from railfix.reference.smoother import Evidence, SmoothedReference, closings, smooth
 
 pytestmark = pytest.mark.requirement("D1")
 SETTINGS = ReferenceSettings()
@@ -143,3 +146,20 @@ def test_an_hour_at_ten_hertz_takes_less_than_half_a_minute() -> None:
     evidence, begin = made(36_000, 0.1), time.process_time()
     smooth(evidence, SETTINGS)
     assert time.process_time() - begin < 30.0
+
+
+def test_closing_errors_and_directions_count_in_sigmas_of_the_fixes_on_both_sides() -> None:
+    """Speeds without an error; the closing error of the first gap, and two of three steps, are within the noise."""
+    t, sigma, each = np.array([0.0, 10.0, 20.0, 30.0]), np.array([1.0, 0.1, 2.0, 0.5]), np.arange(31)
+    start, arc = np.datetime64("2026-05-12", "ns"), np.array([0.0, 101.0, 211.0, 321.0])
+    fixes = SimpleNamespace(good=np.arange(4), time=start + timedelta(t), arc_m=arc, sigma_m=sigma)
+    builder: Any = object.__new__(_ReferenceBuilder)
+    builder._join = lambda _: Speeds(time=start + timedelta(each), speed_mps=each * 0.0 + 10.0, sigma_mps=each * 0.0)
+    found = builder._excess({}, None, None, fixes.time, fixes, ReferenceSettings(doppler_bias_mps=1e-6))
+    np.testing.assert_allclose(found, [1.0, 10.0 / np.hypot(0.1, 2.0), 10.0 / np.hypot(2.0, 0.5)], rtol=1e-6)
+    windows = closings(fixes.time, 10.0 * t, 0.3 * t, arc, sigma, window_s=10.0)
+    np.testing.assert_allclose(windows.error_m, [-1.0, -10.0, -10.0])
+    np.testing.assert_allclose(windows.white_m2, sigma[1:] ** 2 + sigma[:-1] ** 2 + 3.0)
+    fixes.time, fixes.arc_m = start + timedelta(t / 10.0), np.cumsum([0.0, 4.01, 8.02, 8.1])
+    none = Speeds(time=fixes.time[:0], speed_mps=arc[:0], sigma_mps=arc[:0])
+    np.testing.assert_allclose(builder._hint(fixes.time, none, fixes), [np.nan, 8.02, np.nan, np.nan])
