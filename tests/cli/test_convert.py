@@ -67,18 +67,8 @@ def test_a_run_on_a_receiver_log(recordings: Path, tmp_path: Path) -> None:
     RUNNER.invoke(app, ["convert", str(log), "--out", str(converted), "--nav-out", str(nav)])
     results = {}
     for name, front, records in (("ubx", log, log), ("rinex", converted, nav)):
-        words = [
-            "run",
-            "--front",
-            str(front),
-            "--nav",
-            str(records),
-            "--track",
-            str(line),
-            "--out",
-            str(tmp_path / name),
-        ]
-        done = RUNNER.invoke(app, words)
+        words = ["run", "--front", str(front), "--nav", str(records), "--track", str(line)]
+        done = RUNNER.invoke(app, [*words, "--out", str(tmp_path / name)])
         assert done.exit_code == 0, done.output
         import polars as pl
 

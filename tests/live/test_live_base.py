@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-from base_cases import cases
+from base_cases import Case, cases
 from railfix.cli import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
@@ -99,11 +99,9 @@ class Served:
                     await asyncio.sleep(0.03)
 
 
-@pytest.mark.slow
-def test_the_command_with_a_base_station_over_ntrip(recordings: Path, tmp_path: Path) -> None:
-    """Two antennas on a roof: positions are those of the logs with the base station, and not those without."""
+def inputs(recordings: Path, tmp_path: Path, train: slice) -> tuple[Case, dict[str, Path], list[str], list[str]]:
+    """Two antennas on a roof: the case, logs of train and base station, and words of commands."""
     case = next(case for case in cases(recordings) if case.name.startswith("roof"))
-    train, base = case.train[:EPOCHS], case.base[:EPOCHS]
     latitude, longitude, height = geodetic_from_ecef(case.trajectory.ecef_m)
     track = tmp_path / "line.csv"
     table = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
@@ -112,7 +110,31 @@ def test_the_command_with_a_base_station_over_ntrip(recordings: Path, tmp_path: 
     config.write_text('systems = ["G"]\nfilter = "off"\nprotection = "off"\n')
     navigation = next((recordings / "dual" / "mosaic_x2_99cm").glob("*.nav"))
     common = ["--track", str(track), "--nav", str(navigation), "--config", str(config), "--date", DATE]
+    logs = {name: tmp_path / f"{name}.rnx" for name in ("train", "base")}
+    for name, observations in (("train", case.train[train]), ("base", case.base[:EPOCHS])):
+        write_observations(observations, logs[name])
+    place = ",".join(f"{float(value):.9f}" for value in geodetic_from_ecef(case.base_ecef_m))
+    return case, logs, common, ["--base", str(logs["base"]), "--base-place", place]
 
+
+def test_files_of_train_and_base_station_may_begin_and_end_apart(recordings: Path, tmp_path: Path) -> None:
+    """Replayed without pause, they give the positions of the run."""
+    _, logs, common, beside = inputs(recordings, tmp_path, slice(8, 14))
+    found = {}
+    for command, *more in (["run"], ["live", "--send", f"json@{tmp_path / 'sent'}", "--live", "no_input=skip"]):
+        words = [command, "--front", str(logs["train"]), *common, *beside, *more]
+        done = RUNNER.invoke(app, [*words, "--out", str(tmp_path / command)])
+        assert done.exit_code == 0, (done.output, done.exception)
+        found[command] = pl.read_parquet(tmp_path / command / "positions.parquet")["chainage_m"].to_numpy()
+    assert np.isfinite(found["run"]).all()
+    assert np.array_equal(found["run"], found["live"])
+
+
+@pytest.mark.slow
+def test_the_command_with_a_base_station_over_ntrip(recordings: Path, tmp_path: Path) -> None:
+    """Two antennas on a roof: positions are those of the logs with the base station, and not those without."""
+    case, logs, common, beside = inputs(recordings, tmp_path, slice(EPOCHS))
+    train, base = case.train[:EPOCHS], case.base[:EPOCHS]
     served = Served(encoded(base, case.base_ecef_m), encoded(train, case.reference[0]))
     with served.ports() as (caster, receiver):
         words = ["live", "--front", f"tcp://127.0.0.1:{receiver}", "--base", f"ntrip://u:p@127.0.0.1:{caster}/ROOF"]
@@ -120,11 +142,6 @@ def test_the_command_with_a_base_station_over_ntrip(recordings: Path, tmp_path: 
         done = RUNNER.invoke(app, [*words, *common, *options, "--out", str(tmp_path / "live")])
     assert done.exit_code == 0, (done.output, done.exception)
     assert served.requests[0].startswith(b"GET /ROOF HTTP/1.1\r\n")
-    logs = {name: tmp_path / f"{name}.rnx" for name in ("train", "base")}
-    for name, observations in (("train", train), ("base", base)):
-        write_observations(observations, logs[name])
-    place = ",".join(f"{float(value):.9f}" for value in geodetic_from_ecef(case.base_ecef_m))
-    beside = ["--base", str(logs["base"]), "--base-place", place]
     found = {}
     for name, more in (("beside", beside), ("alone", [])):
         out = tmp_path / name

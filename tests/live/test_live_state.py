@@ -56,16 +56,8 @@ def live(
     """Rows of the filter, sequence numbers of the messages, and what was logged."""
     files, out = demo_files(), folder / name
     command = ["live", "--front", str(log), "--track", str(track or files["track"]), "--vehicle", str(files["vehicle"])]
-    command += [
-        "--nav",
-        str(files["nav"]),
-        "--out",
-        str(out),
-        "--live",
-        "no_input=skip",
-        "--log",
-        str(folder / f"{name}.log"),
-    ]
+    command += ["--nav", str(files["nav"]), "--out", str(out), "--live", "no_input=skip"]
+    command += ["--log", str(folder / f"{name}.log")]
     done = RUNNER.invoke(app, [*command, "--send", f"json@{folder / name}.jsonl", *words])
     assert done.exit_code == 0, done.output
     numbers = [from_json(line).sequence for line in (folder / f"{name}.jsonl").read_text().splitlines()]

@@ -110,7 +110,7 @@ async def run_session(
     if isinstance(turn, _Pace) and len(files) == len(sources):
         session.clock = turn.now_ns
     if replay:
-        turn = _InTurn(session.read_to_ns)
+        turn = _InTurn(files)
     pumps = [
         asyncio.create_task(session.pump(name, source, turn if name in files else None, queue))
         for name, source in sources.items()
@@ -348,21 +348,25 @@ class _Pace:
 
 
 class _InTurn:
-    """Order of reading, which delays a file that is ahead of another file, so that epochs do not wait unpaired."""
+    """Order of reading files: epochs pass in the order of their time tags, at equal tags a base station's epoch first.
 
-    def __init__(self, read_to_ns: Mapping[str, int]) -> None:
-        self._read_to_ns = read_to_ns
+    No epoch passes before the next epoch of every other file is known, so that the files may begin at any time.
+    """
+
+    def __init__(self, files: Sequence[str]) -> None:
+        #: Time tag of each file's waiting epoch, and whether it is of the train; None while the file is being read.
+        self._waiting: dict[str, tuple[np.datetime64, bool] | None] = dict.fromkeys(files)
 
     async def wait(self, name: str, tag: np.datetime64) -> None:
-        """Wait until no other file is behind this file, and a base station's file has been read up to the tag."""
-        tag_ns = int((tag - GPS_EPOCH).astype(np.int64))
-        while self._read_to_ns[name] > min(self._read_to_ns.values()) or (
-            name != BASE and self._read_to_ns.get(BASE, tag_ns) < tag_ns
-        ):
+        """Wait until no other file has an epoch that precedes this epoch of a file."""
+        self._waiting[name] = own = (tag, name != BASE)
+        while any(other is None or other < own for other in self._waiting.values()):
             await asyncio.sleep(0)
+        self._waiting[name] = None
 
     def ended(self, name: str) -> None:
-        """Do nothing, as ended sources are removed from `read_to_ns`."""
+        """Record that a file has no more epochs."""
+        self._waiting.pop(name, None)
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:
