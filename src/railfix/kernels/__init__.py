@@ -1,8 +1,9 @@
 """Functions on arrays, compiled with numba: the filter along the track, and the single-epoch stages.
 
-A module of this package is imported at the first use of one of its functions (``kernels.ranges.misfits``): numba takes
-half a second to load. They operate on arrays and numbers only, and import nothing of railfix except this package and
-`railfix.core`. With ``NUMBA_DISABLE_JIT=1`` they are plain Python, for a debugger and for tests.
+A module of this package is imported at the first use of one of its functions (``kernels.ranges.misfits``), because
+numba takes half a second to load. The functions operate on arrays and numbers only, and the modules import nothing of
+railfix except this package and `railfix.core`. With ``NUMBA_DISABLE_JIT=1`` the functions are plain Python, for a
+debugger and for tests.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["hypotheses", "level", "model", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
 
-#: Modules whose kernels the filter calls.
+#: Modules with the kernels of the filter.
 _FILTER_MODULES: Final = ("tracking.recursion", "tracking.velocity")
 
 

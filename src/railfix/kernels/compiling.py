@@ -72,7 +72,7 @@ def inner(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile a small function of an inner loop into its callers (`inline` of numba).
 
-    A call counts the references to each array that is handed over, which takes longer than the function itself.
+    A call counts the references to each array argument, which takes longer than the function itself.
     """
     if is_plain():
         return function

@@ -107,7 +107,7 @@ def _with_each_later(
     ranges: RangeErrors,
     sets: _Sets,
 ) -> None:
-    """Write the sets of channel i and one after it, left out together from the system `rows`.
+    """Write the sets of channel i and one later channel, left out together from the system `rows`.
 
     `removed` and `undetectable` describe the channels left out before.
     """
@@ -144,9 +144,9 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     Returns
     -------
     channel : ndarray of int, shape (T, n)
-        Channels in use, adjacent.
+        Channels, those in use first.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
-        Arguments of `tails.solve_level`: threshold plus bias, sigma (infinite for undetectable faults), prior.
+        Arguments of `level.solve_level`: threshold plus bias, sigma (infinite for undetectable faults), prior.
     separation : ndarray, shape (T,)
         `ProtectionLevel.separation`.
     """

@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 _CLOSE = 5e-4
 #: Largest number of steps; if they do not converge, the lowest level found within the risk is used.
 _STEPS = 60
-#: From this step on every second step bisects the bracket: steps could alternate between two points for ever.
+#: From this step on every second step bisects the bracket, because steps can alternate between two points.
 _HALVING = 8
 #: Fraction of the risk that remains unused.
 _AIM = 0.002
@@ -25,7 +25,7 @@ _MILLS = (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 _ROOT_HALF = math.sqrt(0.5)
-#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, with a relative error below 2e-8 (Cephes; meant for x of 1 to 8).
+#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, with a relative error below 2e-8 (Cephes; designed for 1 <= x <= 8).
 _P = (
     2.46196981473530512524e-10, 5.64189564831068821977e-1, 7.46321056442269912687, 4.86371970985681366614e1,
     1.96520832956077098242e2, 5.26445194995477358631e2, 9.34528527171957607540e2, 1.02755188689515710272e3,
@@ -71,7 +71,7 @@ def _bells(z: Floats, bits: Indices, out: Floats) -> None:
 
 @inner
 def _quantile(probability: float) -> float:
-    """Return the one-sided normal quantile of a probability, as `one_sided_k`."""
+    """Return the number of sigmas that a standard normal variable exceeds with a probability, as `one_sided_k`."""
     if probability >= 1.0:
         return -np.inf
     if not probability > 0.0:
@@ -134,7 +134,7 @@ def solve_level(
     part_m, k : ndarray, shape (T, kinds)
         Largest ``offset + k sigma`` of each kind; 0, with k = -inf, where its hypotheses fit into its share unchecked.
     worst : ndarray of int, shape (T, kinds)
-        Hypothesis that requires this part, counted within its kind; -1 if there is none.
+        Hypothesis that requires `part_m`, counted within its kind; -1 if there is none.
     """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
@@ -168,7 +168,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return a kind's risk left for checked faults, its k, the largest required level, and the hypothesis behind it."""
+    """Return a kind's risk left for checked faults, its k, the largest required level, and the hypothesis of it."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]

@@ -24,7 +24,7 @@ class Channels(NamedTuple):
     """Channels of one epoch, contiguous, channels in use first; zero for the others. Shape (n,) each."""
 
     number: Indices  #: Index of the channel in the model.
-    root: Floats  #: Root of its weight [1/m].
+    root: Floats  #: Root of the channel's weight [1/m].
     clock: Indices
     along: Floats  #: Whitened design.
     across: Floats
@@ -47,7 +47,7 @@ class System(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Misfits summed by clock (C,) and by axis (3,), and the implied steps of the position and of each clock."""
+    """Misfits summed by clock (C,) and by axis (3,), and the steps of position and clocks that they imply."""
 
     by_clock: Floats
     by_axis: Floats
@@ -84,7 +84,7 @@ def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
 def separate(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
-    """Return offset, sigma, and ratio of distance to threshold of a set from its effect."""
+    """Return offset, sigma, and ratio of separation to threshold of a set of excluded channels from its effect."""
     noise, whole_across, whole_up = common[_NOISE], across + common[_MAP_ACROSS], up + common[_MAP_UP]
     apart = noise * square + (1.0 - noise) * (across * across + up * up)
     whole = whole_across * whole_across + whole_up * whole_up
@@ -114,7 +114,7 @@ def new_fit(clocks: int) -> _Fit:
 
 @inner
 def choose_channels(root: Floats, number: Indices) -> None:
-    """Write the indices of the used channels, then the indices of the others."""
+    """Write the indices of the used channels, then the indices of the unused channels."""
     at = 0
     for m in range(len(root)):
         if root[m] > 0.0:
@@ -128,7 +128,7 @@ def choose_channels(root: Floats, number: Indices) -> None:
 
 @inner
 def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Channels) -> None:
-    """Write the channels of one epoch contiguously."""
+    """Write the channels of one epoch contiguously, in the order of `channels.number`."""
     n = len(channels.number)
     for i in range(n):
         m = channels.number[i]
@@ -266,7 +266,7 @@ def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: 
 
 @inner
 def _inverse(matrix: Floats) -> tuple[Floats, bool]:
-    """Return the inverse of a symmetric 3 x 3 matrix scaled to a unit diagonal, and whether it is regular."""
+    """Return the inverse of a symmetric 3 x 3 matrix, and whether the matrix scaled to a unit diagonal is regular."""
     inverse, unit = np.empty((3, 3)), np.empty(3)
     for a in range(3):
         if not matrix[a, a] > 0.0:

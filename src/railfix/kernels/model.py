@@ -54,13 +54,13 @@ def _invert_scaled(matrix: Floats, scale: Floats, inverse: Floats) -> None:
 def linearise_ranges(
     ranges: Any, place_ecef_m: Floats, axes: Floats, prior: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Linearise ranges.
+    """Linearise ranges at positions and whiten them, with the clocks eliminated.
 
     Parameters
     ----------
     ranges : RangeArrays
     place_ecef_m : ndarray, shape (T, 3) [m]
-        NaN without a position: design, misfits and covariance are NaN then.
+        Linearisation points; NaN without a position, for which design, misfit and covariance are NaN.
     axes : ndarray, shape (T, 3, 3)
         Unit vectors of the unknowns.
     prior : ndarray, shape (3, 3) [1/m^2]
@@ -131,9 +131,7 @@ def linearise_ranges(
 
 @kernel
 def residuals(model: Any) -> tuple[Floats, Floats, Floats]:
-    """Compute the remainder of the misfits of `ModelArrays` after the best fit: step, residual, redundancy of
-    `LinearModel`.
-    """
+    """Compute step, residuals and redundancies of the best fit to the misfits of `ModelArrays` (see `LinearModel`)."""
     root_weight, clock, clock_covariance_m2, design, covariance_m2, _, misfit = model
     epochs, channels = root_weight.shape
     groups = clock_covariance_m2.shape[1]

@@ -30,7 +30,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 @inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
-    """Return the tail of a form that is at least ``1 - tau`` times the form of all channels."""
+    """Return an upper bound of the tail of a form that is at least ``1 - tau`` times the form of all channels."""
     if not tau < 1.0:
         return 1.0
     form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
@@ -141,7 +141,7 @@ def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> Non
 
 @inner
 def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, form: Floats) -> bool:
-    """Write the form without the channels of a side, left out in sequence; return whether it has two."""
+    """Write the form without the channels of a side, left out in sequence; return whether the side has two channels."""
     projector, residual, rows, _, _ = residuals
     n, count = len(used), 0
     member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
@@ -182,7 +182,7 @@ def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, for
 def _whiten(
     model: Any, t: int, noise: float, sigma_m: tuple[float, float], used: Indices, residuals: Any, every: Floats
 ) -> int:
-    """Write channels in use, their residuals, and the form of all of them; return how many there are.
+    """Write the channels in use, their residuals, and the form of all of them; return the number of these channels.
 
     The map error is taken as equal in all horizontal directions, because the tangent differs between positions.
     """

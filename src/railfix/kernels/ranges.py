@@ -37,7 +37,7 @@ class _Equations(NamedTuple):
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
     """Compute the normal equations of one epoch.
 
-    The loops over all channels have no branches, so that they are vectorised; unused channels need finite positions.
+    The loops over all channels have no branches, so that they are vectorised; unused channels must have finite values.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
     system, means, rows, totals, _ = equations
@@ -83,7 +83,7 @@ def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> 
 
 @inner
 def _tie(epoch: _Epoch, equations: _Equations) -> None:
-    """Add the known offsets between the clocks of one epoch."""
+    """Add the information of the known clock offsets to the equations of one epoch."""
     weight, starts, offset_m, sigma_m = epoch.weight, epoch.starts, epoch.offset_m, epoch.sigma_m
     system, means, rows, totals, apart = equations
     channels, groups, all_mass = len(weight), len(starts), 0.0
@@ -122,7 +122,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     ranges : RangeArrays
         T epochs.
     place_ecef_m : ndarray, shape (T, 3) [m]
-        In C order.
+        Linearisation points, in C order.
 
     Returns
     -------
@@ -153,7 +153,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
 
 @kernel
 def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
-    """Compute `fit` of arrays in C order, with a position for each of `epochs`."""
+    """Compute `normal_equations.misfit` of arrays in C order, with a position for each of `epochs`."""
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     channels, groups = weight.shape[1], len(starts)
     tied = len(offset_m) == len(code_m)
@@ -225,14 +225,14 @@ def invert(matrix: Floats, inverse: Floats) -> None:
 def iterate_points(
     ranges: Any, start_ecef_m: Floats, enough: Masks, tolerance_m: float, most: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Iterate 3-D positions.
+    """Compute 3-D positions by Newton steps of least squares.
 
     Parameters
     ----------
     ranges : RangeArrays
     start_ecef_m : ndarray, shape (T, 3) [m]
     enough : ndarray of bool, shape (T,)
-        Epochs with enough satellites for a position; the others are NaN.
+        Epochs with enough satellites for a position; results of other epochs are NaN.
     tolerance_m, most
         Convergence limit of the step, and largest number of steps.
 
@@ -306,7 +306,7 @@ def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
 
 @inner
 def _form(system: Floats, a: Floats, b: Floats) -> float:
-    """Return the normal matrix between two directions."""
+    """Return the normal matrix multiplied by two directions, ``a' system b``."""
     form = 0.0
     for i in range(3):
         form += a[i] * (system[i, 0] * b[0] + system[i, 1] * b[1] + system[i, 2] * b[2])
@@ -347,7 +347,7 @@ def _along(
 def iterate_along(
     ranges: Any, line: Any, vertex: Indices, tolerance_m: float, most: int
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """Iterate positions along the line.
+    """Compute positions along the line by Newton steps of constrained least squares.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Robust weights of ranges."""
+"""Robust weights of ranges (IGG-III)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
-#: Smallest scale of whitened residuals: ranges that agree more closely do so by chance.
+#: Smallest scale of whitened residuals, because ranges agree more closely only by chance.
 _LEAST_SCALE = 0.05
 
 
@@ -51,16 +51,16 @@ def reweight_ranges(
     reject: float,
     iterations: int,
 ) -> tuple[Masks, Floats, Masks]:
-    """Reweight ranges by their residuals.
+    """Reweight ranges iteratively by their residuals at linearisation points.
 
     Parameters
     ----------
     ranges : RangeArrays
     place_ecef_m : ndarray, shape (T, 3) [m]
-        In C order.
+        Linearisation points, in C order.
     information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
     correction : ndarray, shape (T,)
-        Scale of the residuals over their median.
+        Ratio of the scale of the residuals to their median.
     keep, reject : float
     iterations : int
 
@@ -156,7 +156,7 @@ def _sum_clocks(room: _Room) -> None:
 
 @inner
 def _sum_normal(count: int, room: _Room, normal: Floats, vector: Floats) -> None:
-    """Write the normal equations of the position, the clocks eliminated."""
+    """Write the normal equations of the position with the clocks eliminated."""
     for a in range(3):
         for b in range(a, 3):
             total = 0.0
@@ -171,7 +171,7 @@ def _sum_normal(count: int, room: _Room, normal: Floats, vector: Floats) -> None
 
 @inner
 def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, vector: Floats) -> None:
-    """Add the information that the known clock offsets give on the position."""
+    """Add the information of the known clock offsets to the normal equations of the position."""
     clocks, whole = len(room.total), 0.0
     for g in range(clocks):
         room.mass[g] = 1.0 / (1.0 / room.total[g] + sigma_m[g] ** 2) if room.total[g] > 0.0 else 0.0
@@ -225,7 +225,7 @@ def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
 
 @inner
 def _median(count: int, room: _Room) -> float:
-    """Return the median of the whitened residuals; their order is kept, as it is nearly the same in the next call."""
+    """Return the median of the whitened residuals; their order is kept, because it changes little between calls."""
     for k in range(count):
         at, number = k, room.order[k]
         while at > 0 and room.white[room.order[at - 1]] > room.white[number]:

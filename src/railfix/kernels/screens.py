@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
-#: Marks a condition without a suspicion: NaT as a number.
+#: Time of an event that has not occurred: NaT as a number.
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
 
@@ -36,12 +36,12 @@ def middle(ordered: Floats, size: int) -> float:
 def suspicions(
     time_ns: Integers, metric: Floats, limit: Floats, level_before: Floats, since_before: Integers, hold_ns: int
 ) -> tuple[Masks, Floats, Integers]:
-    """Track the offset of each satellite's code after a jump; each is summed from the jump on, so that chunk boundaries
-    have no effect.
+    """Track the offset of each satellite's code after a jump.
 
-    `metric` and `limit` have shape (T, M), in C order; the previous offsets and starts of suspicions have shape (M,),
-    `NEVER` for none. Returns the rejections, the offsets (0 without suspicion, NaN without a metric), and the starts at
-    the end of the chunk.
+    An offset is the sum of the metric from the jump on, so that chunk boundaries have no effect. `metric` and `limit`
+    have shape (T, M), in C order; the previous offsets and starts of suspicions have shape (M,), `NEVER` for none.
+    Returns the rejections, the offsets (0 without suspicion, NaN without a metric), and the starts of the suspicions
+    that continue after the chunk.
     """
     epochs, channels = metric.shape
     reject, level = np.zeros((epochs, channels), dtype=np.bool_), np.empty((epochs, channels))
@@ -119,7 +119,8 @@ def falls_of_cn0(
 ) -> tuple[Floats, Floats, Floats, tuple[Floats, Floats, Floats]]:
     """Return the falls of C/N0 below the recent peaks: the statistics of `PowerSigns`, shape (T,), and the new state.
 
-    `before`: peaks, start times and last observations of `PowerState`, shape (K,); `decay` of a peak per second.
+    `before` are peaks, start times and times of the last observations of `PowerState`, shape (K,); a peak decays by
+    `decay` per second.
     """
     epochs, channels = cn0_dbhz.shape
     peak, first, last = before[0].copy(), before[1].copy(), before[2].copy()
@@ -158,11 +159,10 @@ def clock_steps(
     longest_s: float,
     least: int,
 ) -> tuple[Floats, tuple[Floats, Floats, Integers]]:
-    """Return the median change of codes (T, K) against Dopplers, shape (T,), and each channel's last codes and
-    Dopplers.
+    """Return the median change of codes (T, K) less the change by Dopplers, shape (T,), and the new state.
 
-    `before`: each channel's previous code, Doppler and time, shape (K,). Values are not compared across a break or
-    after more than `longest_s`; the result is NaN with fewer than `least` channels.
+    `before` and the new state are each channel's last code, Doppler and time, shape (K,). Values are not compared
+    across a break or after more than `longest_s`; the result is NaN with fewer than `least` channels.
     """
     epochs, channels = code_m.shape
     code, rate, since = before[0].copy(), before[1].copy(), before[2].copy()
@@ -196,10 +196,10 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return masks of the conditions that have been true for their required time and of those that are still active,
-    and the state: see `held`.
+    """Return masks of the conditions that have been true for their required time, and of those still active, (T, C).
 
-    `before`: duration of each condition, and time of its last activity, shape (C,).
+    The new state is also returned (`integrity.interference.limits.hold_signs`). `before` is the duration of each
+    condition, and the time of its last activity, shape (C,).
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

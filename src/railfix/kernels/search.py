@@ -209,9 +209,9 @@ def best_points(
     line : tuple of ndarray
         `arc_m`, `tangent` and `length_m` of the trajectory.
     separation_m : float
-        Points nearer than this along the line are one position.
+        Points nearer to each other than this along the line are one position.
     turn_m : float
-        Length of a closed line; infinite for others.
+        Length of a closed line; infinite for an open line.
 
     Returns
     -------
@@ -258,7 +258,7 @@ def clear_of_sections(
     stretches: tuple[Indices, Floats, Indices],
     section: Indices,
 ) -> Floats:
-    """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
+    """Return a distance along and across within which no part of a line is off its sections' tangents, (S,) [m].
 
     `ecef_m` are the points of the line (P, 3), the other arrays its sections; `stretches` is a field of `SearchIndex`.
     """

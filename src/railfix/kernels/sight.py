@@ -12,9 +12,7 @@ TURN = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 
 @inner
 def sight(sx: float, sy: float, sz: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Return the range of a signal sent at (sx, sy, sz) and received at (x, y, z) [m], and the unit vector to the
-    satellite.
-    """
+    """Return the range of a satellite at (sx, sy, sz) from (x, y, z) [m], and the unit vector to the satellite."""
     dx, dy, dz = sx - x, sy - y, sz - z
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     inverse = 1.0 / distance

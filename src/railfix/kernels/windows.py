@@ -20,11 +20,10 @@ _NS: Final = 1_000_000_000
 def window_ages(
     time_ns: Integers, last_ns: Integers, last_age: Floats, ends: Indices, window_s: float, least_epochs: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return ages of T epochs of A antennas, which end at rows `ends`; `last_ns` is the epoch before the first, NaT for
-    none.
+    """Return ages of T epochs of A antennas, whose rows end at `ends`; `last_ns` is the previous epoch, NaT for none.
 
     Returns, shapes (T,), the time since the previous epoch [s], the age in its span of `SPAN` windows, and the number
-    of spans begun since the previous epoch; and the ages at the end, shape (A,) [windows].
+    of spans begun since the previous epoch; and the ages after the last epochs, shape (A,) [windows].
     """
     epochs = len(time_ns)
     step, in_span, begun, end_age = np.zeros(epochs), np.empty(epochs), np.empty(epochs), last_age.copy()
@@ -47,8 +46,9 @@ def window_ages(
 def decayed_sums(values: Floats, growth: Floats, decay: Floats, current: Floats, ends: Indices) -> Floats:
     """Return sums of the values (T, K) of all earlier epochs, each weighted by ``exp(-difference of the ages)``.
 
-    `values` are multiplied by `growth`. The running sums `current`, shape (A, K), are in units of the decay since the
-    start of a span, so that the order of additions does not depend on where a chunk begins; the new sums replace them.
+    `values` are already multiplied by `growth`. The running sums `current`, shape (A, K), are multiplied by the growth
+    since the start of a span, so that the order of additions does not depend on where a chunk begins; the new sums
+    replace them.
     """
     before, first = np.empty(values.shape), 0
     for a in range(len(ends)):

@@ -1,8 +1,8 @@
 """Adaptation to the measurements: phase and Doppler noise, doubt, length errors of the map, faulty satellites.
 
 The normalised innovations of a satellite's codes have a mean near 0 over a minute, even with reflections, which come
-and go. A wrong clock record or a persistent reflection gives innovations of constant sign: their mean, each clipped to
-one standard deviation, shows the fault (`is_faulty`).
+and go. A wrong clock record or a persistent reflection gives innovations of constant sign. The mean of the innovations,
+each clipped to one standard deviation, shows the fault (`is_faulty`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
 @inner
 def mean_square(rows: Rows, own: slice, found: Fit) -> float:
-    """Return the weighted mean square of one kind of residuals over their variances; NaN for three or fewer."""
+    """Return the weighted mean square of normalised residuals of one kind; NaN for three or fewer residuals."""
     size, total = own.stop - own.start, 0.0
     for j in range(own.start, own.stop):
         total += found.weight[j] * (found.residual[j] ** 2 + found.fitted[j]) / rows.variance[j]
@@ -84,7 +84,7 @@ def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation
 
 @inner
 def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
-    """Return a satellite's mean normalised innovation, updated by another innovation."""
+    """Return a satellite's mean normalised innovation, updated by a new innovation."""
     share = 1.0 - math.exp(-min(code_s, 1.0) / constants.BIAS_MEMORY_S)
     return code_bias + share * (min(max(innovation, -constants.BIAS_MOST), constants.BIAS_MOST) - code_bias)
 
@@ -99,9 +99,9 @@ def is_faulty(code_bias: float) -> bool:
 def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, weight: Floats) -> float:
     """Return the normalised position shift that the codes of an epoch imply; 0 with too few codes.
 
-    The score of the innovations v against a shift, ``h' S^-1 v / sqrt(h' S^-1 h)`` with h the coefficients of the arc
-    length: standard normal and white over epochs where the model holds. `covariance`, shape (Q, Q), is H P H' of the
-    quantities before the measurements, the codes first; first weights above 1, shape (M,), count as 1.
+    It is the score of the innovations v against a shift, ``h' S^-1 v / sqrt(h' S^-1 h)`` with h the coefficients of the
+    arc length: standard normal and white over epochs where the model holds. `covariance`, shape (Q, Q), is H P H' of
+    the quantities before the measurements, codes first; `weight`, shape (M,), are the first weights, limited to 1.
     """
     codes = rows.code.stop
     if codes < constants.MISFIT_CODES:
@@ -123,7 +123,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
 
 @inner
 def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
-    """Update the running mean by an epoch's shift, and raise or lower the length error of the map."""
+    """Update the mean code shift by an epoch's shift, and raise or lower the length error of the map."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / constants.MAP_MISFIT_S)
     if abs(shift) > constants.STEP_SIGMAS:

@@ -34,7 +34,7 @@ OFFSET_PRIOR_M: Final = 30.0
 MAP_ROUGHNESS_M: Final = 0.3
 MAP_CORRELATION_M: Final = 50.0
 MAP_SCALE_M: Final = 0.03  #: Random walk of a length along the map [m per square root of m].
-MAP_ABSOLUTE_M: Final = 500.0  #: Length over which the absolute error of the map changes; its sigma is the map's.
+MAP_ABSOLUTE_M: Final = 500.0  #: Length over which the absolute map error, of the stated sigma, changes.
 CODE_CLOCK_SIGMA_M: Final = 1e3  #: Prior standard deviation of the code clock about the median of an epoch [m].
 #: Random walks of the sensors' scale factors and offset, per square root of a second. A car's wheel scale factor
 #: changed by 2 % within half a minute in bends; an accelerometer's offset follows its temperature.
@@ -62,10 +62,10 @@ FIRST_OFFSET_M2: Final = 1e-4  #: Variance of the offset of the first constellat
 
 # Reweighting.
 PASSES: Final = 4  #: Fits of an epoch, with new weights between them.
-LEVEL_PASSES: Final = 3  #: Sets of weights in sub-filters: the first ones, and those after each of two fits.
+LEVEL_PASSES: Final = 3  #: Sets of weights in sub-filters: the first weights, and new weights after each of two fits.
 #: Mean weight of codes, or of phases and Dopplers, below which the reweighting is restarted from other weights.
 WEAK_FIT: Final = 0.7
-#: Variances of position and speed added for that restart [m2, m2/s2].
+#: Variances of position and speed added for a restart of the reweighting [m2, m2/s2].
 FREEDOM_PLACE_M2: Final = 30.0**2
 FREEDOM_SPEED_M2PS2: Final = 10.0**2
 #: The equations are linearised again when the position has moved by more than this [m]. A range of 26 000 km deviates
@@ -75,7 +75,7 @@ RELINEARISED: Final = 4
 
 # Estimation of the noise.
 SCALE_S: Final = 60.0  #: Time over which the scales of Dopplers and phases are adapted [s].
-#: Bounds of the log scales of their variances.
+#: Bounds of the log scales of the variances of Dopplers and phases.
 LEAST_SCALE: Final = -1.5
 LARGEST_SCALE: Final = 3.0
 #: Fractions of an interval by which the doubt timers of motion and of codes fall at an epoch without doubt. They are
@@ -85,20 +85,20 @@ CODE_LEAK: Final = 1.0
 
 # Satellites with persistent code errors.
 #: Time constant of the mean innovation [s], bound of a single innovation, and the means beyond which codes are left
-#: out as too long, and as too short. Late codes of others pull the clock, so that correct codes appear too short.
+#: out as too long, and as too short. Late codes of other satellites shift the clock: correct codes appear too short.
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
 BIAS_SHORT: Final = -0.55
-#: Errors of orbit, clock and ionosphere last for hours: a smaller mean innovation is no sign of a wrong map [m].
+#: Errors of orbit, clock and ionosphere last for hours: a smaller mean innovation does not indicate a wrong map [m].
 NOMINAL_M: Final = 0.8
 #: No protection level is given if more satellites than this are beyond `BIAS_FAULTY` and one of them is too short: the
-#: map or a constellation is wrong, or reflections pull the clock.
+#: map or a constellation is wrong, or reflections shift the clock.
 BIAS_SATELLITES: Final = 2
-BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out; their innovations show its end.
+BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes left out; their innovations show the end of the fault.
 #: Standard deviation added to the position when a satellite is left out: its codes have affected it so far [m].
 INFLATED_M: Final = 15.0
-INFLATED_SIGMAS: Final = 3.0  #: Not added where all codes are off by more sigmas: they may have stepped together.
+INFLATED_SIGMAS: Final = 3.0  #: Not added if the codes imply a shift of more sigmas: all may have stepped together.
 
 # Length errors of the map.
 #: Time over which codes must contradict the length (`TrackingLimits.map_misfit_sigmas`), and time constant with which
@@ -107,7 +107,7 @@ MAP_MISFIT_S: Final = 30.0
 MAP_MISFIT_KEPT_S: Final = 300.0
 MISFIT_CODES: Final = 4  #: With fewer codes in an epoch, a shift cannot be separated from the clocks.
 #: The shift of a single epoch is clipped to this many standard deviations. Beyond `STEP_SIGMAS` it is a step of all
-#: codes and says nothing about the map.
+#: codes and contains no information on the map.
 MISFIT_CLIPPED: Final = 3.0
 #: Time constant of the adaptation [s], and upper bound of the logarithm: a length error above 1.6 m per square root of
 #: a metre makes no further difference.
@@ -122,7 +122,7 @@ SPEED_SIGMAS: Final = 4.0  #: A measured speed bounds the true speed within this
 MAP_BRANCH_M: Final = 6.0
 #: Standard deviation of the common code error across the line: reflections from one side of a street.
 CODE_COMMON_M: Final = 10.0
-#: Correlation time and distance of that error.
+#: Correlation time and distance of the common code error.
 CODE_COMMON_S: Final = 120.0
 CODE_COMMON_TRAVEL_M: Final = 500.0
 #: Lower bound of the probability of a branch within this distance, if codes alone contradict it.
@@ -150,11 +150,11 @@ SWITCH: Final = 3.0
 ALIKE: Final = 1.5
 RECENT_S: Final = 30.0
 RECENT_MOST: Final = 3.0
-#: Largest log odds from a difference of one `MAP_BRANCH_M`: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
+#: Largest log odds from a distance of one `MAP_BRANCH_M`: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
 MOST_ODDS: Final = 2.25
-#: Largest log odds from the motion of a second, or of an epoch; larger values are reflections.
+#: Largest log odds from the motion of a second, or of an epoch; larger values are caused by reflections.
 MOST_MOTION: Final = 5.0
-#: A leading hypothesis whose probability was recently below this value has taken over from others that all failed: the
+#: If the log probability of the leading hypothesis was recently below this value, all other hypotheses have failed: the
 #: position is searched for again, but not in the first seconds, when all hypotheses are new. The minimum log
 #: probability recovers by `LEAST_RISE` per second.
 TAKEOVER: Final = -6.0
@@ -189,7 +189,7 @@ ALLOWED_SQUARE: Final = 4.0
 CONTRADICTION_DOUBT: Final = 12.0
 CONTRADICTION_LOST: Final = 30.0
 CONTRADICTION_TAKEN: Final = 60.0  #: Sum that is set after a takeover: larger than a velocity across the line can give.
-#: Limits beyond which codes contradict motion, because of a step of all codes, a slow pull or a wrong map: normalised
+#: Limits beyond which codes contradict motion, because of a step or slow drift of all codes or a wrong map: normalised
 #: mean of the position shifts that codes imply, and log variance of the map's lengths (6 times the assumed error).
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
@@ -207,11 +207,11 @@ YOUNG_HOLD_S: Final = 1.0
 #: All codes have stepped together if they imply a shift of more than this many standard deviations for this long [s].
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
-STEP_HOLD_S: Final = 300.0  #: No protection level for this long after a step of all codes, which lead the position.
+STEP_HOLD_S: Final = 300.0  #: No protection level for this long after a step of all codes: they determine the position.
 
 # Protection levels.
-SCALE_BOUND: Final = 0.02  #: Fraction of a distance without codes that may be in error: a worn or wrong wheel.
-#: A source that is not measured needs no sub-filter once its effect has left the filter: position and standard
+SCALE_BOUND: Final = 0.02  #: Largest error of a distance without codes, as a fraction: a wrong wheel diameter.
+#: A source that is not measured requires no sub-filter once its effect on the filter has decayed: position and standard
 #: deviation differ by less than this fraction of the standard deviation.
 JOINED: Final = 0.05
 #: The Newton iteration of the level ends at a step below this [m], or after this many steps.

@@ -1,8 +1,8 @@
 """Measurement equations of one epoch, linearised at one Gaussian: the rows of H and A in docs/filter-equations.md.
 
-The page has an equation for each kind of row, in the letters of its table of unknowns. The change of a carrier phase
-uses the direction of the chord at both ends. With the tangent of each end the phases would measure the absolute
-position from the bend of the line more precisely than the line is known.
+That page has an equation for each kind of row, in the letters of its table of unknowns. For the change of a carrier
+phase the direction of the chord is used at both ends. With the tangent at each end the phases would measure the
+absolute position from the bend of the line more precisely than the line is known.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Geometry(NamedTuple):
     chord: Floats
     distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
     sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
-    along: Floats  #: Their components along the axes; shape (K, 3).
+    along: Floats  #: Components of `sight` along `axes`; shape (K, 3).
 
 
 #: Unknowns of the distance travelled since the previous epoch: s - s' + q_a.
@@ -186,7 +186,7 @@ def write_range_rate(channel: Record, point: Floats, u: Floats, per_velocity: Fl
     velocity.
 
     ``rate = (A + g . v) / (1 + A / c)``: A is the satellite's velocity along u, the unit vector to it; g is -u; both
-    include the Earth's rotation. `per_velocity` is ``g / (1 + A / c)``; it, `point` and `u` have the shape (3,).
+    include the Earth's rotation. `per_velocity` is ``g / (1 + A / c)``. All arrays have the shape (3,).
     """
     sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
     moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]

@@ -33,9 +33,9 @@ def reweigh(
     """Update the branch probabilities, and their part due to codes, by the evidence of motion and codes.
 
     The bounds of both are in docs/filter-equations.md. Branches within the map error have the same range difference at
-    every epoch. Errors of the motion are correlated over seconds, so that one second counts once at any rate. All
-    satellites on one side of a street share code errors for minutes. For laps within `ALIKE` times map_branch_m the
-    recent evidence of codes is kept as `log_recent`; only `find_leading` uses it.
+    every epoch. Errors of the motion are correlated over seconds, so its evidence is multiplied by the interval, at
+    most 1 s. All satellites on one side of a street share code errors for minutes. For laps within `ALIKE` times
+    map_branch_m the recent evidence of codes is kept as `log_recent`; only `find_leading` uses it.
 
     `evidence` and `code_evidence`, shape (H,), are the log evidence of the motion, and of the codes given the motion;
     `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].

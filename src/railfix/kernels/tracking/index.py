@@ -26,7 +26,7 @@ FORCE_OFFSET: Final = 13
 RADAR: Final = 14
 #: Time-correlated error of the Doppler speed [m/s].
 DOPPLER_SPEED: Final = 15
-#: Displacement along the line by code errors that last for minutes (orbits, ionosphere) [m].
+#: Displacement along the line by code errors that last for hours (orbits, ionosphere) [m].
 SLOW_CODE: Final = 16
 #: Speed at the previous epoch [m/s].
 PREVIOUS_SPEED: Final = 17
@@ -60,7 +60,7 @@ ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0,
 #: Bits of the reasons for a position search before an epoch: the track is lost, there were no measurements for a long
 #: time, or motion contradicts the position.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
-#: Flags of the first epoch of a call: predicted, with the position search done; the same after a loss of track.
+#: Flags of the first epoch of a call: not predicted; predicted and the position searched for; the same, track lost.
 NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 

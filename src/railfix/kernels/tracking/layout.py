@@ -144,6 +144,6 @@ class Rows(NamedTuple):
     #: Variance of white errors, including the adapted scales [m2, (m/s)2, squared units of the sensors]; shape (M,).
     variance: Floats
     left_out: Masks  #: True for codes of a satellite that is left out as faulty; shape (M,).
-    code_s: float  #: Interval that the codes represent [s]; that of the epoch if it has none, 0 if they are skipped.
+    code_s: float  #: Interval that the codes represent [s]; the epoch's interval without codes, 0 if they are skipped.
     degrees: float  #: Degrees of freedom of the errors' Student t distribution; no unit.
     late_degrees: float  #: Degrees of freedom for codes that are longer than expected.

@@ -1,6 +1,6 @@
 """Protection level of the filtered position by solution separation; its equation is in docs/filter-equations.md.
 
-Every hypothesis uses the risk that it needs instead of an equal fraction (hypotheses of R. G. Brown and P. W. McBurney,
+Every hypothesis uses the risk it requires instead of an equal fraction (hypotheses of R. G. Brown and P. W. McBurney,
 1988, allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, here for a filter instead of an epoch). The
 separation bounds the error and is not a test, because robust filters can converge to different modes without a fault.
 """
@@ -24,7 +24,7 @@ from railfix.kernels.tracking.subfilters import find_other
 class Alternatives(NamedTuple):
     """Alternative positions of the train with their probabilities; shapes (A,)."""
 
-    along_m: Floats  #: Distance along the line; 0 beyond `start_separation_m`, further than a level may reach.
+    along_m: Floats  #: Distance along the line; 0 beyond `start_separation_m`, the largest reach of a level.
     straight_m: Floats  #: Straight distance.
     forward_m: Floats  #: Component of the straight distance along the line at the alternative.
     sigma_m: Floats
@@ -33,7 +33,7 @@ class Alternatives(NamedTuple):
 
 @inner
 def find_other_positions(given: Given, state: State) -> tuple[Alternatives, float]:
-    """Return the hypotheses except the first, and the probability of those beyond `start_separation_m`."""
+    """Return the hypotheses except the first, and the probability of hypotheses beyond `start_separation_m`."""
     others = slice(1, state.monitors[0].hypotheses)
     along = np.abs(state.x[others, ix.ARC] - state.x[0, ix.ARC])
     sigma = np.sqrt(state.P[others, ix.ARC, ix.ARC])
@@ -79,10 +79,10 @@ def _find_subfilters(given: Given, state: State) -> Alternatives:
 
 @inner
 def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the positions on other branches if a source is faulty, and the risk used by those that need no term.
+    """Return the positions on other branches if a source is faulty, and the risk used by positions without a term.
 
     A fault shifts the positions on all branches equally along the line. Positions that require less than the level so
-    far need no term.
+    far have no term.
     """
     most, size, spent = len(positions.sigma_m) * len(subfilters.sigma_m), 0, 0.0
     along, straight, sigma, probability = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
@@ -104,11 +104,11 @@ def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level
 
 @inner
 def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the positions without both satellites of a pair, and the risk used by pairs that need no term.
+    """Return the positions without both satellites of a pair, and the risk used by pairs without a term.
 
-    Information is additive; the standard deviation is mostly within a tenth of the value from a filter without both,
-    with few satellites down to half of it. Pairs need no term if they require a lower level than the one so far, or if
-    nothing bounds the position without them.
+    Information is additive; the standard deviation is mostly within a tenth of the value of a filter without both, with
+    few satellites down to half of this value. Pairs have no term if they require a lower level than the level so far,
+    or if nothing bounds the position without them.
     """
     source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
     most = satellites * (satellites - 1) // 2
@@ -160,8 +160,8 @@ def write_level(given: Given, state: State, positions: Alternatives, unbounded: 
     """Write the level of the first hypothesis and its parts.
 
     The level is infinite without sub-filters, where one has been contradicted for longer than `LEVEL_DOUBT_S`, and
-    where unbounded satellite pairs are more probable than the risk; along the line also where a position further away
-    than a level may reach is. The straight distance includes all branches and a laterally displaced map.
+    where unbounded satellite pairs are more probable than the risk; along the line also where positions beyond
+    `start_separation_m` are. The straight distance includes all branches and a laterally displaced map.
     """
     parameters, source, first = given.parameters[0], state.source, len(state.hypothesis)
     others = find_other(state, ix.ALL_DOPPLERS)
@@ -201,7 +201,7 @@ def write_level(given: Given, state: State, positions: Alternatives, unbounded: 
 
 @inner
 def join(one: Alternatives, other: Alternatives) -> Alternatives:
-    """Return two sets of alternatives as one."""
+    """Return the concatenation of two sets of alternatives."""
     return Alternatives(
         np.concatenate((one.along_m, other.along_m)), np.concatenate((one.straight_m, other.straight_m)),
         np.concatenate((one.forward_m, other.forward_m)), np.concatenate((one.sigma_m, other.sigma_m)),

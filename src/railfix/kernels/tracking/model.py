@@ -171,7 +171,7 @@ def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
 
 @inner
 def restart(P: Floats, unknown: int, variance: float) -> None:
-    """Make an unknown independent of all others."""
+    """Make an unknown independent of all others, with a given variance."""
     for c in range(len(P)):
         P[unknown, c] = P[c, unknown] = 0.0
     P[unknown, unknown] = variance
@@ -181,10 +181,10 @@ def restart(P: Floats, unknown: int, variance: float) -> None:
 def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
     """Return whether a measured speed is possible after the previous ones, and narrow the range of possible speeds.
 
-    There are no bounds with several branches. Speeds from enough satellites, or supported by a sensor on board, are
-    accepted outside the range too. If the speed is not accepted, the range grows by emergency braking, so that braking
-    is followed from the next epoch on. Without a measurement `sigma` is infinite, and the range grows by service
-    braking.
+    There are no bounds with several branches. Speeds from enough satellites, from codes alone, or supported by a sensor
+    on board, are accepted outside the range too. If the speed is not accepted, the range grows by emergency braking, so
+    that braking is followed from the next epoch on. Without a measurement `sigma` is infinite, and the range grows by
+    service braking.
     """
     low, high = -math.inf, math.inf
     if monitors.hypotheses == 1:

@@ -327,8 +327,8 @@ def advance(
     """Process a span of epochs; return the first epoch that requires a position search with its reasons, or the end of
     the span and 0.
 
-    That epoch is left predicted; a call for it alone with `index.SOUGHT` completes it. An epoch with a restart is
-    returned with 0.
+    The epoch of the search is left predicted; a call for it alone with `index.SOUGHT` completes it. An epoch with a
+    restart is returned with 0, and so is the epoch after one whose position is not finite.
     """
     for t in range(span[0], span[1]):
         if sought == ix.NOT_SOUGHT:

@@ -1,8 +1,8 @@
 """Sub-filters of the protection level, each without one source of measurements.
 
-Each runs the same recursion without one source (a satellite, a constellation, a sensor, all Dopplers, all phases, the
-codes of all satellites ahead or behind) or with a possibly wrong map. It has its own state from its start on, so that a
-fault of the excluded source has never entered it.
+Each sub-filter runs the same recursion without one source (a satellite, a constellation, a sensor, all Dopplers, all
+phases, the codes of all satellites ahead or behind) or with a possibly wrong map. It has a separate state from its
+start on, so that a fault of the excluded source never affects it.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
 def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leading: int) -> None:
     """Correct all sub-filters, predicted to the epoch; `leading` is the leading hypothesis, `best` its correction.
 
-    Each has its own equations, because the line may bend between its position and the filter's. If its own measurements
-    contradict it, it restarts. The filter itself is the sub-filter of a source that it has not absorbed. If all
+    Each sub-filter has separate equations, because the line may bend between its position and the filter's. It restarts
+    if its measurements contradict it. The filter itself is the sub-filter of a source that it has not absorbed. If all
     restart, so does a sub-filter with all satellites in view, which serves satellite pairs until it equals the filter.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
@@ -157,8 +157,8 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
     """Rotate the displacement of a possibly wrong map with the line: a lateral displacement in a bend is along the line
     after it.
 
-    It affects the distance on the map, not the distance of the phases. The previous component along the line is
-    unknown.
+    The rotation affects the distance on the map, not the distance measured by phases. The previous component along the
+    line is unknown.
     """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], x[ix.ARC], point, axes)

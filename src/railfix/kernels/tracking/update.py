@@ -63,7 +63,7 @@ class Correction(NamedTuple):
 
 @inlined
 def find_row(rows: Rows, q: int) -> int:
-    """Return the row of a code's or sensor's quantity. The six motion quantities have no row of their own."""
+    """Return the row of a code's or sensor's quantity; the six motion quantities have no row."""
     return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
 
 
@@ -176,9 +176,9 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the initial weights from the innovations; those of GNSS are less the median of their kind.
+    """Write the initial weights from the innovations; the median of each GNSS kind is subtracted.
 
-    Their variances are without the clocks, whose prior would hide every outlier.
+    The variances exclude the clocks, whose prior would hide every outlier.
     """
     covariance, without_clock = expected
     design, value, codes = equations.design, equations.value, rows.code.stop
@@ -360,7 +360,7 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
 def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
     """Return the log evidence of all measurements except the codes, and of the codes given the others.
 
-    It is 0 with too few measurements, which fit any speed and position.
+    Either is 0 with too few measurements, which fit any speed and position.
     """
     joint = compute_log_evidence(rows, rows.variance, one.fit)
     without_codes, found = rows.variance.copy(), new_fit(rows)

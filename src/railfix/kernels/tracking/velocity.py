@@ -36,7 +36,7 @@ def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: 
 
     The velocity is NaN where the measurements are too few or do not agree. A velocity from phases applies half an
     interval before the epoch. `epoch` and `channel` are `EPOCH` and `CHANNEL`, shapes (T,) and (T, K); `near_ecef_m`,
-    shape (T, 3), is a position accurate to some hundred metres, NaN if unknown; `up`, shape (T, 3), is the vertical at
+    shape (T, 3), is a position accurate to hundreds of metres, NaN if unknown; `up`, shape (T, 3), is the vertical at
     the position.
     """
     epochs, channels = channel.shape
