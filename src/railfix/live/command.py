@@ -256,7 +256,8 @@ def _close(outlet: Outlet[Any], log: SessionLog) -> None:
     """Close an outlet, and log the number of items that it has not written."""
     outlet.close()
     if outlet.dropped or outlet.failed:
-        log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} refused {outlet.failure}")
+        reason = f"; it {outlet.failure}" if outlet.failure else ""
+        log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} items not delivered{reason}")
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:

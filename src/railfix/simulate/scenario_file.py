@@ -132,7 +132,8 @@ def load_recipe(name: FilePath) -> Recipe:
     for name_of in names:
         if not isinstance(name_of, str) or not re.fullmatch(r"[\w.-]*\w", name_of) or names.count(name_of) > 1:
             raise SettingsError(
-                f"{path}: each of [[runs]] needs a unique name (letters, digits, -, _) for its folder, got {name_of!r}"
+                f"{path}: each of [[runs]] needs a unique name (letters, digits, -, _ and dots inside) for its folder, "
+                f"got {name_of!r}"
             )
     tables = tuple(_run_table(base, run, table.get("parts", {}), path) for run in runs)
     return Recipe(path=path, description=description, names=tuple(names), tables=tables)

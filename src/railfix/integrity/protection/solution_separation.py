@@ -30,7 +30,6 @@ from railfix.integrity.raim import LinearModel
 
 _BLOCK_SIZE: Final = 200_000  #: Number of elements of a block's array of hypotheses.
 _OF_MORE: Final = 3  #: Index of the tails of three or more faults among the kinds of hypotheses.
-_SAME: Final = 1e-9  #: Separation in position sigmas below which two positions are the same.
 
 
 class Cause(IntEnum):
