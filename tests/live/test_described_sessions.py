@@ -285,7 +285,8 @@ def _watch(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
     patch.setattr(console, "SensorChecks", Checks)
     patch.setattr(console.RadarWatch, "take_samples", lambda _self, radar, time, speeds: [SimpleNamespace(
         sentence=f"radar {len(radar)} rows, {len(time)} times to {time[-1]}, speeds {speeds.sum():.1f}")])  # fmt: skip
-    for table, dark, length_s in ((False, False, 700), (True, False, 700), (False, True, 1300)):
+    cases = ((False, False, 700, 0), (True, False, 700, 0), (False, True, 1300, 0), (True, False, 1300, 640))
+    for table, dark, length_s, still_s in cases:  # `still_s`: until then one speed alone
         said.clear()
         processor = SimpleNamespace(trajectories=clean_trajectories(), units=None, config=SimpleNamespace(sensors=None))
         watch = SensorWatch(processor, said.append)  # type: ignore[arg-type]
@@ -303,7 +304,9 @@ def _watch(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
             status = Status.UNCERTAIN if second % 50 == 10 or dark else Status.OK
             own = single(100.0 + second, seconds=float(second), status=status)
             track = filtered(
-                100.0 + second, kinds=(Kind.DOPPLER,) if second % 20 else (), speed=NAN if second == 5 else 1.0
+                100.0 + second,
+                kinds=(Kind.DOPPLER,) if second % 20 and not 10 < second < still_s else (),
+                speed=NAN if second == 5 else 1.0,
             )
             before = len(said)
             given = [{"front": (own, track)}] * 2 + [{"rear": (own, track)}, {"front": (own, None)}]  # counts once
@@ -399,10 +402,8 @@ def _sessions(_: Path) -> Iterator[Iterable[str]]:
         (100.0 * k + late, name, 100.0 * k) for k in range(4) for name, late in (("front", 0.0), ("rear", 5.0 + 10 * k))
     ]
     for live in (False, True):
-        yield [
-            "pairs",
-            *_play(_engine("front", "rear"), [*pairs, (400.0, "", 0), (460.0, "", 0), (700, "", 0)], live=live),
-        ]
+        steps = [*pairs, (400.0, "", 0), (460.0, "", 0), (700, "", 0)]
+        yield ["pairs", *_play(_engine("front", "rear"), steps, live=live)]
         early = [(0.0, "front", 0.0), (30.0, "front", 100.0), (60.0, "front", 200.0), (100.0, "", 0), (149.0, "", 0),
                  (200, "front", 300), (260, "", 0), (351, "", 0), (450, "", 0), (452, "", 0)]  # fmt: skip
         yield ["early and silent", *_play(_engine("front"), early, live=live)]
@@ -412,6 +413,8 @@ def _sessions(_: Path) -> Iterator[Iterable[str]]:
         yield ["order and restart", *_play(_engine("front", restart_epochs=3), order, live=live)]
         behind = [(max(100.0 * k, 3000.0 if k > 4 else 0.0), "front", 100.0 * k) for k in range(34)]
         yield ["behind", *_play(_engine("front", behind_s=1.0, no_input="skip"), behind, live=live)]
+    late = [(0.0, "front", 0.0), (300.0, "", 0), (310.0, "rear", 0.0), (320.0, "rear", 300.0), (700.0, "", 0)]
+    yield ["a late antenna", *_play(_engine("front", "rear", no_input="skip"), late, live=False)]
     engine = _engine("front", "rear", pair_wait_s=5.0, no_input="skip")
     queued = [*_play(engine, [(float(k), "front", 100.0 * k) for k in range(103)], live=False)]
     yield ["queue", *queued[:2], *queued[50:53], *queued[-2:]]
