@@ -91,7 +91,8 @@ def describe_axes(axes: Any) -> Iterator[str]:
         yield from describe(np.asarray(line.get_ydata()), "    y")
     for area in axes.collections:
         kind = type(area).__name__.removeprefix("FillBetween")
-        yield f"  {kind} {_label(area.get_label())!r} alpha {area.get_alpha()}, {area.get_linewidths().tolist()}"
+        drawn = f"{area.get_linewidths().tolist()}{', rasterized' * bool(area.get_rasterized())}"
+        yield f"  {kind} {_label(area.get_label())!r} alpha {area.get_alpha()}, {drawn}"
         for path in area.get_paths() if area.get_array() is None else ():
             yield from describe(np.unique(path.vertices.astype(float), axis=0), "    path")
         if area.get_array() is not None:
