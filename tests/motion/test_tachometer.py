@@ -105,3 +105,5 @@ def test_units_lags_and_diameters_of_logs_are_found(factor: float, unit: str, la
     assert found.unit == unit
     assert found.lag_s == pytest.approx(lag, abs=0.11)
     assert found.ratio == pytest.approx(1.015, abs=0.003)
+    creeping = 1.5 + 0.3 * np.sin(t / 9.0)  # speeds over 1 m/s count
+    assert check_speeds(START + timedelta(t), factor * creeping, START + timedelta(t), creeping).unit == unit
