@@ -140,7 +140,7 @@ def test_a_caster_without_tls_is_said_to_be_one(certificate: Path) -> None:
             writer.write(b"HTTP/1.1 400 Bad Request\r\n\r\n")
             await writer.drain()
 
-    with pytest.raises(InputFileError, match=r"does not speak TLS there .*is it ntrip://\?"):
+    with pytest.raises(InputFileError, match=r"does not use TLS on this port .*give ntrip://"):
         received(plain, None, SETTINGS.replaced(ntrip_certificates=certificate))
 
 

@@ -372,7 +372,7 @@ def test_with_a_base_station_one_of_three_tracks_is_told_from_the_others(tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["demo", "city"])
 def test_a_simulated_train_beside_a_loop_of_four_metres_keeps_its_route(tmp_path: Path, scenario: str) -> None:
-    """Seed 12 once ended with "no route joins these", 1,046 epochs off the map and 307 m of error."""
+    """Seed 12 once ended with "no route joins", 1,046 epochs off the map and 307 m of error."""
     files = write_run(load_recipe(scenario).scenario().replaced(seed=12), tmp_path / "simulated")
     around = network_around(read_track(files["track"]), "loop", 12)
     inputs = RunInputs(
@@ -380,7 +380,7 @@ def test_a_simulated_train_beside_a_loop_of_four_metres_keeps_its_route(tmp_path
     )
     summary = run_files(inputs, Config(filter="track"), out=tmp_path / "results", options=ELLIPSOIDAL)
     assert json.loads(summary.files["run.json"].read_text())["line"]["route"]["tracks"] == ["line 0", "main", "line 1"]
-    assert "no route joins" not in " ".join(summary.notes)
+    assert "cannot be joined" not in " ".join(summary.notes)
     truth = pl.read_csv(files["truth"]).filter(antenna="front")
     for table, passed in (("positions", "ok"), ("train", "tracking")):
         rows = pl.read_parquet(summary.files[f"{table}.parquet"])

@@ -200,7 +200,7 @@ class ControlCentre:
         """Alarms on reports awaited after a start, and on interference that trains suspect."""
         awaited = self.supervision.awaited_text
         waits = (
-            [f"nothing is granted until these trains have reported since the start: {awaited} (confirm-start)"]
+            [f"nothing is granted until these trains report, or confirm-start is ordered twice for them: {awaited}"]
             if awaited
             else []
         )
@@ -222,8 +222,8 @@ class ControlCentre:
     def step(self) -> None:
         """Order braking, release points, set routes, extend authorities, and commit; then send the committed messages.
 
-        It must be called several times per second. Orders to brake do not wait for a commit. Authorities, and commands
-        to points, are sent once their state is committed.
+        It must be called several times per second. Orders to brake do not wait for a commit. Authorities and commands
+        to points are sent once the state on which they are based is committed.
         """
         now = self.clock()
         self._monitor(now)

@@ -61,7 +61,8 @@ Order = Callable[..., str | None]
 class Sessions:
     """Log-ins of the page.
 
-    `password` belongs to the operator ``""``; `others` are passwords by name, each of one person or interface.
+    `password` is that of the operator, who logs in without a name; `others` are the passwords of other persons and
+    interfaces, by name.
     """
 
     password: str

@@ -15,8 +15,8 @@ _NO_EFFECT = 1e-6
 #: Separations below this fraction of sigma are taken as zero.
 _SAME = 1e-9
 #: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to map errors
-#: across and up, mean map error across and up, sigmas of the threshold, smallest threshold, 1 without the map, distance
-#: without the map, and the gain below which a channel has no effect.
+#: across and up, mean map error across and up, false-alarm threshold in sigmas, smallest threshold, flag of equations
+#: without the map, distance of the position without the map, and gain below which a channel has no effect.
 _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FREE, _SHIFT, LIMIT = range(11)
 
 
@@ -223,7 +223,7 @@ def write_without_map(
 ) -> bool:
     """Write the equations without the map, and return whether they determine a position.
 
-    The distance to the position with the map is added in full, without a test.
+    Offsets include the full distance from the position with the map, and separations are not tested.
     """
     n, rows, common = len(channels.root), system.rows, system.common
     information, variance = errors.map_information[t], errors.scale[t] ** 2

@@ -179,7 +179,8 @@ async def _tcp(
         raise InputFileError(hidden(source), why + hint) from None
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
-        raise InputFileError(hidden(source), f"does not speak TLS there ({reason}); is it ntrip://?") from None
+        without = "the server does not use TLS on this port"
+        raise InputFileError(hidden(source), f"{without} ({reason}); for a server without TLS give ntrip://") from None
     except (OSError, TimeoutError) as error:
         over = "" if tls is None else " over TLS"
         raise InputFileError(hidden(source), f"cannot be connected to{over} ({str(error) or 'no answer'})") from None

@@ -49,7 +49,7 @@ class SingleEpochs:
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
     off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`).
-    map_offset: Masks  #: True where the 3-D positions of the last minutes are beside or above the line.
+    map_offset: Masks  #: True where the mean 3-D position of the last minutes is beside, above or below the line.
     suspicion: Codes  #: `railfix.integrity.interference.Suspicion`.
 
 

@@ -202,7 +202,10 @@ def sensor_epochs(
 def _wheel_values(
     pulses: TachometerPulses, edges: Datetimes, sensed: SensedMotion, limits: SensorLimits, *, known: Masks
 ) -> dict[str, Any]:
-    """Return the wheel distances toward the front, by inertia during slips, where `known` or inertial."""
+    """Return the wheel distances of the intervals toward the front, with their sigmas and the kind of their sign.
+
+    They are from pulses where these are `known` and usable, from the inertial unit during slips, otherwise NaN.
+    """
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     distance = np.diff(distance_m(pulses, edges, limits=limits.tachometer))

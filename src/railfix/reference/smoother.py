@@ -56,7 +56,7 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
 class Evidence:
     """Measurements along one antenna's path at N instants; NaN where missing."""
 
-    time: Datetimes  #: Rising, with steps of at most some seconds; shape (N,).
+    time: Datetimes  #: Increasing, with steps of a few seconds at most; shape (N,).
     #: Arc length of good fixes, and its standard deviation; shape (N,).
     fix_m: Floats
     fix_sigma_m: Floats

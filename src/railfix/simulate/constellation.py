@@ -275,7 +275,8 @@ def _digits(value: float) -> str:
     return f"{value:.12E}"
 
 
-#: Longest piece of `SatelliteTable` [s], its number of nodes, and the flight time for which it is computed [s].
+#: Longest piece of `SatelliteTable` [s], number of nodes per piece, and approximate flight time from which the
+#: light-time equation is solved [s].
 _PIECE_S: Final = 60.0
 _NODES: Final = 7
 _FLIGHT_S: Final = 0.08

@@ -174,7 +174,7 @@ def find_route(network: Network, matched: Matched, path: str = "the log") -> tup
 def left_out_note(network: Network, left_out: Sequence[int]) -> str:
     """Return the note on the tracks that cannot be joined to the route of a run; see `find_route`."""
     beside = ", ".join(network.names[k] for k in left_out)
-    return f"no route joins these tracks to {beside}: the train turned back there, or the map has a gap"
+    return f"{beside} cannot be joined to the route: the train turned back there, or the map has a gap"
 
 
 def _beside(network: Network, matched: Matched) -> str:

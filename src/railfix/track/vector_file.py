@@ -104,7 +104,10 @@ def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
 
 
 def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return origin, name ("way/7 Main Line") and level of an OpenStreetMap way; empty for any other feature."""
+    """Return the origin of a feature from OpenStreetMap, with its name ("way/7 Main Line") and non-zero level.
+
+    Without an id there is no name and no level. Another feature has an origin only if it is a railway in use.
+    """
     tags = get_tags(row)
     if not is_of_openstreetmap(row):
         return ORIGIN if tags.get("railway") in _RAILWAYS else {}

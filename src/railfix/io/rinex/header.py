@@ -154,7 +154,10 @@ class _HeaderRecords:
                 self._changes |= self._by_words(name, label, text)
 
     def _by_words(self, name: str, label: str, text: str) -> dict[str, Any]:
-        """Return the value of a record read by its words; no value if it is unreadable and broken lines are counted."""
+        """Return the value of a record whose fields are separated by spaces instead of columns.
+
+        An unreadable record is an error, or is noted and skipped if broken lines are counted.
+        """
         read = _BY_WORDS.get(label)
         try:
             if read is not None:
@@ -170,7 +173,7 @@ class _HeaderRecords:
         return {}
 
     def _remark(self, label: str) -> None:
-        self._log.remark(f"{self._path}, line {self._line}: {label} is not in its columns; it was read by its words")
+        self._log.remark(f"{self._path}, line {self._line}: {label} is not in its columns; its fields were separated at spaces")
 
     def finish(self) -> RinexHeader:
         """Return the header with all records applied."""

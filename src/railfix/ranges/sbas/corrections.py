@@ -115,7 +115,7 @@ class SbasCorrections:
         )
 
     def _leave_out(self, messages: SbasMessages) -> list[str]:
-        """Return notes on the unused messages of a whole log."""
+        """Return notes on the messages of type 0 and on the unused corrections of a whole log."""
         notes = []
         zeros = int((messages.type == 0).sum())
         if zeros:
