@@ -460,23 +460,23 @@ def test_positions_are_checked() -> None:
 
 def test_places_by_the_filter_differ_by_more_than_the_limit_and_noise() -> None:
     pair = PairedEpochs(
-        front_epoch=np.arange(4),
-        rear_epoch=np.arange(4),
-        front_ecef_m=np.zeros((4, 3)),
-        rear_ecef_m=np.zeros((4, 3)),
-        along_m=np.full(4, -18.0),
+        front_epoch=np.arange(5),
+        rear_epoch=np.arange(5),
+        front_ecef_m=np.zeros((5, 3)),
+        rear_ecef_m=np.zeros((5, 3)),
+        along_m=np.array([-18.0, -18.0, -18.0, -18.0, np.nan]),
     )
-    place, sigma = np.array([100.0, 100.0, 100.0, np.nan]), np.array([1.0, 1.0, 5.0, 1.0]) / np.sqrt(2.0)
-    front = FilteredMotion(place, sigma, speed_mps=np.full(4, 10.0), speed_sigma_mps=np.full(4, 0.1))
-    rear = front._replace(chainage_m=np.array([118.0, 130.0, 130.0, 118.0]))
+    place, sigma = np.array([100.0, 100.0, 100.0, np.nan, 100.0]), np.array([1.0, 1.0, 5.0, 1.0, 1.0]) / np.sqrt(2.0)
+    front = FilteredMotion(place, sigma, speed_mps=np.full(5, 10.0), speed_sigma_mps=np.full(5, 0.1))
+    rear = front._replace(chainage_m=np.array([118.0, 130.0, 130.0, 118.0, 130.0]))
     found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
-    np.testing.assert_allclose(found.metric, [0.0, 12.0, 12.0, np.nan])
-    np.testing.assert_array_equal(found.reject, [False, True, False, False])
+    np.testing.assert_allclose(found.metric, [0.0, 12.0, 12.0, np.nan, np.nan])
+    np.testing.assert_array_equal(found.reject, [False, True, False, False, False])
     # speeds: beyond 1.5 m/s and four standard deviations of the difference
-    rear = front._replace(chainage_m=place + 18.0, speed_mps=np.array([11.4, 11.6, 11.6, np.nan]))
-    rear = rear._replace(speed_sigma_mps=np.array([0.01, 0.1, 0.5, 0.1]))
+    rear = front._replace(chainage_m=place + 18.0, speed_mps=np.array([11.4, 11.6, 11.6, np.nan, 10.0]))
+    rear = rear._replace(speed_sigma_mps=np.array([0.01, 0.1, 0.5, 0.1, 0.1]))
     found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
-    np.testing.assert_array_equal(found.reject, [False, True, False, False])
+    np.testing.assert_array_equal(found.reject, [False, True, False, False, False])
 
 
 @pytest.mark.requirement("B5")

@@ -92,11 +92,14 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge(
         self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict for pairs of positions; an unknown spacing (NaN) counts as 0."""
-        along = np.where(np.isnan(pair.along_m), 0.0, pair.along_m)
-        return antenna_spacing_screen(
+        """Return metric and verdict for pairs of positions; NaN and no rejection where the spacing is unknown."""
+        unknown = np.isnan(pair.along_m)
+        along = np.where(unknown, 0.0, pair.along_m)
+        found = antenna_spacing_screen(
             front_chainage_m, rear_chainage_m, np.abs(along), facing=np.sign(along).astype(int), limits=limits
         )
+        metric = np.where(unknown, np.nan, found.metric)
+        return Screened(metric=metric, reject=found.reject & ~unknown, limit=found.limit)
 
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: AntennaSpacingLimits
