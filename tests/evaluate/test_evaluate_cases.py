@@ -547,7 +547,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
         arguments += ["--reference", str(file)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    assert "By configuration, with its runs together" in result.output
+    assert "By configuration, runs combined" in result.output
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert {entry["input"] for entry in written["inputs"]} == {"positions", "record", "reference"}
     for entry in written["inputs"]:

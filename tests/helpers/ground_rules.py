@@ -89,7 +89,7 @@ RULES: dict[str, list[Replaced]] = {
     "sequence": [
         (reports, "is_newer", always),
         (reports, "furthest", lambda _facing, new, _known: new),
-        without(reports.older_place, reports.rolled_back),
+        without(reports.older_place, reports.rolled_back, reports.impossible_way),
         (supervision, "counts", always),
     ],
     "direction": [(interlocking, "comes_the_other_way", never)],

@@ -65,7 +65,7 @@ def figures(part: str, heading: str, name: str) -> list[str]:
 
 def table() -> Iterator[str]:
     """Lines of the table."""
-    yield "| systems | way | rate %, points lost | p95, largest m | over 10 m |"
+    yield "| systems | method | rate %, points lost | p95, largest m | over 10 m |"
     yield "|---|---|---|---|---:|"
     yield "| P1, MSAS | conventional | 86.7 | 65.8 | |"
     yield "| | map and screens | 84.6, 2.1 | 10.2 | |"

@@ -92,7 +92,7 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Find the ranges that agree with each other at positions on the line, by IGG-III weights (`robust_fit`).
+    """Find the ranges that agree at positions on the line, by IGG-III weights (Yang, Song and Xu, 2002).
 
     Epochs without a position are fitted at `near_ecef_m`, shape (T, 3) [m], by default the middle of the line.
     """

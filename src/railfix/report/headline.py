@@ -115,13 +115,14 @@ def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed
     """Return a remark on errors above the protection level at usable positions, or, without levels, on error/sigma."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
-        len(evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna))
+        f"{'of the filter: ' if kind == 'train' else ''}{len(found):,}"
         for kind, name in kinds.items()
         if kind in evaluation.integrity and name
+        for found in [evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna)]
     ]
     if not counts:
         return f"95 % of errors within {number(passed.get('normalised_p95'), 1)} sigma"
-    return "errors above the level at usable positions: " + "; of the filter: ".join(f"{count:,}" for count in counts)
+    return f"errors above the level at usable positions: {'; '.join(counts)}"
 
 
 def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:

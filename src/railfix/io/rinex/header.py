@@ -173,7 +173,8 @@ class _HeaderRecords:
         return {}
 
     def _remark(self, label: str) -> None:
-        self._log.remark(f"{self._path}, line {self._line}: {label} is not in its columns; its fields were separated at spaces")
+        read = "is not in its columns; its fields were separated at spaces"
+        self._log.remark(f"{self._path}, line {self._line}: {label} {read}")
 
     def finish(self) -> RinexHeader:
         """Return the header with all records applied."""

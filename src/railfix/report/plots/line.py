@@ -275,7 +275,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
         name="interval-chainage",
         title="Positioning interval",
         caption=f"Distance along the line between consecutive positions. {_by(table)} "
-        f"Longest: {', '.join(longest)}.{thinned}",
+        + (f"Longest: {', '.join(longest)}.{thinned}" if longest else "There are none."),
         x_label="chainage [m]",
         y_label="distance from the previous position [m]",
         layers=tuple(layers),
