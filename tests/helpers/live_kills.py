@@ -100,7 +100,7 @@ def count_sessions(sessions: Iterable[tuple[Path, Path]]) -> tuple[Counter[str],
     middle_m, newest, counted, first = true_middle_m(), 0, Counter[str](), list[int]()
     lost = Counter(dict.fromkeys(("numbers sent twice", "lines", "states", "bounds"), 0))
     for messages, errors in sessions:
-        logged = " ".join(errors.read_text().split())
+        logged = " ".join(errors.read_text().split()) if errors.exists() else ""  # killed before its start
         counted["continued"] += "positioning continues" in logged
         lost["states"] += "not used" in logged
         placed = 0
