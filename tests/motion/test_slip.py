@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.core.constants import GRAVITY_MPS2
+from railfix.live.state_values import decode, encode
 from railfix.motion.slip import MotionSamples, MotionState, find_slips, heading_rate_radps, pitch_rate_radps
 from slip_motion import RATE_HZ, SLIPPING, even_motion, motion
 
@@ -77,8 +78,7 @@ def test_a_body_that_comes_to_rest_after_braking_does_not_roll_away(permille: fl
     """The nose comes up again over a second after the stop: a change of the pitch, and no motion."""
     t = np.arange(0.0, 120.0, 1.0 / RATE_HZ)
     swing = permille / 1e3 * np.exp(-np.maximum(t - 1.0, 0.0) / 0.8)
-    wheel = np.where(t < 0.7, 1.0 - t, np.nan)
-    force = np.where(t < 1.0, -1.0, 0.0) + GRAVITY_MPS2 * swing
+    wheel, force = np.where(t < 0.7, 1.0 - t, np.nan), np.where(t < 1.0, -1.0, 0.0) + GRAVITY_MPS2 * swing
     found, _ = find_slips(MotionSamples(t, wheel, np.where(t < 0.7, -1.0, np.nan), force, np.zeros(len(t))))
     assert (found.state[t > 3.0] == MotionState.STANDING).all()
     assert found.distance_m[-1] == pytest.approx(found.distance_m[np.searchsorted(t, 1.1)], abs=0.2)
@@ -88,9 +88,9 @@ def test_a_body_that_comes_to_rest_after_braking_does_not_roll_away(permille: fl
 def test_rolling_without_a_pulse_expires_as_other_carries_do() -> None:
     t = np.arange(0.0, 60.0, 1.0 / RATE_HZ)
     force = np.where(t < 10.0, 0.05, 0.0)
-    found, _ = find_slips(
-        MotionSamples(t, np.where(t < 0.5, 0.0, np.nan), np.zeros(len(t)), force, np.full(len(t), np.nan))
-    )
+    wheel, unknown = np.where(t < 0.5, 0.0, np.nan), np.full(len(t), np.nan)
+    found, state = find_slips(MotionSamples(t, wheel, np.zeros(len(t)), force, unknown))
+    assert encode(decode(encode(state))) == encode(state), "a state can be stored"
     rolling = t[found.state == MotionState.ROLLING]
     assert rolling[0] < 12.0
     assert rolling[-1] - rolling[0] == pytest.approx(30.0, abs=0.1)

@@ -16,12 +16,11 @@ the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
 
 from __future__ import annotations
 
-import copy
 from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -110,7 +109,7 @@ class SlipState:
     """State of `find_slips` after a call."""
 
     time_s: float  #: Time of the last sample.
-    automaton: _Automaton
+    values: dict[str, Any]  #: Variables of the state machine.
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
@@ -162,7 +161,7 @@ def find_slips(
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
-    automaton = _Automaton(limits) if state is None else state.automaton.copy(limits)
+    automaton = _Automaton(limits, {} if state is None else state.values)
     steps = np.diff(time_s, prepend=time_s[:1] if state is None else state.time_s).tolist()
     turning = np.full((size, 3), np.nan) if body is None else body
     since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
@@ -181,13 +180,13 @@ def find_slips(
         pitch=pitch,
         gyro_bias_radps=bias,
     )
-    return result, SlipState(time_s=float(time_s[-1]), automaton=automaton) if size else state
+    return result, SlipState(time_s=float(time_s[-1]), values=automaton.values()) if size else state
 
 
 class _Automaton:
     """State machine of the motion, updated sample by sample."""
 
-    def __init__(self, limits: SlipLimits) -> None:
+    def __init__(self, limits: SlipLimits, values: dict[str, Any]) -> None:
         self.limits = limits
         self.state = MotionState.INIT
         self.speed, self.distance, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
@@ -199,12 +198,12 @@ class _Automaton:
         self._rest = float("nan")
         #: Time, speed and inertial acceleration of past samples, from which a slip is recomputed after its detection.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
+        self.__dict__.update(values)
+        self._past = self._past.copy()
 
-    def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return a copy with the given limits, so that states already returned stay unchanged."""
-        other = copy.copy(self)
-        other.limits, other._past = limits, self._past.copy()
-        return other
+    def values(self) -> dict[str, Any]:
+        """Return the variables, from which the state machine continues with given limits."""
+        return {name: value for name, value in vars(self).items() if name != "limits"}
 
     def row(self) -> tuple[float, ...]:
         """Return the values of `SlipResult` at the last sample."""
