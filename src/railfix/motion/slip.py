@@ -17,10 +17,10 @@ the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from itertools import pairwise
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -109,7 +109,7 @@ class SlipState:
     """State of `find_slips` after a call."""
 
     time_s: float  #: Time of the last sample.
-    values: dict[str, Any]  #: Variables of the state machine.
+    automaton: _Automaton
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
@@ -161,7 +161,7 @@ def find_slips(
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
-    automaton = _Automaton(limits, {} if state is None else state.values)
+    automaton = _Automaton(limits) if state is None else state.automaton.copy(limits)
     steps = np.diff(time_s, prepend=time_s[:1] if state is None else state.time_s).tolist()
     turning = np.full((size, 3), np.nan) if body is None else body
     since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
@@ -180,30 +180,40 @@ def find_slips(
         pitch=pitch,
         gyro_bias_radps=bias,
     )
-    return result, SlipState(time_s=float(time_s[-1]), values=automaton.values()) if size else state
+    return result, SlipState(time_s=float(time_s[-1]), automaton=automaton) if size else state
 
 
+@dataclass
 class _Automaton:
     """State machine of the motion, updated sample by sample."""
 
-    def __init__(self, limits: SlipLimits, values: dict[str, Any]) -> None:
-        self.limits = limits
-        self.state = MotionState.INIT
-        self.speed, self.distance, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
-        self.pitch, self.bias = float("nan"), 0.0
-        self._smooth, self._limit, self._square = 0.0, _MAP_LIMIT, 0.0
-        self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = self._stood = (
-            self._learnt
-        ) = 0.0
-        self._rest = float("nan")
-        #: Time, speed and inertial acceleration of past samples, from which a slip is recomputed after its detection.
-        self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
-        self.__dict__.update(values)
-        self._past = self._past.copy()
+    limits: SlipLimits
+    state: MotionState = MotionState.INIT
+    speed: float = float("nan")
+    distance: float = 0.0
+    metric: float = float("nan")
+    offset: float = 0.0
+    pitch: float = float("nan")
+    bias: float = 0.0
+    _smooth: float = 0.0
+    _limit: float = _MAP_LIMIT
+    _square: float = 0.0
+    _over: float = 0.0
+    _fits: float = 0.0
+    _gap: float = 0.0
+    _silent: float = 0.0
+    _carried: float = 0.0
+    _apart: float = 0.0
+    _age: float = 0.0
+    _stood: float = 0.0
+    _learnt: float = 0.0
+    _rest: float = float("nan")
+    #: Time, speed and inertial acceleration of past samples, from which a slip is recomputed after its detection.
+    _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=200))
 
-    def values(self) -> dict[str, Any]:
-        """Return the variables, from which the state machine continues with given limits."""
-        return {name: value for name, value in vars(self).items() if name != "limits"}
+    def copy(self, limits: SlipLimits) -> _Automaton:
+        """Return a copy with the given limits, so that states already returned stay unchanged."""
+        return replace(self, limits=limits, _past=self._past.copy())
 
     def row(self) -> tuple[float, ...]:
         """Return the values of `SlipResult` at the last sample."""
