@@ -47,7 +47,7 @@ SCRIPTS: Final[dict[str, tuple[list[str], str]]] = {
     # the train is released where its interval covers its place, and no authority reaches it
     "release_outside": (
         ["python release_outside.py"],
-        "known to be .* stop None .* stop None .* c[.] .* 2795[.][.]3405 .* released by hand: None"
+        "recorded position .* stop None .* stop None .* c[.] .* 2795[.][.]3405 .* released by hand: None"
         ".* route of 2 -> train 1 comes from the opposite direction .* held",
     ),
     "restore_points": (["python restore_points.py"], "lost their detection .* commands to points: \\[\\]"),
