@@ -16,10 +16,10 @@ from railfix.gnss.observations import Observations, first_problems, stack_parts
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"
-#: Largest number of later epochs that may precede an epoch in the file. With more, the time tag of the epoch is taken
-#: as wrong.
+#: Largest number of epochs with later tags that may precede an epoch in the file, or with earlier tags that may follow
+#: it. Above this number, the time tag of the epoch is taken as wrong.
 MOST_PASSED: Final = 20
-_HELD: Final = 2 * MOST_PASSED  #: Number of epochs that wait for later epochs.
+_HELD: Final = 2 * MOST_PASSED  #: Number of epochs held back until later epochs are read.
 #: A time tag that is earlier or later than both neighbours by more than this is taken as wrong.
 _LONE: Final = np.timedelta64(3600, "s")
 _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
@@ -48,9 +48,9 @@ class EpochOrder:
         self._break = False
 
     def ordered(self, runs: Iterable[Run]) -> Iterator[Observations]:
-        """Yield the epochs in rising order of time; the last part has no epochs but the notes.
+        """Yield the epochs in rising order of time; the last part has no epochs, only notes and counts.
 
-        InputFileError: a time tag is wrong, and `broken_lines` is "stop".
+        Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """
         for run in runs:
             self._held.append(run)
@@ -78,7 +78,7 @@ class EpochOrder:
         return part
 
     def _sort(self, *, final: bool) -> Observations:
-        """Sort and check the waiting epochs; return those that no later epoch can precede, and keep the rest."""
+        """Sort and check the waiting epochs; return the epochs that no later epoch can precede, and keep the others."""
         joined = stack_parts([run.epochs for run in self._held])
         line = np.concatenate([run.line for run in self._held])
         path = np.repeat([run.path for run in self._held], [len(run.epochs) for run in self._held])
@@ -119,7 +119,7 @@ class EpochOrder:
         return self._times[-1][-1] if self._times else np.datetime64(np.iinfo(np.int64).min + 1, "ns")
 
     def _handed_on(self, time: Datetimes) -> Masks:
-        """Return which time tags occur among the epochs returned so far."""
+        """Return whether each time tag occurs among the epochs returned so far."""
         if not self._times:
             return np.zeros(len(time), dtype=np.bool_)
         self._times = [np.concatenate(self._times)]
@@ -178,7 +178,10 @@ def _where(path: str, line: int) -> str:
 
 
 def _passed(time: Datetimes) -> tuple[Integers, Integers]:
-    """Return the numbers of preceding epochs with later tags, and of following epochs with earlier tags, per epoch."""
+    """Return the numbers of preceding epochs with later tags and of following epochs with earlier tags, for each epoch.
+
+    Only the nearest 2 * `MOST_PASSED` epochs on each side are counted.
+    """
     reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
     passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
     for step in range(1, reach + 1):
@@ -189,14 +192,14 @@ def _passed(time: Datetimes) -> tuple[Integers, Integers]:
 
 
 def _is_repeated(time: Datetimes) -> Masks:
-    """Return which time tags occur earlier in the array."""
+    """Return whether each time tag occurs earlier in the array."""
     repeated = np.ones(len(time), dtype=np.bool_)
     repeated[np.unique(time, return_index=True)[1]] = False
     return repeated
 
 
 def _is_lone(time: Datetimes) -> Masks:
-    """Return which time tags are over `_LONE` later or earlier than both neighbours, while the neighbours rise."""
+    """Return whether each time tag is over `_LONE` later or earlier than both neighbours, while the neighbours rise."""
     lone = np.zeros(len(time), dtype=np.bool_)
     before, this, after = time[:-2], time[1:-1], time[2:]
     lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))
@@ -204,7 +207,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return epochs in a given order; repeated epochs are merged into the first epoch with the same tag."""
+    """Return epochs in a given order; repeated epochs fill the absent values of the first epoch with the same tag."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered

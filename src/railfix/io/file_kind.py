@@ -37,7 +37,7 @@ KIND_WORDS: Final[dict[FileKind, str]] = {
 _BINARY: Final[dict[FileKind, bytes]] = {
     "gpkg": b"SQLite format 3\0", "shp": b"\0\0\x27\n", "fgb": b"fgb\x03", "dxf": b"AutoCAD Binary DXF",
 }  # fmt: skip
-#: Patterns of the beginning of a text by kind, in the order in which the kinds are tried.
+#: Patterns that identify a kind in the first bytes of a text, in the order in which they are tried.
 _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
     "sp3": re.compile(rb"\A#[a-d][PV]\d"),
     "ifc": re.compile(rb"\A\s*ISO-10303-21;"),
@@ -70,9 +70,10 @@ _ENDINGS: Final[dict[str, FileKind]] = {
 
 
 def find_kind(path: FilePath) -> FileKind:
-    """Return the kind of a file from its first bytes, unpacked, or from the ending of its name if they are ambiguous.
+    """Return the kind of a file from its first bytes after unpacking, or from the ending of its name if these fit no
+    kind.
 
-    EGNSS MATE tables and TOML files are recognised by name.
+    TOML files are recognised by name, EGNSS MATE tables by name or header. The kind is "unknown" if nothing fits.
     """
     if mate_table(path):
         return "mate"
@@ -111,7 +112,7 @@ def wrong_kind(path: FilePath, expected: str) -> InputFileError:
 
 
 def has_times(path: FilePath) -> bool:
-    """Return whether a table or GPX file has times or qualities, which a track map lacks."""
+    """Return whether a table or GPX file has times, qualities or other columns that a track map lacks."""
     head = read_head(path)
     names = _header_line(head).lower()
     return b"time>" in head or any(word in names for word in _OF_POSITIONS)

@@ -1,4 +1,4 @@
-"""Readers of observations and navigation records of any kind, which is recognised by the content."""
+"""Readers of observations and navigation records; the kind of each file is recognised by its content."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def read_observations(
         RINEX observation files, logs in UBX, SBF or RTCM 3 (other protocols in between are skipped), or EGNSS MATE
         tables S_GNSS_SAT; plain or packed. Several files must be of one kind, and are read in order of time.
     broken_lines : {"stop", "count"}
-        With "stop" a broken RINEX line is an error; with "count" what it breaks is skipped and counted, which is always
-        done in a receiver log.
+        With "stop", a broken RINEX line raises InputFileError. With "count", the values or epochs that it affects are
+        skipped and counted. Broken messages in a receiver log are always skipped and counted.
     systems : iterable of str, optional
         Letters of the constellations to read, all by default.
     start, end : datetime64 or str, optional
@@ -61,8 +61,8 @@ def read_observations(
     date : datetime64 or str, optional
         Any time within half a week of the log; needed for RTCM 3 logs without ephemerides, which have no week number.
     reader : {"railfix", "georinex"}
-        "georinex" reads RINEX files with georinex, an independent reader, for comparison. It is slower, and does not
-        read events, scale factors, and indicators of bands other than 1 and 2, nor count broken lines.
+        "georinex" reads RINEX files with georinex, an independent reader, for comparison. It is slower, ignores events,
+        scale factors and the indicators of bands other than 1 and 2, and does not count broken lines.
 
     Raises
     ------
@@ -127,9 +127,9 @@ def scan_observations(
 ) -> Iterator[Observations]:
     """Return an iterator over the observations of one receiver in pieces of at most `epochs` epochs.
 
-    The first piece is shorter. `selection` are `broken_lines`, `systems`, `start`, `end` and `date`, which have the
-    meaning and errors of `read_observations`. `progress` is called with the fraction of the files that has been read.
-    georinex reads all files before the first piece.
+    The first piece is shorter. The arguments `broken_lines`, `systems`, `start`, `end` and `date` are as in
+    `read_observations`, with the same errors. `progress` is called with the fraction of the files that has been read.
+    With georinex, all files are read before the first piece is returned.
     """
     if reader not in get_args(Reader):
         raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
@@ -234,7 +234,8 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     ----------
     paths : path or sequence of path
     broken_lines : {"stop", "count"}
-        A broken record is an error, or is counted in `Navigation.skipped` and described in its notes.
+        With "stop", a broken record raises InputFileError. With "count", it is counted in `Navigation.skipped` and
+        described in `Navigation.notes`.
     date : datetime64 or str, optional
         Any time within half a week of RTCM 3 logs, whose records may have no full date.
 
@@ -262,7 +263,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 
 def _join(parts: list[Navigation]) -> Navigation:
-    """Join the records of several sources; ionosphere and leap seconds are from the first source that has them."""
+    """Join the records of several sources; the first Klobuchar coefficients and leap seconds are used."""
     return Navigation(
         kepler=join_rows([part.kepler for part in parts]),
         glonass=join_rows([part.glonass for part in parts]),

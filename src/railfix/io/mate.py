@@ -69,21 +69,22 @@ WRITTEN: Final[Mapping[str, tuple[str, ...]]] = {
         "SPEED_DOUBTUNDER", "CREATED_TIMESTAMP",
     ),
 }  # fmt: skip
-#: Text columns.
+#: Columns that are read as text.
 _TEXTS: Final = ("SAT_ID", "SIGNAL_TYPE", "ANTENNA", "TRACK_EDGE_ID", "UTM_CELL", "TRACK_SEGMENT_TYPE")
 
 
 def mate_table(path: FilePath) -> str:
-    """Return the EGNSS MATE table of a file from the file name: S_IMU for ``s_imu.parquet``, "" for other names."""
+    """Return the EGNSS MATE table that a file name denotes (S_IMU for ``s_imu.parquet``), or "" for other names."""
     name, _, kind = Path(path).name.partition(".")
     return name.upper() if name.upper() in READ and kind.lower() in ("parquet", "csv", "csv.gz") else ""
 
 
 def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> pl.DataFrame:
-    """Read a table, CSV (also .gz) or Parquet, with upper-case column names; columns not in the file are null.
+    """Read a table from CSV (also .gz) or Parquet; column names become upper case, and columns not in the file are
+    null.
 
-    Without `table_name` the file name determines the table. InputFileError: the file cannot be read, has an unknown
-    column or no rows, or lacks a `needed` column.
+    Without `table_name`, the file name determines the table. Raise InputFileError if the file cannot be read, has an
+    unknown column or no rows, or lacks a `needed` column.
     """
     name, file = table_name or mate_table(path), Path(path)
     with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
@@ -108,7 +109,7 @@ def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> 
 
 
 def only_device(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
-    """Return the table unchanged; InputFileError if it has rows of several devices."""
+    """Return the table unchanged, or raise InputFileError if it has rows of several devices."""
     devices = table["DEVICE_ID"].drop_nulls().unique().sort().to_list()
     if len(devices) > 1:
         raise InputFileError(path, f"has devices {', '.join(map(str, devices))}; keep the rows of one device")
@@ -146,7 +147,7 @@ def signal_code(satellite: str | None, signal: str) -> str:
 def read_mate_observations(path: str) -> Observations:
     """Read the observations in a table S_GNSS_SAT, of the antenna and device with the most rows.
 
-    InputFileError: the file is not such a table, or no row has a known satellite and signal.
+    Raise InputFileError if the file is not such a table, or no row has a known satellite and signal.
     """
     table = read_mate(path, _NEEDED).with_columns(
         pl.col("SAT_ID").cast(pl.String), pl.col("SIGNAL_TYPE").cast(pl.String)
@@ -185,7 +186,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Return the rows as epochs by channels; of several rows of one signal at one epoch the last is used."""
+    """Return the rows as epochs by channels; of several rows of one signal at one epoch, the last is used."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)

@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, read_text
 
-_BLOCK: Final = 4096  #: Number of rows read before they are compacted.
+_BLOCK: Final = 4096  #: Number of rows converted together to columns.
 _SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
 #: Usual column names of positions and maps in other files, as lower-case letters and digits, by railfix name. A height
 #: without a unit is in metres.
@@ -67,13 +67,14 @@ class NamedColumns:
         return InputFileError(self.path, message, line=self.header_line)
 
     def texts(self, name: str, *, absent: str) -> Strings:
-        """Return a column as texts; `absent` in every row if the table has no such column."""
+        """Return a column as texts, or `absent` in every row if the table has no such column."""
         return np.array(self.cells[name].to_list(), dtype=np.str_) if name in self else np.full(len(self), absent)
 
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
-        """Parse a column as finite numbers; InputFileError for other cells.
+        """Parse a column as numbers, shape (n,); raise InputFileError for a cell that is not a finite number.
 
-        Empty cells are an error without `blank`. With it, they get this value, and cells ``nan`` are accepted.
+        Without `blank`, an empty cell is an error. With `blank`, empty cells get this value, and cells ``nan`` are
+        accepted. If `blank` is infinite, infinite cells are accepted, too.
         """
         given = self.cells[name].str.len_bytes().to_numpy() > 0
         cells = self.cells[name].to_list()
@@ -107,7 +108,7 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
 def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
     """Return the table with columns of usual names ("Latitude", "lon", "alt") renamed to railfix's `names`.
 
-    InputFileError: such a column is in another unit ("height_ft").
+    Raise InputFileError if such a column is in another unit ("height_ft").
     """
     cells, usual = dict(table.cells), {}
     for name in names:
@@ -131,7 +132,8 @@ def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
 def read_named_columns(path: FilePath) -> NamedColumns:
     """Read a table with a header line of column names, separated by commas, semicolons, tabs or bars.
 
-    InputFileError: there is no header line, a column name is repeated, or a row has another number of cells.
+    Raise InputFileError if there is no header line, a column name is repeated, or a row does not have one cell for each
+    column.
     """
     return parse_named_columns(read_text(path).splitlines(), path)
 

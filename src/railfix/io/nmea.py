@@ -27,7 +27,7 @@ _OTHER_LINES, _UNCHECKED = (
 )
 #: A geoid separation of 0 is reported as doubtful where the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 2.0
-#: RTKLIB's quality (`position_log.PositionLog`) by GGA's quality (NMEA 0183 4.10, field 6); further qualities become 0.
+#: RTKLIB's quality (`position_log.PositionLog`) by GGA's quality (NMEA 0183 4.10, field 6); other qualities become 0.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 
 
@@ -60,10 +60,10 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
         Text file, also packed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the ``$``
         of a sentence is ignored; a sentence may lack its checksum.
     broken_lines : {"stop", "count"}
-        A sentence with a wrong checksum or invalid fields is an error, or is skipped and noted. A cut last line is
-        always skipped and noted.
+        With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", it is
+        skipped and noted, as a broken last line always is.
     date : datetime64, optional
-        UTC date of the first GGA, for logs without RMC and ZDA.
+        UTC date of the first GGA, for logs without RMC and ZDA. With it, the dates in the log are ignored.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Raises
     ------
     InputFileError
-        The file has no GGA sentence or no date, or a sentence is broken.
+        The file has no GGA sentence or no date, or a sentence is broken and `broken_lines` is "stop".
     """
     problems: list[InputFileError] = []
     fixes: list[_Gga] = []
@@ -208,7 +208,9 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix from the date sentence before it; if `chained`, from the first date onward."""
+    """Compute the GPS time of each fix from the date sentence before it, or, if `chained`, by counting days from the
+    first date.
+    """
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])
     if chained:

@@ -79,8 +79,8 @@ def skip_broken(
 ) -> tuple[Parsed, tuple[str, ...]]:
     """Parse the lines of a log; return the result, and a note on each skipped line.
 
-    With "count" broken lines below the header are skipped; with "stop" only an incomplete last line, as left by a power
-    cut. InputFileError: any other line is broken, or more than `_MOST_BROKEN` lines are broken.
+    With "count", broken lines below the header are skipped; with "stop", only an incomplete last line, as left by a
+    power cut. Raise InputFileError if any other line is broken, or more than `_MOST_BROKEN` lines are broken.
     """
     text = read_text(path)
     lines = text.splitlines()
@@ -102,7 +102,7 @@ def skip_broken(
 
 
 def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> PositionLog:
-    """Parse the positions in a table with named columns; `columns` are as in `read_positions`."""
+    """Parse the positions in a table with named columns; `columns` is as in `read_positions`."""
     table = rename_columns(parse_named_columns(lines, path), columns, known=(*CSV_COLUMNS, *OTHER_COLUMNS))
     return positions_of_table(table)
 
@@ -110,7 +110,7 @@ def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, 
 def positions_of_table(table: NamedColumns) -> PositionLog:
     """Return the positions in a table; columns of heights, sigmas, times and qualities may be absent.
 
-    InputFileError: the table has no position columns or no rows, or a value is not a number or out of range.
+    Raise InputFileError if the table has no position columns or no rows, or a value is not a number or out of range.
     """
     path = table.path
     cartesian = all(name in table for name in _CARTESIAN)
@@ -165,7 +165,9 @@ def qualities_in_words(log: PositionLog) -> str:
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return a mapping of railfix's to the file's column names from ``NAME=COLUMN`` texts; SettingsError if invalid."""
+    """Return the file's column names by railfix's names from ``NAME=COLUMN`` texts; raise SettingsError for other
+    texts.
+    """
     columns: dict[str, str] = {}
     for pair in pairs:
         ours, equals, theirs = pair.partition("=")
@@ -176,9 +178,9 @@ def column_names(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
-    """Return the table with some columns also under railfix's names; `columns` as in `read_positions`.
+    """Return the table with copies of some columns under railfix's names; `columns` is as in `read_positions`.
 
-    SettingsError: a name is not in `known`. InputFileError: the table has no such column.
+    Raise SettingsError if a name is not in `known`, and InputFileError if the table has no such column.
     """
     if unknown := sorted(set(columns) - set(known)):
         raise SettingsError(f"{table.path}: column {unknown[0]!r} is unknown; expected one of {', '.join(known)}")
@@ -260,7 +262,9 @@ _OF_RTKLIB: Final = {
 
 
 def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
-    """Parse RTKLIB's solution format (manual 2.4.2, B.1); InputFileError for baselines and heights above the geoid."""
+    """Parse RTKLIB's solution format (manual 2.4.2, B.1); raise InputFileError for baselines or heights above the
+    geoid.
+    """
     scale, names = _rtklib_header(path, [line for line in lines if line.startswith("%")])
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]
     if not rows:

@@ -1,4 +1,4 @@
-"""Reader of position logs of any kind, which is detected from the content."""
+"""Reader of position logs; the kind of a log is detected from its content."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PP
 
 
 def _read_gpx(path: FilePath) -> PositionLog:
-    """Read the points of tracks and routes in GPX 1.0 or 1.1 (UTC).
+    """Read the points of tracks and routes in GPX 1.0 or 1.1, whose times are in UTC.
 
     Heights without ``geoidheight`` are used as ellipsoidal heights, with a note.
     """
@@ -60,7 +60,10 @@ def _read_gpx(path: FilePath) -> PositionLog:
 
 
 def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
-    """Parse the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN)."""
+    """Parse the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN).
+
+    BESTPOSA and BESTGNSSPOSA logs whose status is not SOL_COMPUTED are left out.
+    """
     rows: list[tuple[float, ...]] = []
     lines: list[int] = []
     for number, line in enumerate(text, start=1):
@@ -97,7 +100,8 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
     )
 
 
-#: Rows are sorted by time if no row is out of order by more than this [s]; otherwise all stay in the file's order.
+#: Rows are sorted by time if all have times and none is out of order by more than this [s]; otherwise they stay in the
+#: file's order.
 _SORTED_S: Final = 60.0
 
 
@@ -118,22 +122,23 @@ def read_positions(
         An RTKLIB solution, a table with named columns (CSV), NMEA, GPX, NovAtel ASCII, or a receiver log with positions
         (UBX, SBF); plain or packed.
     broken_lines : {"stop", "count"}
-        A broken line is an error, or is skipped and noted; an incomplete last line is always skipped.
+        With "stop", a broken line raises InputFileError; with "count", it is skipped and noted. An incomplete last line
+        is always skipped.
     date : datetime64, optional
         UTC date of the first position in an NMEA log without dates (see `railfix.io.nmea.read_nmea`); time within half
         a week of a UBX log whose positions have no date.
     columns : mapping of str, optional
         Column names in the file by railfix's names, for tables with other names: ``{"latitude_deg": "Lat"}``.
     heights : {"needed", "optional"}
-        With "needed" a file without any height is an error.
+        With "needed", a file without any height raises InputFileError.
     antennas : {"one", "several"}
-        With "one" a table with positions of several antennas is an error.
+        With "one", a table with positions of several antennas raises InputFileError.
 
     Returns
     -------
     PositionLog
-        All rows and columns of the file. If times go back by at most one minute, the rows are sorted by time, with a
-        note; otherwise they stay in the file's order, with a note.
+        All rows and columns of the file. If times go back, there is a note, and the rows are sorted by time if they all
+        have times and go back by at most one minute.
 
     Raises
     ------

@@ -30,7 +30,7 @@ ATTRIBUTES: Final = (
     "protection_level_ground_m", "protection_status", "speed_mps", "track", "track_chainage_m", "track_probability",
 )  # fmt: skip
 COORDINATES: Final = ("longitude_deg", "latitude_deg", "height_m")
-#: Colour of each status, by the reliability of the position; "other" is for any further status.
+#: Colour of each status, by the reliability of the position; "other" is used for statuses that are not listed.
 STATUS_COLOURS: Final[Mapping[str, str]] = {
     "ok": "#00805e",
     "tracking": "#00805e",
@@ -55,7 +55,9 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return the path of the QGIS style to write for a file; None if the format has none or it is there."""
+    """Return the path of the QGIS style to write for a file; None if its format has no style or the style is already
+    there.
+    """
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
         return None
@@ -63,9 +65,10 @@ def style_file(path: Path) -> Path | None:
 
 
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates in the format of the ending, with the QGIS style; return their number.
+    """Write the rows with coordinates in the format of the file ending, and the QGIS style; return the number of rows
+    written.
 
-    NoPositionError: no row has coordinates.
+    Raise NoPositionError if no row has coordinates.
     """
     points = _points(rows)
     if points.is_empty():
@@ -148,7 +151,7 @@ def _geoparquet(points: pl.DataFrame, description: str) -> bytes:
 
 
 def _wkb(points: pl.DataFrame, flavor: str) -> Any:
-    """Return the points as well-known binary, "iso" or "extended", array of bytes, shape (n,)."""
+    """Return the points as well-known binary of the flavor "iso" or "extended", shape (n,)."""
     with needs_extra():
         import shapely
 

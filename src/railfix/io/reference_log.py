@@ -42,7 +42,7 @@ class AntennaReference(NotebookTable):
     time: Datetimes  #: GPS time, strictly rising, shape (R,).
     ecef_m: Floats  #: Position in ECEF, shape (R, 3).
     chainage_m: Floats  #: Chainage, NaN where the file has none; shape (R,).
-    speed_mps: Floats  #: Along the line, positive toward rising chainage; NaN where unknown; shape (R,).
+    speed_mps: Floats  #: Speed along the line, positive toward rising chainage; NaN where unknown; shape (R,).
     sigma_m: Floats  #: Standard deviation along the track; NaN where the file has none; shape (R,).
     source: Strings  #: Source of the position, one of `SOURCES`; shape (R,).
     environment: Strings  #: Environment such as "open", blank where the file has none, shape (R,).
@@ -81,7 +81,7 @@ def read_reference(
     antennas : sequence of str
         Antennas to read. A file without the column ``antenna`` has the positions of one antenna.
     quality : collection of int
-        Accepted qualities; not applied to a log without qualities.
+        Accepted qualities (`PositionLog.quality`); not applied to a log without qualities.
     columns : mapping of str, optional
         For CSV with other column names, as in `read_positions`.
     broken_lines, date
@@ -90,8 +90,8 @@ def read_reference(
     Returns
     -------
     dict of str to AntennaReference
-        Rows without position or time are dropped; of rows with the same time the first is used. ``source`` is taken
-        from the file; without that column it is "truth" for files of the simulator and "rtk" for others.
+        Rows without position or time are dropped; of rows with the same time, the first is used. ``source`` is taken
+        from the file; without this column, it is "truth" for files of the simulator and "rtk" for other files.
 
     Raises
     ------
@@ -123,7 +123,9 @@ def read_reference(
 
 
 def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of all rows, NaN or blank where the file lacks them; InputFileError: an unknown source."""
+    """Return the columns of all rows, NaN or blank where the file lacks them; raise InputFileError for an unknown
+    source.
+    """
     source = table.texts("source", absent="truth" if all(name in table for name in _OF_TRUTH) else "rtk")
     unknown = ~np.isin(source, SOURCES)
     if unknown.any():
@@ -190,7 +192,7 @@ class Pulses:
     #: Pulses, or metres for kind "distance"; falls where the train runs backward, if `signed`; shape (P,).
     count: Floats
     kind: str  #: Source of the count: "count" (readings of a counter), "pulse" (single pulses) or "distance".
-    signed: bool  #: Whether the table has the running direction: a column of it, or a count that falls somewhere.
+    signed: bool  #: Whether the table has the running direction, as a column or by a falling count.
 
     def at(self, time: Datetimes) -> Floats:
         """Interpolate the count linearly; NaN outside the table and in gaps in which the count changes.
@@ -219,7 +221,9 @@ class Acceleration:
     kind: str
 
     def mean_over(self, time: Datetimes) -> Floats:
-        """Compute means between consecutive times, shape (len(time) - 1,); NaN outside the table or in gaps."""
+        """Compute mean accelerations between consecutive times, shape (len(time) - 1,); NaN outside the table or over
+        gaps.
+        """
         known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
         step = np.diff(known)
         velocity = np.concatenate(
@@ -236,9 +240,9 @@ def read_pulses(path: FilePath) -> Pulses:
     """Read a tachometer table, CSV or Parquet, with ``time_gpst`` and the count.
 
     The count is in the column ``count`` (reading of a counter, which falls when the train runs backward and never
-    wraps), ``pulse`` (number of a pulse, as for `railfix run`) or ``distance_m`` (distance run). Without these columns
-    each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: the file is not such a
-    table, its times do not rise, or a direction is neither 1 nor -1.
+    wraps), ``pulse`` (number of a pulse, as for `railfix run`) or ``distance_m`` (distance run). Without these columns,
+    each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. Raise InputFileError if the file is not
+    such a table, its times do not rise, or a direction is neither 1 nor -1.
     """
     table = read_sensor_table(path, "pulses")
     names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
@@ -260,7 +264,7 @@ def read_acceleration(path: FilePath) -> Acceleration:
 
     ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
     include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the train's acceleration
-    without gravity. InputFileError: the table has none or several of these columns, or its times do not rise.
+    without gravity. Raise InputFileError if the table has none or several of these columns, or its times do not rise.
     """
     table = read_sensor_table(path, "acceleration")
     kinds = {

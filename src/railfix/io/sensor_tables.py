@@ -44,8 +44,8 @@ _WHOLE: Final = ("pulse", "direction")  #: Integer columns.
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     """Read a sensor table of a kind in `COLUMNS`; names are text, and times are GPS time and do not fall.
 
-    Rows with only a time are dropped. InputFileError: the file is not such a table, has no rows, or a value is missing
-    or wrong; the message names the row.
+    Rows with only a time are dropped. Raise InputFileError if the file is not such a table or has no rows, or if a
+    value is missing or wrong; the message names the row.
     """
     with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
         if mate_table(path):
@@ -117,7 +117,7 @@ def _check_times(path: FilePath, column: pl.Series, kind: str) -> None:
 
 
 def _numbers(path: FilePath, column: pl.Series, kind: str, silent: pl.Series | None) -> pl.Series:
-    """Return a column as numbers; InputFileError: a value is not a number, or is missing and must not be."""
+    """Return a column as numbers; raise InputFileError if a value is not a number, or is missing and required."""
     numbers = column.cast(pl.Int64 if column.name in _WHOLE else pl.Float64, strict=False)
     wrong = numbers.is_null() & column.is_not_null()
     if kind in _COMPLETE or column.name == "chainage_m":
@@ -144,7 +144,7 @@ _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
 def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     """Read an EGNSS MATE table as a table with `COLUMNS`.
 
-    InputFileError: the table is of another kind, has several devices, or its forces do not include gravity.
+    Raise InputFileError if the table is of another kind, has several devices, or its forces do not include gravity.
     """
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
@@ -169,7 +169,9 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
 
 
 def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of the first balise of each group (N_PIG = 0), whose position is used as the group's."""
+    """Return the rows of the first balise of each group (N_PIG = 0), whose position is used as the position of the
+    group.
+    """
     return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
 
 

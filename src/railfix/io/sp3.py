@@ -15,7 +15,7 @@ from railfix.gnss.orbits.ephemerides import POINTS
 from railfix.gnss.plausible_records import plausible_radius
 from railfix.io.file_kind import wrong_kind
 
-#: Time systems that are GPS time up to nanoseconds; SP3-a files have no time system and are in GPS time.
+#: Time systems that agree with GPS time to nanoseconds; SP3-a files have no time system and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
 #: Functions that convert other time systems to GPS time, by the names of the systems in files.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
@@ -100,7 +100,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
 def _satellite(text: str) -> str:
     """Return the satellite as ``G01``; SP3-a omits the letter of GPS and may have blanks for zeros.
 
-    ValueError: the text has no number.
+    Raise ValueError if the text has no number.
     """
     letter = text[0] if text[:1].isalpha() else "G"
     digits = text[1:].strip()
@@ -110,7 +110,7 @@ def _satellite(text: str) -> str:
 
 
 def _numbers(line: str) -> list[float]:
-    """Parse position [km] and clock [us], the clock NaN where blank; ValueError: a value is not a finite number."""
+    """Parse position [km] and clock [us], the clock NaN where blank; raise ValueError if a value is infinite."""
     x, y, z = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(3))
     text = line[46:60].strip()
     clock = float(text) if text else np.nan
@@ -120,7 +120,7 @@ def _numbers(line: str) -> list[float]:
 
 
 def _time_system(path: FilePath, lines: list[str]) -> str:
-    """Return the time system of the first %c line, "GPS" without such a line; InputFileError: it is unsupported."""
+    """Return the time system of the first %c line, "GPS" without such a line; raise InputFileError if unsupported."""
     for number, line in enumerate(lines, start=1):
         if line.startswith("%c"):
             system = line[9:12].strip().upper()
@@ -132,7 +132,7 @@ def _time_system(path: FilePath, lines: list[str]) -> str:
 
 
 def _instant(line: str, system: str) -> int:
-    """Parse an epoch line as nanoseconds of GPS time since 1970; ValueError: it is not a valid time."""
+    """Parse an epoch line as nanoseconds of GPS time since 1970; raise ValueError if the time is invalid."""
     year, month, day, hour, minute = (int(line[a:b]) for a, b in ((3, 7), (8, 10), (11, 13), (14, 16), (17, 19)))
     seconds = float(line[20:31])
     if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):

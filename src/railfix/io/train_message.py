@@ -31,7 +31,7 @@ class MessageStatus(IntEnum):
     POSITION = 0  #: Position with every check passed.
     COASTING = 1  #: Position from sensors alone.
     DOUBTFUL = 2  #: Position with a failed check, or several possible tracks or positions.
-    NO_POSITION = 3  #: Observations, but no position.
+    NO_POSITION = 3  #: Observations received, but no position computed.
     NO_INPUT = 4  #: No input received in this period.
     #: Satellite positioning is suspended by order of the ground side; railfix itself sends no such message.
     SUSPENDED = 5
@@ -77,7 +77,7 @@ class TrainMessage(Message):
     time_ns: Unsigned  #: Time of validity of the position, GPS time since 1980-01-06.
     sent_ns: Unsigned  #: Time of sending by the sender's clock, GPS time since 1980-01-06.
     line: Unsigned  #: Identity of the line or track.
-    chainage_cm: Signed | None = None  #: Front end of the train along the line; None without a position.
+    chainage_cm: Signed | None = None  #: Chainage of the train's front end; None without a position.
     #: The front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
@@ -95,9 +95,9 @@ class TrainMessage(Message):
     length_cm: Unsigned = 0  #: Train length.
     complete: bool = False  #: Train integrity confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
-    #: Number of the newest authority accepted by the train: its acknowledgement to the ground side.
+    #: Number of the newest movement authority that the train has accepted, which acknowledges it to the ground side.
     authority: Unsigned | None = None
-    authority_end_cm: Signed | None = None  #: End of the train's authority, rounded away from the train.
+    authority_end_cm: Signed | None = None  #: End of the train's movement authority, rounded away from the train.
     interference: SuspectedInterference | None = None  #: None from trains without this check.
     #: Safe front end and safe rear end: no part of the train is ahead of the safe front end or behind the safe rear
     #: end, in the direction of `facing`. None without bounds, or where the end or the direction is unknown.
@@ -149,7 +149,7 @@ def encode(message: TrainMessage) -> bytes:
 
 
 def decode(data: bytes) -> TrainMessage:
-    """Decode CBOR, skipping unknown keys; MessageError: the bytes are not a valid message of this version."""
+    """Decode CBOR, skipping unknown keys; raise MessageError if the bytes are not a valid message of this version."""
     cbor2 = cbor()
     if len(data) > LONGEST:
         raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")
@@ -179,7 +179,7 @@ def _entries(data: bytes) -> int:
 
 
 def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
-    """Return a message of a kind from its values; MessageError: a value is missing, out of range or inconsistent."""
+    """Return a validated message; raise MessageError if a value is missing, out of range or inconsistent."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -200,7 +200,7 @@ def to_json(message: TrainMessage) -> str:
 
 
 def from_json(line: str) -> TrainMessage:
-    """Parse a message from its line of JSON; MessageError: the text is not a valid message of this version."""
+    """Parse a message from its line of JSON; raise MessageError if the text is not a valid message of this version."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):
@@ -230,8 +230,8 @@ _LARGEST_LENGTH: Final = 32_766  #: Largest value of a length in packet 0; the n
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
     """Return the fields of packet 0 (SUBSET-026 v4, 7.4.2.1), with the position relative to a balise group.
 
-    `reference_cm` is the chainage of the group, and `reference` its identity (NID_LRBG). ValueError: the message has no
-    position of the front end, or the front end is too far from the group.
+    `reference_cm` is the chainage of the group, and `reference` its identity (NID_LRBG). Raise ValueError if the
+    message has no position of the front end, or the front end is too far from the group.
     """
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")

@@ -49,7 +49,7 @@ def _texts(element: Element) -> dict[str, str]:
 
 
 def read_gpx_lines(path: FilePath) -> list[XmlLine]:
-    """Return the track segments and routes of a GPX file; InputFileError: a point has no position."""
+    """Return the track segments and routes of a GPX file; raise InputFileError if a point has no valid position."""
     lines = []
     for owner in read_root(path):
         if tag(owner) not in ("trk", "rte"):
@@ -72,7 +72,7 @@ def read_gpx_lines(path: FilePath) -> list[XmlLine]:
 def read_kml_lines(path: FilePath) -> list[XmlLine]:
     """Return the lines and tracks of a KML file; heights that are clamped to the ground are ignored.
 
-    InputFileError: a coordinate is not a number, or heights are relative to the ground or the sea floor.
+    Raise InputFileError if a coordinate is not a number, or heights are relative to the ground or the sea floor.
     """
     lines = []
     for mark in (element for element in read_root(path).iter() if tag(element) == "Placemark"):
@@ -106,7 +106,7 @@ def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
 
 
 def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[float]:
-    """Return a point's longitude, latitude and further cells as numbers; InputFileError: not numbers, out of range."""
+    """Return a point's cells (longitude, latitude, ...) as numbers; raise InputFileError if they are invalid."""
     if comma := next((cell for cell in cells if "," in str(cell)), None):
         raise InputFileError(path, f"{where}: {comma} has a comma in a number; a point was expected")
     try:

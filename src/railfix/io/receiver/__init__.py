@@ -1,1 +1,1 @@
-"""Receiver logs and streams: UBX, RTCM 3, SBF and NMEA bytes to observations, navigation records and positions."""
+"""Decoders of receiver logs and streams (UBX, RTCM 3, SBF, NMEA): observations, navigation records and positions."""

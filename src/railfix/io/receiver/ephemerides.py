@@ -1,9 +1,9 @@
 """Assemble ephemerides from navigation subframes in the order of a stream.
 
-A record needs several subframes of one issue: three of GPS and QZSS, five words (I/NAV) or four pages (F/NAV) of
-Galileo, three (D1, B-CNAV1, B-CNAV2) or ten pages (D2) of BeiDou, and four strings of GLONASS. `assemble_records`
-combines the subframes of a piece with subframes of earlier pieces, so that records do not depend on the division of
-a stream.
+A record needs several subframes of one issue: three for GPS and QZSS, five words (I/NAV) or four pages (F/NAV) for
+Galileo, three (D1, B-CNAV1, B-CNAV2) or ten pages (D2) for BeiDou, and four strings for GLONASS. `assemble_records`
+combines the subframes of a piece with subframes of earlier pieces, so that records do not depend on the division of a
+stream.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which its strings 1 to 4 are sent.
-_EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch whose time it is assigned.
-#: Duration of a GLONASS frame.
+_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which its strings 1 to 4 are sent [s].
+_EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch whose time it is assigned [s].
+#: Duration of a GLONASS frame [s].
 _FRAME_S: Final = 30.0
 
 
@@ -58,7 +58,8 @@ class Unfinished:
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     #: Issue of the last record by satellite and message, which identifies repetitions.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    #: Next epoch (NaT: not yet received) by GLONASS satellite whose complete strings have no certain frame.
+    #: First epoch after the last string, NaT if not yet received, by GLONASS satellite. Its four strings are complete,
+    #: but may be of different frames.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
@@ -84,8 +85,8 @@ def assemble_records(
 ) -> tuple[Assembled, Unfinished]:
     """Return the ephemerides completed by a piece, and the new state.
 
-    `time` and `after` are the epochs before and after each subframe, and `first` is the first epoch of the piece; NaT
-    where unknown.
+    `time` and `after` are the epochs before and after each subframe, shape (N,), and `first` is the first epoch of the
+    piece. Unknown epochs are NaT.
     """
     builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
@@ -151,7 +152,7 @@ class _EphemerisBuilder:
         self.leap_seconds: int | None = None
 
     def needs_date(self, satellite: str, time: np.datetime64) -> bool:
-        """Return whether the date of a record is unknown, and note the satellite as undated.
+        """Return whether a record cannot be dated; if so, add its satellite to `undated`.
 
         GPS and QZSS send ten bits of the week, and GLONASS sends only the time of day.
         """
@@ -201,7 +202,9 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append records of complete GLONASS strings whose next epoch is known and not after `until` (None: any)."""
+        """Append records of complete GLONASS strings whose next epoch is known and, unless `until` is None, not after
+        it.
+        """
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
                 del self.waiting[satellite]
@@ -329,7 +332,7 @@ class _EphemerisBuilder:
 
 
 def merge_records(parts: list[Assembled]) -> Assembled:
-    """Join the records of several pieces of one stream; the last ionosphere and leap seconds are used."""
+    """Join the records of several pieces of one stream; the last Klobuchar coefficients and leap seconds are used."""
     klobuchar: dict[str, np.ndarray] = {}
     leap: int | None = None
     for part in parts:

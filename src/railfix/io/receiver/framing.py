@@ -22,7 +22,8 @@ from railfix.core.files import FilePath, open_stream
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-#: Whether a byte is valid as the first and as the second character of an NMEA address; 0 marks the buffer's end.
+#: Whether a byte is valid as the first and as the second character of an NMEA address; 0 (the end of the buffer) is
+#: valid.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
 #: Value of each byte as a hexadecimal digit, 255 for others.
@@ -37,15 +38,15 @@ class Frames:
     data: Bytes  #: Buffer that contains the frames.
     protocol: Strings  #: "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
     kind: Integers  #: UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0; shape (N,).
-    #: Start and end of the payload in `data`, shape (N,). UBX and RTCM 3: without header and checksum, with the RTCM
-    #: message number. SBF: from the time stamp, after the header of 8 bytes. NMEA: from ``$`` to before ``*``, while
-    #: the frame includes the end of the line.
+    #: Start and end of the payload in `data`, shape (N,). The payload of UBX and RTCM 3 excludes header and checksum,
+    #: but includes the RTCM message number. The payload of SBF begins at the time stamp, after the header of 8 bytes.
+    #: The payload of NMEA is the text from ``$`` to before ``*``.
     start: Indices
     end: Indices
     frame_start: Indices  #: Offset of the first byte of the frame, sync included; shape (N,).
     consumed: int  #: Number of processed bytes of the buffer; the rest may be the start of a frame.
     skipped_bytes: int  #: Number of processed bytes outside frames.
-    bad_checksums: int  #: Number of complete frame candidates outside frames whose checksum is wrong.
+    bad_checksums: int  #: Number of complete frame candidates with a wrong checksum that begin outside all frames.
 
     def __len__(self) -> int:
         return len(self.start)
@@ -248,7 +249,10 @@ _LONGEST: Final = 62
 
 
 def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
-    """Return unsigned integers from a bit field of N messages, bits of shape (N, bits); ValueError: over 62 bits."""
+    """Return the unsigned integers, shape (N,), in a bit field of N messages, `bits` of shape (N, bits).
+
+    Raise ValueError if the field has over 62 bits.
+    """
     if length > _LONGEST:
         raise ValueError(f"a field has at most {_LONGEST} bits, {length} were requested")
     value = np.zeros(len(bits), dtype=np.int64)
@@ -258,13 +262,13 @@ def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
 
 
 def read_signed(bits: Bytes, first: int, length: int) -> Integers:
-    """Return integers in two's complement from a bit field, shape (N,)."""
+    """Return the integers in two's complement in a bit field, shape (N,)."""
     value = read_unsigned(bits, first, length)
     return np.where(value >> (length - 1) & 1, value - (1 << length), value)
 
 
 def sign_magnitude(bits: Bytes, first: int, length: int) -> Integers:
-    """Return integers as sign and magnitude (GLONASS), shape (N,)."""
+    """Return the integers coded as sign and magnitude (GLONASS) in a bit field, shape (N,)."""
     value = read_unsigned(bits, first + 1, length - 1)
     return np.where(bits[:, first] == 1, -value, value)
 

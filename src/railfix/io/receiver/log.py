@@ -40,20 +40,18 @@ RF_STATUS: Final = 4092
 RECEIVER_STATUS: Final = 4014
 
 JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
-#: u-blox state from which an alarm is set: jamming critical, spoofing affirmed. State 2 (warning, indicated) was sent
+#: Lowest u-blox state that sets an alarm (jamming critical, spoofing affirmed). State 2 (warning, indicated) was sent
 #: for 571 of 581 s of a recording without interference.
 _CERTAIN: Final = 3
-#: Septentrio mode of a band with interference that is not cancelled.
-_NOT_MITIGATED: Final = 8
+_NOT_MITIGATED: Final = 8  #: Septentrio mode of a band with interference that is not cancelled.
 _MON_HW_BYTES: Final = 60
 _BLOCK: Final = 24  #: Bytes of each MON-RF block of u-blox, after a header of four bytes.
-#: Septentrio: offsets of the first band block and the first front-end block in the payload.
-_BANDS, _FRONT_ENDS = 12, 24
+_BANDS, _FRONT_ENDS = 12, 24  #: Offsets of Septentrio's first band block and first front-end block in the payload.
 _NO_GAIN: Final = -128
-#: u-blox SEC-SIGLOG: bytes of each event, and duration of the effect of a single trigger [s].
+#: Bytes of each event in u-blox SEC-SIGLOG, and time for which an event of a single trigger sets the alarm [s].
 _EVENT: Final = 8
 _TRIGGERED_S: Final = 10
-_SIMULATED: Final = 0  #: Detection type that is used: simulated signals. Jamming detections begin with a warning.
+_SIMULATED: Final = 0  #: SEC-SIGLOG detection type of simulated signals, the only type that sets an alarm.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +128,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
     """Return the spoofing bit, set if simulated signals have begun and not ended, or were triggered within 10 s.
 
     Events of abnormal signals, inconsistent inertial data and abrupt changes are ignored, because tunnels cause them.
+    Jamming events are ignored, because they begin with a warning. None for a broken message.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
@@ -140,7 +139,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit (interference not cancelled) and the spoofing bit (misleading or unauthentic signals)."""
+    """Return the jamming bit (interference not cancelled) and spoofing bit (misleading or unauthentic); None if broken."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -162,7 +161,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read a receiver's positions; `date`, within half a week, is for UBX logs without a dated NAV-PVT message."""
+    """Read a receiver's positions; UBX logs without a dated NAV-PVT message need a `date` within half a week."""
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
     undated, rest = 0, b""
@@ -215,7 +214,7 @@ class StreamState:
     rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch, at first a date.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch; at first, a date.
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
     observed: bool = False  #: Whether UBX or SBF measurements with a time have been decoded.
     kind: str = ""  #: Kind of observation messages used, blank before the first epoch.
@@ -296,7 +295,7 @@ def _places(frames: Frames, kind: str) -> Integers:
 
 
 def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Integers) -> str:
-    """Return the kind of the first epoch with a date, "" if there is none; further kinds repeat the same ranges."""
+    """Return the kind of the first epoch with a date, "" if there is none; other kinds repeat the same ranges."""
     begins = {kind: _places(frames, kind)[-len(part.time)] for kind, part in own.items() if len(part.time)}
     if len(msm_places):
         begins[_MSM] = msm_places[0]
@@ -362,8 +361,10 @@ def _navigation(
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[LogPiece]:
-    """Yield the pieces of a receiver log; `progress` is called with the fraction read. `date`, within half a week of
-    the log, resolves the week of RTCM 3 logs without ephemerides. MismatchError: the ephemerides contradict the date.
+    """Yield the pieces of a receiver log.
+
+    `progress` is called with the fraction read. `date`, within half a week of the log, resolves the week of RTCM 3 logs
+    without ephemerides. Raise MismatchError if the ephemerides contradict the date.
     """
     state = StreamState(time=_week_of_log(path, date))
     with open_stream(path, content="bytes") as stream:
@@ -377,12 +378,11 @@ def scan_pieces(
                 return
 
 
-#: A date and ephemerides that differ by more than this contradict each other.
-_SAME_WEEK: Final = np.timedelta64(5, "D")
+_SAME_WEEK: Final = np.timedelta64(5, "D")  #: Largest accepted difference between date and ephemerides.
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
-    """Return a time near an RTCM 3 log: `date`, else the time of the first ephemerides, else NaT."""
+    """Return the time of an RTCM 3 log's first ephemerides, else `date`, else NaT; raise MismatchError on conflict."""
     own: np.datetime64 = np.datetime64("NaT", "ns")
     rest = b""
     with open_stream(path, content="bytes") as stream:
@@ -400,7 +400,7 @@ def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
 
 
 def at_station(observations: Observations, station: tuple[float, float, float] | None) -> Observations:
-    """Return the observations with the position of the base station in the header; unchanged if it is None."""
+    """Return the observations with the position of the base station in the header, unchanged if `station` is None."""
     if station is None:
         return observations
     return replace(observations, header=replace(observations.header, approximate_ecef_m=np.array(station)))
@@ -409,7 +409,7 @@ def at_station(observations: Observations, station: tuple[float, float, float] |
 def scan_receiver_log(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[Observations]:
-    """Yield the observations of a receiver log by blocks; InputFileError where none can be dated."""
+    """Yield the observations of a receiver log by blocks; raise InputFileError if no observation can be dated."""
     tracking = Tracking()
     epochs = frames_seen = undated = 0
     old: Counter[str] = Counter()
@@ -437,7 +437,7 @@ def scan_receiver_log(
 
 
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
-    """Read the navigation records of receiver logs; InputFileError: no record is complete and has a date."""
+    """Read the navigation records of receiver logs; raise InputFileError if no record is complete and has a date."""
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
     whole = merge_records(parts)

@@ -29,7 +29,7 @@ class Measurements:
 
     time: Datetimes  #: Time tags in the order of the stream, shape (T,).
     epoch: Indices  #: Epoch of each measurement, shape (N,).
-    #: Satellite and signal, blank where RINEX has no name (counted, not used); shape (N,).
+    #: Satellite and signal, blank where RINEX has no name; such measurements are counted but not used. Shape (N,).
     satellite: Strings
     signal: Strings
     #: NaN where absent or declared invalid by the receiver, shape (N,).
@@ -39,8 +39,8 @@ class Measurements:
     cn0_dbhz: Floats
     lock_s: Floats  #: Minimum time of continuous phase tracking, shape (N,).
     half_cycle: Masks  #: Whether a half-cycle ambiguity of the phase is unresolved, shape (N,).
-    polarity: Integers  #: A change indicates a jump of half a cycle, shape (N,).
-    glonass_channel: Integers  #: Frequency channel of a GLONASS satellite, shape (N,).
+    polarity: Integers  #: Number whose change indicates a half-cycle jump of the phase, shape (N,).
+    glonass_channel: Integers  #: Frequency channel of GLONASS, unknown if not in -7 to 6; shape (N,).
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """State after epochs: time of the last epoch, and lock time [s] and polarity of the last phase by channel."""
+    """State after a piece: time of the last epoch, and lock time [s] and polarity of the last phase by channel."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -190,7 +190,7 @@ Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
-#: Bit of the Galileo data source: the clock refers to E5a and E1.
+#: Bit of the Galileo data source, set if the clock refers to E5a and E1.
 _E5A_CLOCK: Final = 1 << 8
 _MOSCOW_S: Final = 3 * 3600.0
 
@@ -211,7 +211,7 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
 
 
 def cnav_record(satellite: str, values: Values) -> Record:
-    """Return the record of GPS or QZSS from the fields of CNAV messages 10, 11 and 30, which have a unique week."""
+    """Return the record of GPS or QZSS from the fields of CNAV messages 10, 11 and 30, whose week is unambiguous."""
     sent = from_week(int(values["week"]), values["tow_s"])
     toc = nearest_week(values["toc_s"], sent)
     delays = ("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4)))
@@ -227,9 +227,9 @@ def cnav_record(satellite: str, values: Values) -> Record:
 
 
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
-    """Return the record of BeiDou from the fields of B-CNAV1 or B-CNAV2, which have a unique week.
+    """Return the record of BeiDou from the fields of B-CNAV1 or B-CNAV2, whose week is unambiguous.
 
-    None: the fields are of another satellite or an unknown kind of orbit.
+    Return None if the fields are of another satellite or an unknown kind of orbit.
     """
     if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
         return None
@@ -296,7 +296,7 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
-    """Return the start time of the GLONASS frame of a string 1, GPS time."""
+    """Return the start of the GLONASS frame that contains a string 1, GPS time; `time` resolves the day."""
     utc = gpst_to_utc(time)
     return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 
@@ -308,8 +308,8 @@ def _frame_s(values: Values) -> float:
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
     """Return the GPS week of toe, and toc as GPS time.
 
-    The broadcast week is the week of transmission: at its end, toe is in the next week. RTCM 3 has no time of
-    transmission; it is replaced by the time of week of `time`, when the message was received.
+    The broadcast week is the week of transmission; near its end, toe may be in the next week. RTCM 3 has no time of
+    transmission, so the time of reception `time` is used instead.
     """
     sent_s = values.get("tow_s", values["toe_sow_s"] if np.isnat(time) else float(to_week(time)[1]))
     sent = from_week(week, sent_s)

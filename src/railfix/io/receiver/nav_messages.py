@@ -178,8 +178,8 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
 BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 known to begin with the health.
-#: A B-CNAV1 frame is passed on as three pages. Subframe, first bit and end of the bits of each page, which follow PRN,
-#: page number and SOW.
+#: Subframe, first bit and end of the data bits in each of the three pages into which a B-CNAV1 frame is divided. In a
+#: page, they follow PRN, page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
 BCNAV1: Final = _with_head(BCNAV1_HEAD, {
@@ -279,7 +279,7 @@ URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
     """Return I/NAV words as bits (N, 128) from page pairs (N, 8), even page first, and whether they are valid.
 
-    Pairs are valid with a correct CRC, and without the alert flag.
+    A pair is valid if its CRC is correct and neither page is an alert page.
     """
     bits = unpack_words(words[:, :8], drop=0, keep=32)
     even, odd = bits[:, :120], bits[:, 128:248]
@@ -289,7 +289,7 @@ def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple
 
 
 def has_crc(bits: Bytes, checked: int) -> Masks:
-    """Return whether the 24 bits after the first `checked` bits are the CRC-24Q of these, shape (N,)."""
+    """Return whether the first `checked` bits are followed by their CRC-24Q of 24 bits, shape (N,)."""
     before = np.zeros((len(bits), -checked % 8), dtype=np.uint8)
     data = np.packbits(np.concatenate([before, bits[:, :checked]], axis=1), axis=1)
     start = np.arange(len(data)) * data.shape[1]
@@ -314,9 +314,9 @@ def glonass_hamming(bits: Bytes) -> Masks:
     return np.asarray(~wrong & (total == 0))
 
 
-#: Galileo data source: I/NAV with clock and group delay E5b/E1, received on E1-B or on E5b-I.
+#: Galileo data source of I/NAV (clock and group delay of E5b/E1), received on E1-B and on E5b-I.
 E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
-#: Galileo data source: F/NAV with clock and group delay E5a/E1.
+#: Galileo data source of F/NAV (clock and group delay of E5a/E1).
 E5A_SOURCE: Final = 1 << 1 | 1 << 8
 _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)

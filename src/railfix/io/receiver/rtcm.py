@@ -96,7 +96,7 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
     """Decode all MSM4 to MSM7 messages; return the measurements and the offset of each epoch in the stream.
 
-    `near` is within half a week of the first message; if it is NaT, messages are only counted.
+    `near` is within half a week of the first message; if `near` is NaT, messages are only counted.
     """
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
@@ -139,7 +139,9 @@ def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int
 
 
 def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
-    """Correct BeiDou times that an encoder sent in GPS time (14 s late); return the number of corrected times."""
+    """Correct BeiDou times that an encoder sent in GPS time (14 s late); return all times and the number of
+    corrections.
+    """
     beidou, others = np.flatnonzero(letter == "C"), np.flatnonzero(np.isin(letter, list("GEJ")))
     if not len(beidou) or not len(others):
         return time, 0
@@ -182,7 +184,7 @@ def take_bits(frames: Frames, chosen: Indices, length: int) -> Bytes:
 
 
 def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
-    """Return the antenna reference point of the last message 1005 or 1006, ECEF [m]; None without one."""
+    """Return the antenna reference point of the last message 1005 or 1006, ECEF [m]; None without such a message."""
     chosen = frames.of("rtcm3", 1005, 1006)
     if not len(chosen):
         return None
@@ -192,7 +194,7 @@ def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
 
 
 def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
-    """Return which MSM are the last message of their epoch (DF393 is 0), shape (len(chosen),)."""
+    """Return whether each MSM is the last message of its epoch (DF393 is 0), shape (len(chosen),)."""
     return np.asarray(take_bits(frames, chosen, 56)[:, 54] == 0)
 
 
@@ -326,7 +328,7 @@ def _sequence(codings: Mapping[str, Coding], names: str) -> dict[str, Field]:
 
 _ORBIT: Final = "crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot"
 _GALILEO: Final = f"number week iod accuracy i_dot toc_s af2 af1 af0_s {_ORBIT} group_delay_1_s"
-#: Ephemeris messages: fields in the order in which they are sent.
+#: Layouts of ephemeris messages by number, with the fields in the order of transmission.
 EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
     1019: _sequence(
         nav_messages.LNAV_CODINGS,
@@ -376,9 +378,9 @@ _FIRST_MSM_WEEK: Final = 1642
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
     """Return the median time of the ephemerides in a log, which resolves the week of observations; NaT without any.
 
-    The weeks of Galileo and BeiDou are unique. The GPS week, modulo 1024, is resolved to the week nearest to `near`;
-    without `near`, to a week from July 2011, when MSM were introduced, to February 2031. The computer's clock is not
-    used.
+    Galileo is used if available, then BeiDou, whose weeks are unambiguous, then GPS and QZSS. The GPS week, modulo
+    1024, is resolved to the week nearest to `near`; without `near`, to a week from July 2011, when MSM were introduced,
+    to February 2031. The computer's clock is not used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

@@ -50,7 +50,8 @@ BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
-#: Blocks with navigation pages: constellation, and UBX signal number by SBF signal number (None: 0 for all signals).
+#: Constellation, and UBX signal number by SBF signal number, of each block with navigation pages. None means 0 for all
+#: signals.
 _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GPS_RAW_CA: ("G", None),
     QZS_RAW_L1CA: ("J", None),
@@ -114,7 +115,7 @@ _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF
 _TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])  #: Time of a block.
-_SCRAMBLED: Final = 0x80  #: Flag of MeasEpoch: measurements are encrypted.
+_SCRAMBLED: Final = 0x80  #: Flag of a MeasEpoch with encrypted measurements.
 _WITHOUT_OFFSET: Final = (1, 2)  #: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
 
 
@@ -134,7 +135,10 @@ _SIGNAL_NAMES: Final = np.array([SIGNALS.get(number, "") for number in range(64)
 
 
 def meas_epoch_measurements(frames: Frames) -> Measurements:
-    """Return the measurements of all MeasEpoch blocks; malformed blocks are skipped and counted."""
+    """Return the measurements of the main antenna in all MeasEpoch blocks.
+
+    Blocks that are malformed, scrambled or without time, and measurements of other antennas, are skipped and counted.
+    """
     chosen, head = frames.structures("sbf", [MEAS_EPOCH], _HEAD)
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
     scrambled = dated & (head["flags"] & _SCRAMBLED != 0)

@@ -172,7 +172,7 @@ def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> 
 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
-    """Return the receiver's positions as columns of `PositionLog`; `near` is within half a week of them.
+    """Return the receiver's positions as columns of `PositionLog`; `near` is within half a week of the positions.
 
     If `near` is NaT, there are no rows.
     """
@@ -191,7 +191,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal"] * 1e-4, rows["vertical"] * 1e-4
         by_tow = dict(zip(pvt["tow_ms"].tolist(), np.where(fixed, quality, -1).tolist(), strict=True))
         quality = np.array([by_tow.get(tow, 5) for tow in rows["tow_ms"].tolist()], dtype=np.int64)
-        kept &= quality > 0  # before its first fix a receiver sends positions that NAV-PVT marks as invalid
+        kept &= quality > 0  # before its first fix, a receiver sends positions that NAV-PVT marks as invalid
     else:
         rows, kept = pvt, fixed
         latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7
@@ -213,7 +213,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
 
 
 def find_date(frames: Frames) -> np.datetime64:
-    """Return the day of the last NAV-PVT with a valid date (UTC, near enough to resolve weeks); NaT without one."""
+    """Return the day of the last NAV-PVT with a valid date (UTC, near enough to resolve weeks), NaT if none."""
     days, _, _ = _date(frames)
     return days[-1] if len(days) else np.datetime64("NaT", "ns")
 

@@ -22,7 +22,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_co
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
 ALL: Final = ""  #: Key of the types of a RINEX 2 file, which apply to all constellations.
-#: Longest accepted header.
+#: Longest accepted header [bytes].
 _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
 #: Alternative names of time systems written by some programs.
@@ -60,7 +60,7 @@ class RinexHeader:
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
     """Return the header lines of an observation file, and the bytes read after them.
 
-    InputFileError: the file is not a RINEX observation file, or the header does not end.
+    Raise InputFileError if the file is not a RINEX observation file, or the header does not end.
     """
     data = b""
     found = -1
@@ -82,7 +82,7 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
 
 
 def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:
-    """Parse the header of an observation file, which begins at `first_line`; InputFileError: it cannot be used.
+    """Parse the header of an observation file, which begins at `first_line`; raise InputFileError if it cannot be used.
 
     `log` receives notes on records that are not in their columns, and on unreadable records that are skipped.
     """
@@ -101,7 +101,7 @@ def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: 
 
 
 def read_version(path: FilePath, line: str) -> float:
-    """Return the version of a RINEX file from its first line; InputFileError: the version is not supported."""
+    """Return the version of a RINEX file from its first line; raise InputFileError if it is not supported."""
     try:
         version = float(line[:9])
     except ValueError as error:
@@ -123,7 +123,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header; records that are not in their columns are read by words."""
+    """Reader of header records into a copy of a header; records that are not in their columns are split at spaces."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
@@ -279,7 +279,7 @@ class _HeaderRecords:
             self._changes["time_system"] = name
 
     def strength_unit(self, text: str) -> None:
-        """Check SIGNAL STRENGTH UNIT; InputFileError: the unit is not DBHZ."""
+        """Check SIGNAL STRENGTH UNIT; raise InputFileError if the unit is not DBHZ."""
         unit = text[:20].strip().upper()
         if unit not in ("DBHZ", ""):
             raise self._fail(f"SIGNAL STRENGTH UNIT: '{unit}' was found, DBHZ was expected")
@@ -331,7 +331,7 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
 }
 
 
-#: Readers of some records in `_VALUES` by their words.
+#: Readers of records in `_VALUES` whose fields are separated by spaces instead of columns.
 _BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
     "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
     "ANTENNA: DELTA H/E/N": lambda words: _three("".join(f"{word:>14}" for word in words[:3])),

@@ -70,7 +70,7 @@ class NavigationContent:
             stored[part] = [0.0 if np.isnan(v) else v for v in values]
 
     def klobuchar_sets(self) -> dict[str, Floats]:
-        """Return the coefficients by constellation; sets of zeros, which were not received, are left out and noted."""
+        """Return the coefficients by constellation; sets of zeros, which mean not received, are left out and noted."""
         received = {}
         for letter, values in self.klobuchar.items():
             if any(values):
@@ -81,7 +81,10 @@ class NavigationContent:
 
 
 def read_header(path: FilePath, lines: list[str], content: NavigationContent) -> tuple[float, str, int]:
-    """Read a navigation header; return version, file type letter and index of the first line after the header."""
+    """Read a navigation header into `content`; return version, file type letter and index of the first line after it.
+
+    Raise InputFileError if the header has an invalid number or does not end.
+    """
     version, kind = _version(path, lines[0] if lines else "")
     for i, line in enumerate(lines):
         label = line[60:80].strip()
@@ -127,7 +130,7 @@ _MESSAGES: Final = {
 #: Constellation of records without a letter, by file type (RINEX 2.11, 2.12; 3.00 also has types by constellation).
 _FILE_SYSTEMS: Final = {"N": "G", "G": "R", "H": "S", "E": "E", "L": "E", "J": "J"}
 _SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped: SBAS, NavIC.
-_WIDTH: Final = 19  #: Width of a number.
+_WIDTH: Final = 19  #: Width of a number [characters].
 #: ``> EPH G01 LNAV`` (RINEX 4.02, table A7); time offsets (STO) may name a constellation alone: ``> STO E   IFNV``.
 _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
@@ -135,8 +138,8 @@ _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navigation:
     """Read all records of one or several navigation files, plain or packed.
 
-    With "count" a broken record is counted in `skipped` and described in `notes`. InputFileError: a file is missing, is
-    not a navigation file, or (with "stop") has a broken record; or no file has a usable record.
+    With "count", a broken record is counted in `skipped` and described in `notes`. Raise InputFileError if a file is
+    missing, is not a navigation file, or (with "stop") has a broken record, or if no file has a usable record.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -296,7 +299,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
 
 
 def _instant(text: str, digits: int) -> np.datetime64:
-    """Parse a time whose year has `digits` characters (RINEX 2: 3, later versions: 4); ValueError: not a time."""
+    """Parse a time whose year has `digits` characters (3 in RINEX 2, 4 later); raise ValueError if it is invalid."""
     year, rest = int(text[:digits]), text[digits:]
     if digits < 4:
         year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0

@@ -23,7 +23,8 @@ _GLONASS: Final = (
     "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
     "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
 ).split()
-#: First numbers of CNAV and of CNV1 to CNV3; CNAV records have no toe, which equals toc (IS-GPS-200, 30.3.3.1.1).
+#: Names of the first numbers of CNAV and of CNV1 to CNV3; CNAV records have no toe, which equals toc (IS-GPS-200,
+#: 30.3.3.1.1).
 _ORBIT_4: Final = (
     "af0_s af1 af2 a_dot crs delta_n m0 cuc eccentricity cus sqrt_a {} cic omega0 cis i0 crc omega omega_dot "
     "i_dot delta_n_dot "
@@ -34,7 +35,7 @@ _CNAV: Final = _ORBIT_4.format("top") + (
 )
 _CNV: Final = _ORBIT_4.format("toe_sow_s") + "kind top sisai_oe sisai_ocb sisai_oc1 sisai_oc2 "
 _CNV_END: Final = " group_delay_1_s group_delay_2_s sismai health flags iodc transmitted spare spare iode"
-#: Numbers of the messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Names of the numbers of messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
 _MESSAGES_4: Final[Mapping[str, str]] = {
     **dict.fromkeys(("G CNAV", "J CNAV"), _CNAV + "transmitted week"),
     **dict.fromkeys(("G CNV2", "J CNV2"), _CNAV + "inter_signal_4 inter_signal_5 spare spare transmitted week"),
@@ -77,7 +78,7 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
 }
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 _BLANK: Final = float("nan")
-_UNKNOWN: Final = 0.99e9  #: Numbers from here to 1.01E9 are unknown; RINEX has 0.9999E9.
+_UNKNOWN: Final = 0.99e9  #: Magnitudes from this to 1.01E9 mean unknown; RINEX writes 0.9999E9.
 _TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this from toe are invalid [s].
 
 
@@ -106,7 +107,7 @@ def list_fields(system: str, message: str) -> Sequence[str]:
 def number(text: str) -> float:
     """Parse a FORTRAN number; blank and 0.9999E9 give the same NaN object, so that equal records compare equal.
 
-    ValueError: the text is not a finite number.
+    Raise ValueError if the text is not a finite number.
     """
     text = text.strip()
     if not text:

@@ -27,7 +27,7 @@ _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
     "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
 }
 _BLANK: Final = " " * 19
-#: Last line of a GLONASS record of version 4: flags, group delay and accuracy, which are not known here.
+#: Last line of a GLONASS record of version 4: flags, group delay and accuracy, which `GlonassRecords` lacks.
 _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
 
 
@@ -165,7 +165,7 @@ def _calendar_text(time: Datetimes) -> Strings:
 def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Datetimes, Floats]:
     """Return toc in the constellation's time, and the numbers `names` of `FIELDS`, shape (n, numbers).
 
-    ValueError: a constellation has no Keplerian records in RINEX.
+    Raise ValueError if a constellation has no Keplerian records in RINEX.
     """
     letter = records.satellite.astype("<U1")
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
@@ -176,7 +176,7 @@ def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Dateti
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
     toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
     week, sent = _week_and_transmission(records, shift, beidou)
-    # For QZSS the flag is written: 0 for two hours, 1 for longer.
+    # For QZSS, a flag is written instead of hours: 0 for two hours, 1 for longer.
     fit = np.where(
         letter == "J",
         np.where(np.isnan(records.fit_interval_h), np.nan, records.fit_interval_h > 2.0),

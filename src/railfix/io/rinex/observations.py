@@ -1,9 +1,9 @@
 """Reader of RINEX 2, 3 and 4 observation files of one receiver.
 
-Reading in pieces and reading at once use the same code. A broken line stops the reading with an
-`InputFileError`, or with ``broken_lines="count"`` the record, satellite, epoch or rest of the file that it breaks is
-skipped, counted and described in `Observations.problems`. An error in the header that changes how the file is read is
-always raised.
+Reading in pieces and reading at once use the same code. With ``broken_lines="stop"``, a broken line raises
+`InputFileError`. With "count", the record, satellite, epoch or rest of the file that the line breaks is skipped,
+counted and described in `Observations.problems`. An error in the header that changes how the file is read is always
+raised.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, spli
 
 #: Bytes of text in a block: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: Longest accepted line. Failing recorders fill lines with zeros, but these lines are shorter.
+#: Longest accepted line [bytes]. Failing recorders fill lines with zeros, but these lines are shorter.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
 _TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems equal GPS time.
@@ -48,14 +48,15 @@ class Selection:
 
     broken_lines: BrokenLines = "stop"
     systems: frozenset[str] | None = None  #: Constellation letters, None for all.
-    start_ns: int = _BEFORE_ALL  #: First time, GPS time since 1970.
-    end_ns: int = int(np.iinfo(np.int64).max)  #: End, not included, GPS time since 1970.
+    start_ns: int = _BEFORE_ALL  #: First time, GPS time since 1970 [ns].
+    end_ns: int = int(np.iinfo(np.int64).max)  #: End, not included, GPS time since 1970 [ns].
 
 
 class BlockReader:
-    """Reader of one file in file order, with `last_ns`, `epochs` and the fraction `share` of what has been read.
+    """Reader of one file in file order.
 
-    `last_ns` is the median time of the last block. An incomplete last record is left out, with a note.
+    `epochs` is the number of epochs read, `share` the fraction of the file read, and `last_ns` the median time of the
+    last block [ns]. An incomplete last record is left out, with a note.
     """
 
     def __init__(self, path: FilePath, selection: Selection, *, block_bytes: int = BLOCK_BYTES) -> None:
@@ -197,12 +198,11 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Return the observations of one receiver in pieces of at most `epochs` epochs; other arguments as in
-    `railfix.read_observations`.
+    """Return an iterator over the observations of one receiver in pieces of at most `epochs` epochs.
 
-    The first piece is shorter (`in_pieces`). Each piece has only the channels that occur in it; the concatenated pieces
-    are the log. Memory use is one piece and one block of text. `progress` is called with the fraction of the files that
-    has been read, 0 to 1.
+    The other arguments are as in `railfix.read_observations`. The first piece is shorter (`in_pieces`). Each piece has
+    only the channels that occur in it; the concatenated pieces are the log. Memory use is one piece and one block of
+    text. `progress` is called with the fraction of the files that has been read, 0 to 1.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was requested")
@@ -222,7 +222,8 @@ def _runs(
 ) -> Iterator[Observations]:
     """Yield runs of epochs of all files in order of time.
 
-    InputFileError: no file has a usable epoch. MismatchError: no epoch is selected, or files are of different runs.
+    Raise InputFileError if no file has a usable epoch, and MismatchError if no epoch is selected or files are of
+    different runs.
     """
     firsts = [first_time(path) for path in paths] if len(paths) > 1 else []
     if firsts:
@@ -267,7 +268,7 @@ def _of_files(
             raise InputFileError(reader.path, "has a header but no epochs; the recording is empty or cut short")
 
 
-#: Files that begin farther apart than this are of different runs.
+#: Longest time between the first epochs of consecutive files of one run.
 LONGEST_GAP: Final = np.timedelta64(7, "D")
 
 
@@ -284,13 +285,15 @@ def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None
 
 
 def first_time(path: str) -> np.datetime64:
-    """Return the time of the first epoch of a file, NaT without epochs."""
+    """Return the time of the first epoch of a file, NaT if it has none."""
     with closing(BlockReader(path, Selection(broken_lines="count"), block_bytes=_PEEK_BYTES).blocks()) as runs:
         return next((run.epochs.time[0] for run in runs if len(run.epochs)), np.datetime64("NaT", "ns"))
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
-    """Set `break_before` at the first epoch of the next file, unless it follows within 1.5 intervals of the log."""
+    """Return `run` with `break_before` set at its first epoch, unless this follows `last` within 1.5 intervals of the
+    log.
+    """
     if last is None:
         return run
     interval = run.header.interval_s

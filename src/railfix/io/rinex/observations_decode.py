@@ -36,7 +36,7 @@ _BLANKS: Final = _U(0x2020202020202020)
 _NUMBER: Final = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,2})?")
 _DIGIT_OR_BLANK: Final = re.compile("[ 0-9]{2}")
 
-#: Words that keep the first 0..16 characters of a field, shape (17, 2).
+#: Bit masks that keep the first 0 to 16 characters of a field, shape (17, 2).
 _KEEP: Final = np.array(
     [[(1 << 8 * min(n, 8)) - 1, (1 << 8 * max(n - 8, 0)) - 1] for n in range(FIELD_WIDTH + 1)], dtype=np.uint64
 )
@@ -109,7 +109,7 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
 @dataclass(frozen=True)
 class DecodedRows:
-    """Satellites of a run of epochs, shape (n,): epoch, constellation, number (-1: unreadable), first line."""
+    """Satellites of a run of epochs, shape (n,): epoch, constellation, number (-1 if unreadable), first line."""
 
     epoch: Integers
     letter: Bytes
@@ -272,7 +272,7 @@ def _values(
 
 
 def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Masks:
-    """Return which lines have non-blank characters in the 16 columns after their fields."""
+    """Return whether each line has non-blank characters in the 16 columns after its fields."""
     result = np.zeros(len(start), dtype=np.bool_)
     long = np.flatnonzero(length > width)
     if len(long):

@@ -249,7 +249,7 @@ class _Walk:
         self._events: list[tuple[int, int, int]] = []
 
     def run(self, stop: int, *, at_end: bool) -> tuple[EpochHeads, int]:
-        """Walk from line 0 to `stop`; see `find_epochs`."""
+        """Walk from line 0 to `stop`; the result is as in `find_epochs`."""
         position = 0
         while position < stop:
             k = int(np.searchsorted(self._line, position))

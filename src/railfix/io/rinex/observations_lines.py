@@ -255,7 +255,7 @@ def find_signal(name: str, *, system: str, version: float, declared: Sequence[st
 def assign_columns(
     declared: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
 ) -> tuple[SignalColumn, ...]:
-    """Return the columns of a constellation; of several types with the same meaning only the first."""
+    """Return the columns of a constellation; of several types with the same meaning, only the first is kept."""
     columns: dict[tuple[int, str], SignalColumn] = {}
     for index, name in enumerate(declared):
         signal = find_signal(name, system=system, version=version, declared=declared)

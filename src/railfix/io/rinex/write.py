@@ -43,7 +43,7 @@ def detect_packing(path: FilePath) -> Packing:
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
     """Open a stream to a file, packed as requested or by the file name; the file is created only if there is no error.
 
-    ValueError: the packing is unknown. OutputError: the text cannot be compressed.
+    Raise ValueError if the packing is unknown, and OutputError if the text cannot be compressed.
     """
     kind = detect_packing(path) if packing is None else packing
     if kind not in get_args(Packing):
@@ -98,7 +98,9 @@ PROGRAM = "railfix"
 
 
 def header_line(text: str, label: str) -> str:
-    """Format one header record of 80 columns with its line end; ValueError: not ASCII of at most 60 characters."""
+    """Format one header record of 80 columns with its line end; raise ValueError unless `text` is ASCII of at most 60
+    characters.
+    """
     if len(text) > 60 or not text.isascii():
         raise ValueError(f"{label}: {text!r} is not ASCII of at most 60 characters")
     return f"{text:<60}{label:<20}\n"
@@ -142,8 +144,8 @@ def write_observations(
         By default from the file name: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
     version : {"3.04", "4.02"}
     observables : mapping of str to sequence of str, optional
-        Columns of each constellation (``{"G": ["C1C", "L1C"]}``). By default C, L, D and S of every
-        signal of the first piece.
+        Observation types of each constellation (``{"G": ["C1C", "L1C"]}``). By default C, L, D and S of every signal of
+        the first piece.
     header : ObservationHeader, optional
         Header to write, by default the header of the first piece.
     comments : sequence of str
