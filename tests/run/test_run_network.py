@@ -310,7 +310,7 @@ def test_positions_are_matched_in_the_frame_of_the_map() -> None:
     with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log .* swapped in one of them"):
         swapped.transform_to(made)
     elsewhere = replace(log, longitude_deg=log.longitude_deg + 6.0)
-    with pytest.raises(MismatchError, match=r"the map lies \d\d\d km from .* its CRS right"):
+    with pytest.raises(MismatchError, match=r"the map lies \d\d\d km from .* its CRS is right"):
         elsewhere.transform_to(made)
 
 

@@ -30,7 +30,7 @@ Strings = NDArray[np.str_]  #: Names, for example of satellites.
 def copy_with(instance: Instance, **values: Any) -> Instance:
     """Copy a frozen dataclass with changed attributes, without calling ``__init__`` and ``__post_init__``.
 
-    Values of cached properties are copied too.
+    Values of cached properties are copied, too.
     """
     copy = object.__new__(type(instance))
     copy.__dict__.update(instance.__dict__, **values)
@@ -68,7 +68,7 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 
 
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
-    """Freeze the arrays of a dataclass; ValueError if the number of rows of an array differs from that of `first`.
+    """Freeze the arrays of a dataclass; raise ValueError if an array has not as many rows as the array `first`.
 
     `of` names the rows in the message.
     """
@@ -102,8 +102,8 @@ def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
 def join_rows(parts: Sequence[Rows]) -> Rows:
     """Return a dataclass with the concatenated rows of several dataclasses of one type.
 
-    Fields that are not arrays are taken from the first dataclass. ValueError: the dataclasses differ in which fields
-    are arrays.
+    Fields that are not arrays are taken from the first dataclass. Raise ValueError if the dataclasses differ in which
+    fields are arrays.
     """
     if len(parts) == 1:
         return parts[0]
@@ -114,7 +114,7 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
 
 
 def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
-    """Return a copy of a dataclass of arrays in which the rows at given indices are replaced by those of `part`.
+    """Return a copy of a dataclass of arrays in which the rows at given indices are replaced by the rows of `part`.
 
     Every field is an array with the rows on axis 0.
     """
@@ -164,7 +164,7 @@ def channel_sums(values: Floats) -> Floats:
     """Return sums over the channels, axis 1, added in the order of the channels.
 
     Channels of zeros therefore do not change the rounding of a sum, and an epoch has the same sum whether its chunk has
-    only its own channels or those of the whole log.
+    only its own channels or the channels of the whole log.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
 

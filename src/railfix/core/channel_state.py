@@ -22,13 +22,15 @@ Value = TypeVar("Value", bound=np.generic)
 class JoinedChannels:
     """Channels of a chunk, followed by the channels of the states that the chunk lacks; U in total."""
 
-    channel: Strings  #: Shape (U,).
+    channel: Strings  #: Names of the channels, shape (U,).
     present: int  #: Number of channels of the chunk, which come first.
     #: For each state, the index of each channel in that state, shape (U,); -1 if the state lacks the channel.
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
-        """Return values of a state, channels on the last axis, for all U channels; `fill` if the state lacks one."""
+        """Return values of a state, channels on the last axis, for all U channels; `fill` where the state lacks a
+        channel.
+        """
         place = self.places[state]
         known = place >= 0
         out: NDArray[Value] = np.full((*values.shape[:-1], len(place)), fill, dtype=values.dtype)
@@ -47,7 +49,8 @@ class JoinedChannels:
 def join_channels(channel: Strings, states: Sequence[Strings], kept: Sequence[Masks | None] = ()) -> JoinedChannels:
     """Return the union of the channels of a chunk and of states.
 
-    `kept` has, for each state, a mask of the channels that are recent enough; None or a missing mask keeps all of them.
+    `kept` has, for each state, a mask of the channels that are recent enough; None or a missing mask keeps all
+    channels.
     """
     names = channel.tolist()
     place = {name: k for k, name in enumerate(names)}

@@ -46,7 +46,7 @@ def _defaults(kind: Any) -> tuple[str, ...]:
 
 
 def join_epochs(values: Sequence[Value]) -> Value:
-    """Concatenate the rows of arrays, or of the arrays in dataclasses or tuples; keep other values of the first."""
+    """Concatenate the rows of arrays, or of the arrays in dataclasses or tuples; other values are from the first."""
     first: Any = values[0]
     if len(values) == 1:
         return values[0]

@@ -124,7 +124,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of strings; SettingsError if none is given, or a value is not a path."""
+    """Return one or several paths as a list of strings; raise SettingsError if there is none or one is no path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise SettingsError("no file was given")
@@ -137,8 +137,8 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
     """Open a file as a stream of its decompressed bytes.
 
     Line ends are as in the file. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed.
-    InputFileError: the file is missing, a folder, unreadable, empty, an archive of another kind, or, with "text",
-    binary.
+    Raise InputFileError if the file is missing, a folder, unreadable, empty, an archive of another kind, or, with
+    "text", binary.
     """
     held = ExitStack()
     with held:
@@ -180,7 +180,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 def unpacked_file(path: FilePath) -> Iterator[Path]:
     """Yield the path of a file with the decompressed content, for programs that open files themselves.
 
-    For a file that is not compressed it is the given path. All files of a zip archive are extracted into one folder.
+    For a file that is not compressed, this is the given path. All files of a zip archive are extracted into one folder.
     The temporary files are removed at the end of the block.
     """
     with _open_plain(path) as source:
@@ -203,9 +203,9 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
 
 
 def read_bytes(path: FilePath) -> bytes:
-    """Read the decompressed content of a small file (navigation, SP3, map); raises the errors of `open_stream`.
+    """Read the decompressed content of a small file (navigation, SP3, map); raise the errors of `open_stream`.
 
-    InputFileError: the content exceeds both `_LARGEST_RATIO` times the size of the file and `_LARGEST_BYTES`.
+    Raise InputFileError if the content exceeds both `_LARGEST_RATIO` times the size of the file and `_LARGEST_BYTES`.
     """
     content = bytearray()
     with open_stream(path) as stream:
@@ -220,9 +220,9 @@ def read_bytes(path: FilePath) -> bytes:
 
 
 def read_text(path: FilePath) -> str:
-    """Read the text of a small UTF-8 file, without a byte order mark; raises the errors of `read_bytes`.
+    """Read the text of a small UTF-8 file, without a byte order mark; raise the errors of `read_bytes`.
 
-    InputFileError: the content is not UTF-8.
+    Raise InputFileError if the content is not UTF-8.
     """
     content = read_bytes(path)
     try:
@@ -246,7 +246,7 @@ def ending(path: FilePath) -> str:
 
 
 def file_sha256(path: FilePath) -> str:
-    """Return the SHA-256 of a file as hexadecimal digits; InputFileError if the file cannot be read."""
+    """Return the SHA-256 of a file as hexadecimal digits; raise InputFileError if the file cannot be read."""
     try:
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -261,7 +261,7 @@ def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[s
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Read the object in a JSON file; InputFileError if the file does not contain one.
+    """Read the object in a JSON file; raise InputFileError if the file does not contain one.
 
     `what` names the expected kind of file in messages, with its article ("the record of a run").
     """
@@ -363,7 +363,7 @@ def source_commit() -> str:
     """Return the commit of the source, or "unknown" if neither the build nor a checkout states it.
 
     "+changed" is appended if the files differed from the commit when the package was built. In a checkout
-    (``pip install -e``) the commit is read from git's files; uncommitted changes are not detected.
+    (``pip install -e``), the commit is read from git's files; uncommitted changes are not detected.
     """
     if FROM_BUILD.is_file():
         return FROM_BUILD.read_text(encoding="ascii").strip()

@@ -30,7 +30,7 @@ def damage_errors() -> tuple[type[Exception], ...]:
 
 
 def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
-    """Open a zip archive; InputFileError if it is damaged."""
+    """Open a zip archive; raise InputFileError if it is damaged."""
     try:
         return zipfile.ZipFile(source)
     except zipfile.BadZipFile as error:
@@ -40,7 +40,7 @@ def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
 def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
     """Return the name of the file to read in a zip archive: its only file, or its only KML or SHP file.
 
-    InputFileError: there is no such file, or the archive is a document (spreadsheet).
+    Raise InputFileError if there is no such file, or the archive is a document (spreadsheet).
     """
     names = [
         item.filename

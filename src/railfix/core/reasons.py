@@ -16,7 +16,7 @@ from railfix.core.arrays import Integers
 
 
 class Reason(IntFlag):
-    """Reasons for rejecting an observation (epoch, channel); 0 = used."""
+    """Reasons for rejecting an observation (epoch, channel); 0 means used."""
 
     USED = 0
     #: There is no pseudorange at this epoch.
@@ -98,7 +98,7 @@ class Status(IntEnum):
     MAP_OFFSET = 10
     #: A position that passed every check, but interference with the signals is suspected: jamming.
     JAMMING_SUSPECTED = 11
-    #: A position, but the signals may be those of a spoofer: its error has no bound.
+    #: A position, but the signals may be from a spoofer, so that its error has no bound.
     SPOOFING_SUSPECTED = 12
     #: A position, but moved to an end of the map: the ranges put it beyond that end, by no more than their noise.
     MAP_END = 13
@@ -127,7 +127,7 @@ _LAST_BIT: Final = 30
 def screen_reason(name: str) -> Reason:
     """Return the reason of a screen by its lower-case name.
 
-    A name that `Reason` does not have receives the next free bit; ValueError if no bit is left.
+    A name that `Reason` does not have receives the next free bit; raise ValueError if no bit is left.
     """
     if name.upper() in Reason.__members__:
         return Reason[name.upper()]

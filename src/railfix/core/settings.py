@@ -68,7 +68,9 @@ class Checked(BaseModel):
         return html_table(rows, caption=f"{type(self).__name__}: {of}")
 
     def replaced(self, **changes: Any) -> Self:
-        """Return a copy with some settings changed; SettingsError where a value is out of range or a name unknown."""
+        """Return a copy with some settings changed; raise SettingsError if a value is out of range or a name is
+        unknown.
+        """
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self)(**{**values, **changes})
 
@@ -143,7 +145,10 @@ def option(
 
 
 def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
-    """Validate plain values as settings; SettingsError names the `source` of an invalid value (a path, or "--set")."""
+    """Validate plain values as settings.
+
+    Raise SettingsError, which names the `source` (a path, or "--set"), if a value is invalid.
+    """
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:

@@ -17,7 +17,8 @@ from railfix.core.staged_files import FilePath, check_path, write_whole
 def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
     """Read the values of a TOML file; `what` names the expected kind of file in messages ("a vehicle file").
 
-    InputFileError: the file is missing, unreadable, not UTF-8, or not TOML. SettingsError: `path` is not a path.
+    Raise InputFileError if the file is missing, unreadable, not UTF-8, or not TOML, and SettingsError if `path` is not
+    a path.
     """
     check_path(path, what=f"the path of {what}")
     try:
@@ -33,12 +34,12 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
 
 def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
-    """Read settings from a TOML file; raises the errors of `read_toml` and `validate`."""
+    """Read settings from a TOML file; raise the errors of `read_toml` and `validate`."""
     return validate(model, read_toml(path, what=what), source=str(path))
 
 
 def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file", comment: str = "") -> None:
-    """Write values as TOML below an optional comment; OutputError if the file cannot be written."""
+    """Write values as TOML below an optional comment; raise OutputError if the file cannot be written."""
     head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     write_whole(path, head + tomli_w.dumps(dict(values)), what=what)
 
@@ -49,8 +50,8 @@ ModelFile = TypeVar("ModelFile", bound=Settings)
 def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format_name: str, command: str) -> ModelFile:
     """Read a TOML model file whose entry `format` is `format_name`.
 
-    InputFileError: the file is of another format or version, or has an invalid entry. `what` names the kind of file and
-    `command` the command that makes it.
+    Raise InputFileError if the file is of another format or version, or has an invalid entry. `what` names the kind of
+    file, and `command` the command that creates it.
     """
     values = read_toml(path, what=what)
     written = values.get("format")

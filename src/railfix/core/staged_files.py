@@ -17,7 +17,7 @@ FilePath = str | os.PathLike[str]
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
     """Write a text file under a temporary name and rename it, so that a failed write leaves no partial file.
 
-    OutputError: the file cannot be written; `what` names the kind of file in the message.
+    Raise OutputError if the file cannot be written; `what` names the kind of file in the message.
     """
     with stage_file(path, what=what) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -27,7 +27,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
     """Yield a temporary path in the folder of a file; if the block ends without an error, it replaces the file.
 
-    OutputError: a system error occurred in the block or while replacing the file.
+    Raise OutputError if a system error occurs in the block or while replacing the file.
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")

@@ -35,7 +35,7 @@ _LEAP_UTC: Final = np.array(
 
 
 def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
-    """Parse a GPS time; ValueError if it is not a time, or has a time zone, which numpy would convert to UTC."""
+    """Parse a GPS time; raise ValueError if it is not a time, or has a time zone, which numpy would convert to UTC."""
     text = str(value).strip().replace(" ", "T")
     if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
         raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind it by the leap seconds")
@@ -109,7 +109,7 @@ def gpst_to_utc(time: ArrayLike) -> Datetimes:
 def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
     """Return the index of the nearest of ascending times to each wanted time; -1 if none is within `within_ns` [ns].
 
-    Of two equally near times the earlier one is returned.
+    Of two equally near times, the earlier time is returned.
     """
     have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
     if not len(have):

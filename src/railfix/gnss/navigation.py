@@ -25,7 +25,7 @@ def _records_text(satellite: Strings, toe: Datetimes) -> str:
 
 
 class _NavigationRecords(FrozenArrays, NotebookTable):
-    """Base of broadcast records: length, `repr`, read-only arrays."""
+    """Base of broadcast records, with length, `repr` and read-only arrays."""
 
     satellite: Strings
     toe: Datetimes
@@ -121,10 +121,10 @@ class PreciseEphemeris(NotebookTable):
 
     time: Datetimes  #: GPS time (files in another time system are converted), shape (E,).
     satellite: Strings  #: Name of the satellite, shape (N,).
-    position_ecef_m: Floats  #: NaN where the file has none (0.000000), shape (E, N, 3).
-    clock_s: Floats  #: NaN where the file has none (999999.999999), shape (E, N).
+    position_ecef_m: Floats  #: Position; NaN where the file has none (0.000000), shape (E, N, 3).
+    clock_s: Floats  #: Clock offset; NaN where the file has none (999999.999999), shape (E, N).
     source: str = ""  #: Names of the files.
-    notes: tuple[str, ...] = ()  #: Omitted records, with reasons.
+    notes: tuple[str, ...] = ()  #: Notes on omitted records, with reasons.
 
     def __post_init__(self) -> None:
         expected = (len(self.time), len(self.satellite))

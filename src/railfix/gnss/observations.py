@@ -76,9 +76,9 @@ class ObservationHeader:
     glonass_channel: Mapping[str, int] = field(default_factory=dict)
 
     leap_seconds: int | None = None
-    #: Signals declared for each constellation, RINEX 3 codes without the type letter ("1C", "2W").
+    #: Signals declared for each constellation, as RINEX 3 codes without the type letter ("1C", "2W").
     signals: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: RCV CLOCK OFFS APPL: time tags, codes and phases are already corrected for the receiver clock.
+    #: Whether time tags, codes and phases are already corrected for the receiver clock (RCV CLOCK OFFS APPL).
     receiver_clock_applied: bool = False
 
 
@@ -87,9 +87,9 @@ class Observations(NotebookTable):
     """Raw observations of one receiver, T epochs by M channels."""
 
     time: Datetimes  #: Receiver time tags in GPS time, not rounded, strictly rising; shape (T,).
-    satellite: Strings  #: Satellite of each channel, "G01", "J02"; shape (M,).
-    #: RINEX 3 observation code of each channel without its type letter, "1C", "2I"; shape (M,). RINEX 2 codes are
-    #: mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
+    satellite: Strings  #: Satellite of each channel, such as "G01" or "J02"; shape (M,).
+    #: RINEX 3 observation code of each channel without its type letter, such as "1C" or "2I"; shape (M,). RINEX 2 codes
+    #: are mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
     signal: Strings
     code_m: Floats  #: Pseudorange, shape (T, M).
     phase_cycles: Floats  #: Carrier phase, shape (T, M).
@@ -178,7 +178,7 @@ class Observations(NotebookTable):
         return part
 
     def _epoch_at(self, bound: str | datetime | np.datetime64) -> int:
-        """Return the number of the first epoch at or after a time; KeyError: the bound is not a time."""
+        """Return the number of the first epoch at or after a time; raise KeyError if the bound is not a time."""
         text = str(bound).replace(" ", "T")
         try:
             if "-" in text or not len(self):
@@ -192,7 +192,7 @@ class Observations(NotebookTable):
         return int(np.searchsorted(self.time, time))
 
     def _find_channels(self, names: Sequence[str]) -> Indices:
-        """Return the channels of satellites or constellations; KeyError: one of them is absent."""
+        """Return the channels of satellites or constellations; raise KeyError if one of them is absent."""
         found = np.zeros(len(self.satellite), dtype=np.bool_)
         for name in names:
             own = (self.system if len(name) == 1 else self.satellite) == name
@@ -203,7 +203,7 @@ class Observations(NotebookTable):
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
-    """Return which channels have an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
+    """Return whether each channel has an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
         used |= ~np.isnan(array[:1]).all(axis=0)  # nearly all channels have data in the first epoch

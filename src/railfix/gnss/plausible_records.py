@@ -33,7 +33,7 @@ _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "
 _GLONASS_M: Final = (25.3e6, 25.7e6)
 #: Largest difference of the reference times of orbit and clock of a record; they are equal in the 2,104 records.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0
-_EARTH_GM: Final = 3.986004418e14  #: [m^3/s^2].
+_EARTH_GM: Final = 3.986004418e14  #: Geocentric gravitational constant [m^3/s^2].
 _NAMES: Final = {"G": "GPS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "R": "GLONASS"}
 
 
@@ -42,8 +42,8 @@ def plausible_navigation(navigation: Navigation) -> Navigation:
     kepler, glonass = navigation.kepler, navigation.glonass
     causes = {
         "toe and toc differ by more than 5 min": (kepler, unrelated_times(kepler)),
-        "the orbit is not one of this constellation": (kepler, ~plausible_kepler(kepler)),
-        "radius or velocity is not that of a GLONASS orbit": (glonass, ~plausible_glonass(glonass)),
+        "the orbit does not fit this constellation": (kepler, ~plausible_kepler(kepler)),
+        "radius or velocity does not fit a GLONASS orbit": (glonass, ~plausible_glonass(glonass)),
     }
     notes, skipped = list(navigation.notes), dict(navigation.skipped)
     wrong = {id(kepler): np.zeros(len(kepler), dtype=np.bool_), id(glonass): np.zeros(len(glonass), dtype=np.bool_)}

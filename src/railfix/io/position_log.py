@@ -124,7 +124,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not geodetic and not cartesian:
         raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)} (name the right one by columns, --column latitude_deg=NAME)"
+            f"{', '.join(table.cells)} (name the columns to read by columns, --column latitude_deg=NAME)"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")

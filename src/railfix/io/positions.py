@@ -174,7 +174,7 @@ def read_positions(
     if antennas == "one" and len(log.antennas) > 1:
         raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give the positions of one antenna")
     if np.isnan(log.geodetic[0]).all():
-        raise NoPositionError(f"{path}: {plural(len(log), 'row')}, none with a position")
+        raise NoPositionError(f"{path}: has {plural(len(log), 'row')}, but none with a position")
     if heights == "needed" and log.plan_deg is not None and np.isnan(log.ecef_m).all():
         raise InputFileError(path, "its positions have no height; expected heights above the ellipsoid (height_m)")
     return _in_order(log)

@@ -23,15 +23,18 @@ QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 #: Smallest change that is a feature: 3 permille, and from straight track to a radius of 1000 m.
 _GRADIENT_CHANGE: Final = 0.003
 _CURVATURE_CHANGE_1PM: Final = 1e-3
-_LIKELIHOOD_RATIO: Final = 1e3  #: Least likelihood ratio of the accepted position to any other in the window.
+#: Smallest likelihood ratio of the accepted position to any other position in the window.
+_LIKELIHOOD_RATIO: Final = 1e3
 _GAP_SIGMAS: Final = 3.0  #: Largest deviation of the distance from the last accepted feature, in sigmas.
 _FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity, in units of its variance.
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
-HALF_LENGTH_M: Final = 60.0  #: Length of line before and after a feature that is compared.
-#: Changes below this fraction of a change within `HALF_LENGTH_M` are ignored: a curve through sparse points ripples.
+HALF_LENGTH_M: Final = 60.0  #: Length of line that is compared before and after a feature.
+#: Changes below this fraction of a larger change within `HALF_LENGTH_M` are ignored, because a curve through sparse
+#: points ripples.
 _RIPPLE: Final = 0.2
-#: Length over which a change is computed, about the distance between a vehicle's bogies, which smooth shorter changes.
+#: Length over which a change is computed, about the distance between a vehicle's bogies; a vehicle smooths shorter
+#: changes.
 BASE_M: Final = 15.0
 
 
@@ -39,7 +42,7 @@ BASE_M: Final = 15.0
 class LineSeries:
     """Gradient and curvature along a line, at N points `STEP_M` apart."""
 
-    arc_m: Floats  #: Shape (N,).
+    arc_m: Floats  #: Arc length of the points, shape (N,).
     gradient: Floats  #: Height change per horizontal length, in the direction of rising arc length; shape (N,).
     curvature_1pm: Floats  #: Curvature, positive to the right in the direction of rising arc length; shape (N,).
 
@@ -79,8 +82,8 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
     """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
-    A feature is at the middle of its change. `least` gives for each quantity of a measured line a lower bound of
-    changes at the points, shape (N,): a change must also exceed the root sum of squares of the bounds at its two ends.
+    A feature is at the middle of its change. `least` gives, for each quantity of a measured line, a lower bound of
+    changes at each point, shape (N,); a change must also exceed the root sum of squares of the bounds at its two ends.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []
@@ -127,7 +130,7 @@ def locate(
 ) -> LocatedFeature:
     """Estimate the position of a measured series by maximum likelihood, within four sigmas of the predicted position.
 
-    A constant offset of the quantity is estimated, too, so that a bias of the sensor has no effect.
+    A constant offset of the quantity is also estimated, so that a bias of the sensor has no effect.
 
     Parameters
     ----------
@@ -140,7 +143,7 @@ def locate(
     quantity : {"gradient", "curvature"}
         Quantity that is matched. The second quantity must agree with the map at the estimated position.
     noise : tuple of float
-        Standard deviations of gradient and curvature at one point of the series.
+        Standard deviations of gradient [1] and curvature [1/m] at one point of the series.
     last : tuple of float, optional
         Arc length of the last accepted feature, its sigma, and the wheel distance from that feature [m].
 

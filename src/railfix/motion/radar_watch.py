@@ -24,7 +24,7 @@ _SILENT: Final = 2  #: Number of consecutive windows without a radar speed that 
 #: Smallest reported step of the ratio, absolute and as a multiple of the scatter of the windows before the step.
 _STEP: Final = 0.01
 _SCATTERS: Final = 5.0
-_LEAST_SCATTER: Final = 0.001  #: Lower bound of that scatter.
+_LEAST_SCATTER: Final = 0.001  #: Lower bound of the scatter of the windows before the step.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class RadarAlarm:
 class RadarWatch:
     """Ratios of radar to satellite speed in the last windows of GPS time; memory is bounded in a long session."""
 
-    #: Ratio less 1 in each window.
+    #: Ratio of radar to satellite speed less 1, in each window.
     ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
     #: Number of each window, counted from the origin of datetime64.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
@@ -63,9 +63,9 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Add radar and satellite speeds at instants after all earlier instants, and return the alarms raised.
+        """Add radar and satellite speeds, later than all speeds added before, and return the alarms raised.
 
-        All arrays have shape (N,); a speed is NaN where not measured. `right_mps` are the satellite speeds.
+        All arrays have shape (N,). `right_mps` are the satellite speeds. A speed is NaN if it was not measured.
         """
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])

@@ -1,7 +1,7 @@
 """Samples of the on-board sensors as read-only arrays, and formulas of Doppler radar and two-way ranges (P2 3).
 
-Times are GPS times in ascending order. Values are NaN where not measured. If a radar beam points alpha below the
-direction of travel, the relative error of its speed is ``tan(alpha)`` times the error of alpha.
+Times are GPS times in ascending order. Values are NaN where nothing was measured. If a radar beam points by an angle
+alpha below the direction of travel, the relative error of its speed is ``tan(alpha)`` times the error of alpha.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """N passages of the train's balise reader over a balise; a group has one, of the balise that the list contains."""
+    """N passages of the train's reader over a balise; of a group of balises, only the listed balise has a reading."""
 
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity of the balise, shape (N,).
     #: Standard deviation along the line, reported by the reader; NaN if not reported; shape (N,).
@@ -128,7 +128,7 @@ class SensorSamples:
         return {name: getattr(self, name) for name in SENSORS}
 
     def between(self, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
-        """Return the samples after `begin` up to and including `end`; from the first sample on if `begin` is NaT."""
+        """Return the samples after `begin` up to and including `end`; all up to `end` if `begin` is NaT."""
         parts: dict[str, Any] = {}
         for name, rows in self.tables.items():
             first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))
@@ -137,7 +137,7 @@ class SensorSamples:
         return SensorSamples(**parts, silent=self.silent)
 
     def merge(self, later: SensorSamples) -> SensorSamples:
-        """Return both sets of samples in order of time; `silent` is that set of `later`."""
+        """Return both sets of samples in order of time, with `silent` from `later`."""
         parts: dict[str, Any] = {}
         for name, after in later.tables.items():
             before: Samples = getattr(self, name)

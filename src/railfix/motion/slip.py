@@ -1,7 +1,7 @@
 r"""Slip, slide, low speed and rolling away, detected from the vehicle's pitch (P2 2.1) and bridged by inertia.
 
 While the wheel rolls, ``sin(theta_T) = (f_x - a_T) / g`` from accelerometer and tachometer is the sine of the pitch.
-During a slip it has values that no line has. There are two rules:
+During a slip, it exceeds the gradient of any line. There are two rules:
 
 * ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient and the pitching of the body. It only
   detects a change of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
@@ -9,9 +9,9 @@ During a slip it has values that no line has. There are two rules:
   when the wheel has returned to the inertial speed and the pitch agrees, or when wheel and train are at rest.
 
 During a slip, speed and distance are integrated from the accelerometer less the components of pitch and offset, from
-`LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. The pitch is that of the line where
-the position is known. With a gyro it is the integral of the pitch rate, with a slow correction to the line or, where
-the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
+`LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. Without a gyro, the pitch of the line
+is used where the position is known. With a gyro, the pitch is the integral of the pitch rate, with a slow correction to
+the line or, where the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class MotionState(IntEnum):
 
 #: Limit of the difference of the pitch sines of vehicle and line: 0.15 m/s2 between wheel and train.
 _MAP_LIMIT: Final = 0.015
-#: Lower bound of the limit, in standard deviations of the difference while the wheel rolls, and their time constant. A
-#: pitching body accelerates its accelerometer, the more the higher it is mounted.
+#: Lower bound of the limit, in standard deviations of the difference while the wheel rolls, and time constant of their
+#: estimate. A pitching body accelerates its accelerometer, the more the higher it is mounted.
 _NOISE_SIGMAS: Final = 5.0
 _NOISE_S: Final = 30.0
 #: A slip ends when wheel and inertial speeds agree within the larger of these two limits for this time.
@@ -61,9 +61,10 @@ SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
 _STANDING_MPS: Final = 0.5  #: Largest inertial speed that agrees with a stationary wheel.
 _PITCH_S: Final = 20.0  #: Time constant of the correction of the gyro's pitch.
-_STEEPEST: Final = 0.1  #: Largest plausible sine of the pitch; a line has 0.035 at most, the rest is body and mounting.
+#: Largest plausible sine of the pitch; a line has at most 0.035, the rest is margin for body and mounting.
+_STEEPEST: Final = 0.1
 _FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
-#: Time for which the body pitches after a stop, before its pitch is taken as the pitch at standstill.
+#: Time for which the body still pitches after a stop; only then its pitch is used as the pitch at standstill.
 _SETTLING_S: Final = 2.0
 #: Change of the pitch sine at standstill, its duration, and the inertial speed that indicate rolling away.
 _ROLLING_LIMIT: Final = 0.002
@@ -74,8 +75,8 @@ _ROLLING_MPS: Final = 0.05
 class SlipLimits(Settings):
     """Limits of the slip detection."""
 
-    #: Whether the pitch is compared with the gradient of the line ("map"), or with P2's constant limit ("p2"), without
-    #: latch and look-back.
+    #: Whether the pitch is compared with the gradient of the line ("map"), or with the constant `p2_limit`, without
+    #: latch and look-back ("p2").
     rule: Literal["map", "p2"] = "map"
     #: Largest sine of the pitch without slip, for the rule "p2": 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
@@ -93,9 +94,11 @@ class SlipResult:
     """Speed, distance and state of motion at N samples."""
 
     state: Codes  #: `MotionState`, shape (N,).
-    speed_mps: Floats  #: Wheel speed in NORMAL, 0 or inertial speed otherwise, NaN in INIT and EXPIRED; shape (N,).
+    #: Wheel speed in NORMAL, NaN in INIT and EXPIRED, 0 or inertial speed in other states; shape (N,).
+    speed_mps: Floats
     #: Integral of the speed from the first sample, shape (N,). A slip is bridged by inertia from its look-back on. At
-    #: its end the distance is corrected for the difference of wheel and inertial speeds, assumed to grow linearly.
+    #: the end of the slip, the distance is corrected for the difference of wheel and inertial speeds, assumed to grow
+    #: linearly.
     distance_m: Floats
     #: Sine of the pitch by wheel and accelerometer less `pitch`; NaN without pulses; shape (N,).
     metric: Floats
@@ -116,7 +119,7 @@ def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) 
     """Compute the rate of the pitch angle from the body rates, shape (N, 3), and the roll, shape (N,) [rad/s].
 
     The rate is ``w_y cos(phi) - w_z sin(phi)`` with the roll ``sin(phi) = (v w_z - f_y) / g``, as the body leans with
-    the cant. Without the roll it is wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
+    the cant. If the roll were ignored, the rate would be wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
     """
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
@@ -147,17 +150,18 @@ class MotionSamples(NamedTuple):
     #: missing. The pitch rate (`pitch_rate_radps`) is computed with the inertial speed during a slip, because the speed
     #: of the slipping wheel would result in a wrong roll.
     body: Floats | None = None
-    #: Time since the last pulse, shape (N,). It is needed where a creeping train has pulses without a speed; without it
-    #: the time since the last speed is used.
+    #: Time since the last pulse, shape (N,). This time is needed where a creeping train has pulses without a speed; if
+    #: it is missing, the time since the last speed is used.
     since_pulse_s: Floats | None = None
 
 
 def find_slips(
     samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
 ) -> tuple[SlipResult, SlipState | None]:
-    """Compute the state of motion, speed and distance at each sample from this sample and all earlier samples.
+    """Compute state of motion, speed and distance at each sample from this and all earlier samples.
 
-    `state` is the state returned for the previous samples, None at the start.
+    `state` is the state returned by the previous call, None at the start. The second returned value is the state for
+    the next call.
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
@@ -208,7 +212,7 @@ class _Automaton:
     _stood: float = 0.0
     _learnt: float = 0.0
     _rest: float = float("nan")
-    #: Time, speed and inertial acceleration of past samples, from which a slip is recomputed after its detection.
+    #: Time, speed and inertial acceleration of past samples, from which `_look_back` recomputes the speed.
     _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=200))
 
     def copy(self, limits: SlipLimits) -> _Automaton:
@@ -216,7 +220,7 @@ class _Automaton:
         return replace(self, limits=limits, _past=self._past.copy())
 
     def row(self) -> tuple[float, ...]:
-        """Return the values of `SlipResult` at the last sample."""
+        """Return the values of `SlipResult` at the last sample, in the order of its fields."""
         return self.state, self.speed, self.distance, self.metric, self._smooth, self.pitch, self.bias
 
     def step(
@@ -240,7 +244,7 @@ class _Automaton:
         if self.metric == self.metric:
             share = min(dt / SMOOTHING_S, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
-        # without line and gyro the reference pitch is constant, and valid only at an earlier position
+        # without line and gyro, the reference pitch is constant, and valid only at an earlier position
         least = _MAP_LIMIT if sine == sine or rate == rate else limits.p2_limit
         self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
@@ -264,8 +268,9 @@ class _Automaton:
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float, *, rests: bool) -> None:
         """Update the reference pitch and the gyro bias.
 
-        Without a gyro the pitch is that of the line. With a gyro it is the integrated rate, corrected slowly to the
-        line, or to the wheel's pitch without a line. At rest the mean rate over `bias_s` is the bias of the gyro.
+        Without a gyro, the pitch of the line is used. With a gyro, the pitch is the integrated rate, corrected slowly
+        to the line, or to the pitch from wheel and accelerometer if the line is unknown. At rest, the gyro bias is the
+        mean rate over `bias_s`.
         """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
@@ -319,7 +324,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """Use the speed of the wheel, or declare a slip if the pitch contradicts it for `confirm_s`."""
+        """Use the speed of the wheel, or declare a slip if the pitch contradicts this speed for `confirm_s`."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")
@@ -342,7 +347,7 @@ class _Automaton:
                 self._look_back(inertial, dt)
 
     def _look_back(self, inertial: float, dt: float) -> None:
-        """Recompute speed and distance by inertia from shortly before the detection on."""
+        """Recompute speed and distance by inertia, beginning shortly before the detection."""
         begin = self._age - LOOK_BACK_S - self.limits.confirm_s - SMOOTHING_S
         past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
         if not past:
@@ -373,7 +378,7 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """Detect rolling away from a change of the force at rest, which is the gravity component along the vehicle."""
+        """Detect rolling away by a change of the forward force since standstill, which is a gravity component."""
         limits = self.limits
         self._stood += dt
         if self.state == MotionState.STANDING and self._stood < _SETTLING_S:

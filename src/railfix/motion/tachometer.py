@@ -1,7 +1,7 @@
 """Speed, acceleration and distance from the pulse times of a tachometer (P2 2.2), and checks of its settings.
 
-From pulse k0 to pulse k the mean speed is ``(k - k0) p / (t_k - t_k0)``, with the distance per pulse p. At constant
-acceleration this is the speed at the middle of the interval, so that speeds are returned with that instant.
+From pulse k0 to pulse k, the mean speed is ``(k - k0) p / (t_k - t_k0)``, with the distance per pulse p. At constant
+acceleration, this is the speed at the middle of the interval; each speed is therefore returned with this instant.
 """
 
 from __future__ import annotations
@@ -50,13 +50,14 @@ class PulseSpeeds:
     #: Instant at which the speed is valid, before the requested instant; NaT without a speed; shape (N,).
     time: Datetimes
     speed_mps: Floats  #: Speed, negative backward; NaN where the pulses give no speed; shape (N,).
-    sigma_mps: Floats  #: Standard deviation by jitter and clock, without the wheel scale error; shape (N,).
+    #: Standard deviation caused by jitter and clock resolution, without the wheel scale error; shape (N,).
+    sigma_mps: Floats
 
 
 def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> PulseSpeeds:
-    """Compute the speed at each instant from the pulses of the last `window_s` up to it, shape (N,).
+    """Compute the speed at each instant from the pulses of the last `window_s` up to this instant, shape (N,).
 
-    The speed is NaN below `LEAST_SPEED_MPS`, after `silence_s` without a pulse, and before the second pulse.
+    The speed is NaN if it is below `LEAST_SPEED_MPS`, after `silence_s` without a pulse, and before the second pulse.
     """
     limits = limits or TachometerLimits()
     last = np.searchsorted(pulses.time, time, side="right") - 1
@@ -87,7 +88,8 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
 def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
     """Return the index of the pulse at which the window of each pulse `last` starts.
 
-    It is the last pulse at least `window_s` earlier, and at least one pulse earlier; near the start it is the first.
+    The window starts at the last pulse that is at least `window_s` earlier, and at least one pulse earlier; near the
+    start, at the first pulse.
     """
     start = np.searchsorted(time, time[last] - timedelta(np.full(len(last), window_s)), side="right") - 1
     return np.asarray(np.maximum(np.minimum(start, last - 1), 0), dtype=np.intp)
@@ -100,10 +102,10 @@ def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
 
 
 def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
-    """Return the signed distance travelled up to each instant, from the pulses up to it, shape (N,) [m].
+    """Return the signed distance travelled up to each instant, from the pulses up to this instant, shape (N,) [m].
 
-    Between pulses the distance is extrapolated with the last speed, by one pulse at most. It is 0 before the first
-    pulse. A pulse without direction counts as forward.
+    Between pulses, the distance is extrapolated with the last speed, by at most one pulse. Before the first pulse, the
+    distance is 0. A pulse without direction counts as forward.
     """
     limits = limits or TachometerLimits()
     if not len(pulses):
@@ -142,7 +144,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses detected up to each instant, two pulses late, shape (N,).
+    """Return the number of lost and doubled pulses found up to each instant, two pulses after they occur, shape (N,).
 
     Lost pulses that the `pulse` numbers show are not counted.
     """

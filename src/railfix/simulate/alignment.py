@@ -2,7 +2,7 @@
 
 The curve is the ground truth. The track map consists of points of the curve, with the offset `MapError` where set.
 Chainage is the arc length in three dimensions. Curvature and cant change linearly in transitions (clothoids and cant
-ramps), the gradient changes linearly in vertical curves. The curve is integrated on the WGS 84 ellipsoid.
+ramps), and the gradient changes linearly in vertical curves. The curve is integrated on the WGS 84 ellipsoid.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Alignment(Knots):
         return CubicHermiteSpline(chainage, place, tangent, axis=0)
 
     def at(self, chainage_m: ArrayLike) -> Floats:
-        """Return points of the curve, shape (..., 3) ECEF [m]; beyond the ends the curve is extrapolated."""
+        """Return points of the curve, shape (..., 3) ECEF [m]; beyond the ends, the curve is extrapolated."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
 
     def tangent_at(self, chainage_m: ArrayLike) -> Floats:
@@ -114,7 +114,7 @@ class Alignment(Knots):
     def point_chainage_m(self) -> Floats:
         """Return the chainages of the points of the track map.
 
-        These are the ends of the elements, and evenly spaced points between them; with a track file, its points.
+        These are the ends of the elements, and evenly spaced points between them, or the points of the track file.
         """
         if self.file is not None:
             return self.file.point_m
@@ -164,7 +164,7 @@ class Alignment(Knots):
 def build_alignment(settings: LineSettings) -> Alignment:
     """Return the line of a scenario.
 
-    Raise SettingsError where the elements do not fit together, InputFileError where the track file cannot be read, has
+    Raise SettingsError if the elements do not fit together, and InputFileError if the track file cannot be read, has
     too few points, or has a curve that is too sharp.
     """
     if settings.kind == "file":

@@ -57,7 +57,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # Drawn for every phase, so that the slips of a phase do not depend on those of other phases.
+        # Drawn for every phase, so that the slips of a phase do not depend on the slips of other phases.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
             continue
@@ -105,7 +105,7 @@ def pulse_times_s(
     times = _times_at(target, node, turned, np.abs(speed) + surplus)
     if tooth_errors is None:
         return times
-    # After a turn in either direction the same tooth is at the sensor again.
+    # After a turn in either direction, the same tooth is at the sensor again.
     tooth = np.cumsum(np.where(motion.at(times)[1] < 0.0, -1, 1)) % len(tooth_errors)
     moved = np.clip(target + apart * tooth_errors[tooth], 0.0, turned[-1])
     return _times_at(np.sort(moved), node, turned, np.abs(speed) + surplus)
@@ -176,7 +176,8 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
 
 _HALF_S: Final = 0.02  #: Longest half interval of the differences in time [s].
 _BLOCK: Final = 50_000  #: Number of samples computed in one step.
-_LEVER_M: Final = 10.0  #: Lever arm from which the attitude is computed, long against the rounding of positions [m].
+#: Lever arm from which the attitude is computed, so long that rounding of positions is negligible [m].
+_LEVER_M: Final = 10.0
 #: Normal gravity of WGS 84 at the equator [m/s^2], Somigliana's constant, flattening, m, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
 _ECCENTRICITY_2: Final = 6.694_379_990_14e-3
@@ -208,7 +209,7 @@ def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: 
 def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats, half_s: float) -> Floats:
     """Compute specific force [m/s^2] and angular rate [rad/s] relative to inertial space in body axes, shape (n, 6).
 
-    They are central differences of position and attitude over ``2 half_s``.
+    The quantities are central differences of position and attitude over ``2 half_s``.
     """
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now

@@ -37,7 +37,8 @@ _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": 
 def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     """Read the navigation records of the satellites that have a valid record throughout the scenario.
 
-    Raise MismatchError where no satellite has, or the file lacks the Klobuchar coefficients that the scenario requires.
+    Raise MismatchError if there is no such satellite, or the file lacks Klobuchar coefficients that the scenario
+    requires.
     """
     navigation = read_navigation(path)
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
@@ -52,8 +53,8 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     if not kept:
         span = f"{records.toe.min()} to {records.toe.max()}" if len(records) else "none of these constellations"
         raise MismatchError(
-            f"{path}: no satellite of {scenario.sky.systems!r} has records for all of {first} to {last} GPS time, "
-            f"the scenario's; reference times in the file: {span}"
+            f"{path}: no satellite of {scenario.sky.systems!r} has records for the whole scenario, {first} to {last} "
+            f"(GPS time); reference times in the file: {span}"
         )
     return Navigation(
         kepler=take_rows(records, np.concatenate(kept)),
@@ -85,11 +86,11 @@ def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, 
 def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:
     """Return the indices of a satellite's records in force from `first` to `last`, in order of transmission.
 
-    The result is empty where the record in force is not valid at some time, or there is none.
+    The result is empty if the record in force is not valid at some time, or there is no record in force.
     """
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
-    # Of records transmitted at the same time only that with the latest reference time is kept.
+    # Of records transmitted at the same time, only the record with the latest reference time is kept.
     rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0, "ns"), True)]
     sent = records.transmitted[rows]
     begin, end = (int(np.searchsorted(sent, time, side="right")) for time in (first, last))
@@ -130,8 +131,8 @@ def simulate_navigation(scenario: Scenario) -> Navigation:
     """Return the broadcast records for the duration of a run.
 
     All values are rounded to the digits that `railfix.io.write_navigation` writes, so that file and arrays describe the
-    same satellites. If the scenario names a navigation file, the records are those of `navigation_of_file`, which also
-    raises its errors.
+    same satellites. If the scenario names a navigation file, the records are read by `navigation_of_file`, whose errors
+    are raised.
     """
     if scenario.sky.nav is not None:
         return navigation_of_file(scenario, scenario.sky.nav)
@@ -298,7 +299,8 @@ def record_state(
 ) -> tuple[Floats, Floats]:
     """Return positions, shape (T, 3) [m], and clocks with relativistic correction, shape (T,) [s].
 
-    `row` is the row of the records for each instant, `since_toe_s` and `since_toc_s` the times since its toe and toc.
+    `row` is the row of the record for each instant; `since_toe_s` and `since_toc_s` are the times since toe and toc of
+    the record.
     """
     position, _, relativity = kepler_state(Orbits.from_records(records).take(row), since_toe_s)
     dt = since_toc_s
@@ -380,7 +382,7 @@ class SatelliteTable:
     def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
         """Return the signals of all satellites at a receiver, as `links` does, shapes (T, S).
 
-        Raise ValueError where a tag is outside the span of the table.
+        Raise ValueError if a tag is outside the span of the table.
         """
         when = seconds(tag - self._start)
         if when.size and (when.min() < 0.0 or when.max() > self._end):

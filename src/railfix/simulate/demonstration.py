@@ -26,7 +26,7 @@ DEMO_FILES: Final = {
 def demo_folder() -> Path:
     """Return the folder of the demonstration run, in the installed package or in a clone of the repository.
 
-    Raise InputFileError where neither has the folder, or a file is missing.
+    Raise InputFileError if neither has the folder, or a file is missing.
     """
     package = Path(__file__).resolve().parents[1]
     places = (package / "_demo", package.parents[1] / "data" / "demo")
@@ -40,13 +40,13 @@ def demo_folder() -> Path:
 
 
 def demo_files() -> dict[str, Path]:
-    """Return the files of the demonstration run by kind (`DEMO_FILES`); InputFileError where they are missing."""
+    """Return the files of the demonstration run by kind (`DEMO_FILES`); raise InputFileError if they are missing."""
     folder = demo_folder()
     return {name: folder / file for name, file in DEMO_FILES.items()}
 
 
 def demo_inputs() -> RunInputs:
-    """Return the files of the demonstration run as inputs of a run; InputFileError where they are missing."""
+    """Return the files of the demonstration run as inputs of a run; raise InputFileError if they are missing."""
     files = demo_files()
     return RunInputs(
         front=(files["front"],),
@@ -58,7 +58,7 @@ def demo_inputs() -> RunInputs:
 
 
 def demo_truth() -> Path:
-    """Return the file with the ground truth of the demonstration run; InputFileError where it is missing."""
+    """Return the file with the ground truth of the demonstration run; raise InputFileError if it is missing."""
     return demo_files()["truth"]
 
 

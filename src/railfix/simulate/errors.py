@@ -26,7 +26,7 @@ from railfix.ranges.sbas.troposphere import rtca_mapping
 from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 
-_NODES_A_TIME: Final = 32  #: Nodes per correlation time.
+_NODES_A_TIME: Final = 32  #: Number of nodes per correlation time.
 #: Minimum number of nodes before the start of the run.
 _BEFORE: Final = 3
 #: Margins before and after the run [s], because clock biases shift instants beyond its start and end.
@@ -61,7 +61,7 @@ class Interpolated:
     def at(self, time_s: Floats) -> Floats:
         """Return the values, shape (T, C), at times after the start, shape (T,) [s].
 
-        Raise ValueError where a time is outside the run and its margins.
+        Raise ValueError if a time is outside the run and its margins.
         """
         a, b, c, d, u = self._place(time_s)
         return np.asarray(b + u / 2.0 * ((c - a) + u * (2.0 * a - 5.0 * b + 4.0 * c - d + u * (3.0 * (b - c) + d - a))))
@@ -86,8 +86,8 @@ def node_count(duration_s: float, spacing_s: float) -> int:
 class GaussMarkov(Interpolated):
     """Independent Gauss-Markov processes of first order, one per key, which is its seed.
 
-    `sigma` is the standard deviation and `time_s` the correlation time. A longer duration does not change the values of
-    a shorter one.
+    `sigma` is the standard deviation and `time_s` the correlation time. A longer duration does not change the values
+    within a shorter duration.
     """
 
     def __init__(self, keys: Sequence[Sequence[int]], *, sigma: float, time_s: float, duration_s: float) -> None:

@@ -72,7 +72,7 @@ class Gradient(ScenarioSettings):
 
 
 class Terrain(ScenarioSettings):
-    """Ranges of uniformly distributed properties of a generated line, from a chainage to that of the next terrain."""
+    """Ranges of uniformly distributed properties of a generated line, from `from_m` to the next terrain."""
 
     from_m: NotNegative = 0.0  #: Chainage at which this terrain begins.
     straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)  #: Range of the lengths of straights.
@@ -87,7 +87,7 @@ class GeneratedLine(ScenarioSettings):
     """Commercial line generated at random."""
 
     seed: Seed = 1  #: Seed of the line, separate from the seed of the run, so that several runs can share a line.
-    #: Speed of the equilibrium cant, which curves have up to `largest_cant_m`, in steps of 5 mm.
+    #: Speed for which the cant of a curve is the equilibrium cant, limited to `largest_cant_m` and rounded to 5 mm.
     speed_mps: Positive = 110.0 / 3.6
 
     largest_cant_m: NotNegative = 0.105
@@ -106,7 +106,7 @@ class GeneratedLine(ScenarioSettings):
 class LineFile(ScenarioSettings):
     """Track file used as the line."""
 
-    path: str  #: Path for `railfix.track.read_track`; in a scenario file relative to the folder of the scenario file.
+    path: str  #: Path for `railfix.track.read_track`; in a scenario file, relative to the file's folder.
     from_m: NotNegative = 0.0  #: Chainage of the file at which the line begins.
     to_m: float = Field(default=math.inf, allow_inf_nan=True)  #: Chainage of the file at which the line ends.
     crs: str = ""  #: Option of `read_track`; empty if the file states it.
@@ -142,13 +142,14 @@ class LineSettings(ScenarioSettings):
     longitude_deg: Finite = 135.45  #: Longitude of the first point; not used for a file.
     height_m: Finite = 162.0  #: Ellipsoidal height of the first point; not used for a file.
     azimuth_deg: Finite = 63.0  #: Azimuth of the line at its first point; not used for a file.
-    #: Kilometrage of the first point; it rises with chainage. Not used for a file, which has its own kilometrage.
+    #: Kilometrage of the first point; the kilometrage rises with chainage. Not used for a file, which has its own
+    #: kilometrage.
     kilometrage_start_m: Finite = 12_340.0
     straight_spacing_m: Positive = 20.0  #: Largest spacing of map points on straights; not used for a file.
     curve_spacing_m: Positive = 2.32  #: Largest spacing of map points in curves and transitions; not used for a file.
 
     elements: tuple[Element, ...] = ()
-    gradients: tuple[Gradient, ...] = ()  #: Gradients by rising chainage; without any the line is level.
+    gradients: tuple[Gradient, ...] = ()  #: Gradients by rising chainage; without gradients, the line is level.
     #: Length of the line. The pattern of 756 m is repeated, every second copy mirrored, and cut off at this length. The
     #: length of elements is their sum; for a file it must be NaN.
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
@@ -198,7 +199,10 @@ class Knots:
 
 
 def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
-    """Return the knots of a line of given elements; SettingsError where they do not fit together."""
+    """Return the knots of a line of given elements and gradients.
+
+    Raise SettingsError if elements that follow each other, or gradients, do not fit together.
+    """
     for k, (element, following) in enumerate(pairwise(elements)):
         both = {element.kind, following.kind}
         if both == {"transition"}:
@@ -220,7 +224,7 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
 def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, Floats]:
     """Return the chainages and gradients of the ends of the vertical curves, between which the gradient is linear.
 
-    Raise SettingsError where a vertical curve overlaps another or an end of the line.
+    Raise SettingsError if a vertical curve overlaps another or an end of the line.
     """
     places, values, reached, current = [0.0], [0.0], 0.0, 0.0
     for k, item in enumerate(gradients):
@@ -324,7 +328,7 @@ class FileLine:
 def line_of_file(settings: LineFile) -> FileLine:
     """Return the line through the points of a track file.
 
-    Raise InputFileError where there are fewer than four points, or a radius is below `_TIGHTEST_M`.
+    Raise InputFileError if there are fewer than four points, or a radius is below `_TIGHTEST_M`.
     """
     track = read_track(
         settings.path,

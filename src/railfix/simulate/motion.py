@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from railfix.simulate.scenario import Scenario
 
 
-_ROUNDS: Final = 20  #: Maximum number of rounds in which the averaging time is increased until the jerk is in limits.
+_ROUNDS: Final = 20  #: Maximum number of rounds that increase the averaging time until the jerk is within its limit.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class Motion:
     jerk_mps3: Floats | float = 0.0  #: Jerk of each piece, shape (P,) [m/s^3].
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the chainage [m] and speed [m/s] at times; before time 0 the values are those at 0."""
+        """Return the chainage [m] and speed [m/s] at times; before time 0, the chainage and speed at 0."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.maximum(np.searchsorted(self.time_s, time, side="right") - 1, 0)
         since = np.maximum(time - self.time_s[piece], 0.0)
@@ -56,7 +56,7 @@ class Motion:
         return chainage + jerk * since**3 / 6.0, speed + jerk * since**2 / 2.0
 
     def acceleration_at(self, time_s: ArrayLike) -> Floats:
-        """Return the acceleration along the line at times [m/s^2]; before time 0 it is 0."""
+        """Return the acceleration along the line at times [m/s^2]; 0 before time 0."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.searchsorted(self.time_s, time, side="right") - 1
         at = np.maximum(piece, 0)
@@ -69,7 +69,7 @@ class Motion:
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
     """Return a motion whose jerk is limited by averaging over a time T.
 
-    The speed becomes ``(s(t) - s(t - T)) / T``, which is delayed by T / 2 on average.
+    The speed becomes ``(s(t) - s(t - T)) / T`` with the chainage s, a delay of T / 2 on average.
     """
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3
@@ -102,7 +102,7 @@ def _breakpoints(start_s: Floats, duration_s: float) -> Floats:
 
 
 def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> Floats:
-    """Return the acceleration just after breakpoints less the acceleration a duration earlier [m/s^2]."""
+    """Return the acceleration just after breakpoints less the acceleration `duration_s` earlier [m/s^2]."""
     after = time_s + 1e-9
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
@@ -114,8 +114,8 @@ _RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelse
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
     """Return the motion of the middle of the vehicle: a shuttle, or a run curve if its settings are not the defaults.
 
-    The duration is that of the scenario unless given; with 0 the motion ends at the last stop of the first leg. Raise
-    SettingsError where the train does not fit on the line.
+    The motion covers `duration_s`, by default the duration of the scenario; with a duration of 0, the motion ends at
+    the last stop of the first leg. Raise SettingsError if the train does not fit on the line.
     """
     settings = scenario.run
     scenario.check_room(line.length_m)
@@ -131,7 +131,7 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Return the motion to and fro between two chainages, with a standstill at each, for at least a duration."""
+    """Return the motion to and fro between two chainages, with a standstill at each, for at least `duration_s`."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
@@ -154,7 +154,8 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
 
 
 def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, contact_m: float) -> Motion:
-    """Return the motion from stop to stop at the highest permitted speed, for at least a duration and to the last stop.
+    """Return the motion from stop to stop at the highest permitted speed, for at least `duration_s` and to the last
+    stop.
 
     `contact_m` is the distance between the contact points of a wheelset, which determines the speed in canted curves.
     """
@@ -216,7 +217,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
 
 
 def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_m: float) -> Floats:
-    """Return the highest permitted speed at chainages [m/s] by cruising speed, speed limits and cant deficiency."""
+    """Return the highest speed at chainages [m/s] that cruising speed, speed limits and cant deficiency permit."""
     limit = np.full(chainage_m.shape, settings.cruise_mps)
     for part in settings.limits:
         inside = (chainage_m >= part.from_m) & (chainage_m <= part.to_m)
@@ -296,7 +297,7 @@ def antenna_truth(
 
 
 FULL_SPEED_MPS: Final = 20.0  #: Speed from which the random motions of the body have their full amplitude [m/s].
-_STEP_S: Final = 0.01  #: Time step of the pitch response to accelerations [s].
+_STEP_S: Final = 0.01  #: Time step for the pitch response to accelerations [s].
 _DAMPING: Final = 0.3  #: Damping ratio of the suspension.
 _MARGIN_S: Final = 2.0  #: Margin before the start and after the end of the run for which pitch is computed [s].
 
@@ -327,7 +328,7 @@ class BodyMotion:
 
     @cached_property
     def _response(self) -> CubicSpline[np.float64]:
-        """Pitch by the acceleration of the train, the response of a damped oscillator with period `pitch_period_s`."""
+        """Pitch caused by acceleration [rad], as a function of time [s]: response of a damped oscillator."""
         from scipy.signal import cont2discrete, lfilter
 
         last = max(self._duration_s, float(self._motion.time_s[-1])) + _MARGIN_S

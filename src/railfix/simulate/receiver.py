@@ -31,7 +31,9 @@ class CarriedNoise:
         self._cn0 = _FirstOrder((*key, 1), channels, interval_s / settings.cn0_wander_time_s)
 
     def code(self, white: Floats) -> Floats:
-        """Return code noise of standard deviation 1, shape (T, M); `white` is its uncorrelated part, shape (T, M)."""
+        """Return code noise of standard deviation 1, shape (T, M); `white` is white noise for its uncorrelated part,
+        (T, M).
+        """
         share = self._settings.code_correlated_share
         if share == 0.0:
             return white
@@ -60,7 +62,7 @@ class _FirstOrder:
 class CodeSmoothing:
     """Low-pass filter of code errors: ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``.
 
-    The filter restarts at each lock. With a time constant of 0 errors are not filtered.
+    The filter restarts at each lock. With a time constant of 0, errors are not filtered.
     """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
@@ -90,7 +92,8 @@ class LockState:
     """Lock state of the channels of a receiver over T epochs."""
 
     lost: Masks  #: Whether the signal is not tracked, shape (T, M).
-    slip_cycles: Floats | float  #: Whole cycles by which the phase has slipped since the start, shape (T, M).
+    #: Whole cycles by which the phase has slipped since the start, shape (T, M); 0.0 without simulated slips.
+    slip_cycles: Floats | float
     loss_of_lock: Bytes  #: Loss-of-lock indicator; bit 0 is set at the first epoch after a loss; shape (T, M).
 
 
@@ -101,7 +104,8 @@ class TrackingNoise:
         self._settings = settings
         self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
         self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
-        # Epochs since the last epoch at which the signal was not trackable; before the start it is assumed trackable.
+        # Epochs since the last epoch at which the signal was not trackable; before the start, the signal is assumed
+        # trackable.
         self._since = np.full(channels, self._wait + 1, dtype=np.int64)
         self._seen = np.zeros(channels, dtype=np.bool_)
         self._present = np.zeros(channels, dtype=np.bool_)
@@ -109,14 +113,14 @@ class TrackingNoise:
         self._weak = np.zeros(channels, dtype=np.bool_)
 
     def too_weak(self, cn0_dbhz: Floats) -> Masks:
-        """Return whether signals are below the threshold, or have not reached the re-acquisition C/N0 since, (T, M)."""
+        """Return whether signals are below the threshold or have not reached the re-acquisition C/N0 again, (T, M)."""
         threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
         if threshold is None:
             return np.zeros(cn0_dbhz.shape, dtype=np.bool_)
         weak = cn0_dbhz < threshold
         if again is None:
             return np.asarray(weak)
-        # The later of both events determines the state; without an event the state before the first epoch remains.
+        # The later of both events determines the state; without an event, the state before the first epoch remains.
         epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
         fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
         risen = np.maximum.accumulate(

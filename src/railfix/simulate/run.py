@@ -25,14 +25,14 @@ from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
-#: Prefixes of settings of which the README lists only non-default values.
+#: Prefixes of the names of settings that the README lists only if they have non-default values.
 _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
 
 
 def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
     """Return the text of the README of a run.
 
-    `files` are the paths by name that `write_run` returns, `command` is the command that made them, or blank.
+    `files` are the paths by name that `write_run` returns, `command` is the command that created the files, or empty.
     """
     scenario = simulation.scenario
     made = f"Made by `{command}`.\n" if command else "Made by `railfix.simulate.write_run`.\n"
@@ -65,8 +65,8 @@ that applies the same models corrects the delays exactly, unless a scale in the 
 def _list_inventions(scenario: Scenario) -> str:
     if scenario.line.kind != "file" and not scenario.sky.nav:
         return "Everything in this folder is simulated: no such line, train or satellite exists."
-    line = "the line is that of a track file" if scenario.line.kind == "file" else "no such line exists"
-    sky = "the satellites are those of a navigation file" if scenario.sky.nav else "no such satellites exist"
+    line = "the line is from a track file" if scenario.line.kind == "file" else "no such line exists"
+    sky = "the satellites are from a navigation file" if scenario.sky.nav else "no such satellites exist"
     return f"The train and all measurements in this folder are simulated; {line}, {sky}."
 
 
@@ -132,7 +132,7 @@ def _list_effects(scenario: Scenario) -> str:
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:
-    """Return the settings of a scenario by dotted name; of the groups `_SHORT` only non-default settings."""
+    """Return the settings of a scenario by dotted name; of the groups `_SHORT`, only non-default settings."""
     usual = Scenario(sensors=None).describe()
     table = {}
     for name, value in scenario.describe().items():
@@ -201,7 +201,7 @@ def write_run(
     overwrite: Overwrite = "refuse",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run and write its files, which appear together when all are written; return their paths by name.
+    """Simulate a run, write its files, which appear together when all are written, and return their paths by name.
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx if plain)
@@ -217,11 +217,11 @@ def write_run(
     README.md                    contents and settings of the run
     ============================ ===================================================
 
-    With `packing` "plain" no file is compressed, and the tables of sensors are CSV files. `command` is the command that
-    the README names. `progress` is called with the receiver and the number of epochs written since the last call. The
-    names of the paths are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the
-    names of reference stations and sensor tables, ``scenario`` and ``readme``. Raise SettingsError where the scenario
-    is invalid, OutputError where a file cannot be written.
+    With `packing` "plain", no file is compressed, and the tables of sensors are CSV files. `command` is the command
+    that the README names. `progress` is called with the receiver and the number of epochs written since the last call.
+    The names of the paths are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``,
+    the names of reference stations and sensor tables, ``scenario`` and ``readme``. Raise SettingsError if the scenario
+    is invalid, and OutputError if a file cannot be written.
     """
     check_type(scenario, Scenario, "scenario")
     simulation = Simulation(scenario)

@@ -40,7 +40,7 @@ DEGRADATION: Final = {
 def message(kind: int, second: int, *fields: Field) -> Bytes:
     """Return a message of type `kind` with its parity, as bytes of shape (32,).
 
-    The fields (value, length in bits) begin at bit 14. Raise ValueError where a value does not fit its length.
+    The fields (value, length in bits) begin at bit 14. Raise ValueError if a value does not fit its length.
     """
     return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
@@ -48,7 +48,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
     """Return a message with its parity, shape (32,), from its first bits as text and its fields (value, length).
 
-    Raise ValueError where a value does not fit its length, or the message is too long.
+    Raise ValueError if a value does not fit its length, or the message is too long.
     """
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
@@ -61,7 +61,7 @@ def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
 
 
 def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
-    """Return a type 1 message, the PRN mask, of the satellites with the given numbers in the mask."""
+    """Return a type 1 message, the PRN mask, with the satellites of the given numbers (1 to 210)."""
     return message(1, second, *((int(i in numbers), 1) for i in range(1, 211)), (iodp, 2))
 
 
@@ -75,13 +75,13 @@ def fast(
 
 
 def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0, 0)) -> Bytes:
-    """Return a type 6 message, integrity information, with the UDREI of all slots; remaining slots not monitored."""
+    """Return a type 6 message, integrity, with the UDREI of the first slots; the others are not monitored."""
     grades = list(udrei) + [NOT_MONITORED] * (51 - len(udrei))
     return message(6, second, *((i, 2) for i in iodf), *((g, 4) for g in grades))
 
 
 def factors(second: int, indicator: Sequence[int], *, latency: int = 0) -> Bytes:
-    """Return a type 7 message, fast-correction degradation, with the degradation indicators of all slots."""
+    """Return a type 7 message with the fast-correction degradation indicators of the first slots; 0 for the others."""
     values = list(indicator) + [0] * (51 - len(indicator))
     return message(7, second, (latency, 4), (0, 4), *((v, 4) for v in values))
 
@@ -133,7 +133,7 @@ def grid_delay(
 ) -> Bytes:
     """Return a type 26 message, vertical grid delays [m] with GIVEI; remaining points are not monitored.
 
-    A delay of 63.875 m means do not use.
+    A delay of 63.875 m means "do not use".
     """
     raw = [round(v / STEP_M) for v in delay] + [0] * (15 - len(delay))
     grades = list(givei) + [NO_DELAY] * (15 - len(givei))
@@ -157,8 +157,8 @@ class Service:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # The mask has all satellites, not only those in view of the train. The errors are those of the train's signals,
-        # because the errors of a satellite do not depend on the other satellites.
+        # The mask has all satellites, not only those in view of the train. Their errors equal the errors of the train's
+        # signals, because the errors of a satellite do not depend on the other satellites.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
@@ -168,21 +168,21 @@ class Service:
 
     @staticmethod
     def slot(name: str) -> int:
-        """Return the number of a satellite in the mask, 0 for a satellite without corrections (all except GPS)."""
+        """Return the number of a satellite in the mask; 0 for a satellite without corrections (all except GPS)."""
         return int(name[1:]) if name[0] == "G" else 0
 
     def _instant(self, second: float) -> Floats:
-        """Return the time of validity of the corrections sent at a second [s]; before the start of the run it is 0."""
+        """Return the time of validity of the corrections sent at a second [s], limited to the duration of the run."""
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:
-        """Return the fast corrections of `satellites` [m], which are clock errors less group-delay errors of L1 C/A."""
+        """Return the fast corrections of `satellites` [m]: clock less group-delay errors of L1 C/A, plus noise."""
         clock = self._errors.clock_error_m(self._instant(second))[0]
         noise = self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(self.satellites))
         return np.asarray(np.clip(clock - self._group_delay_m + noise, -_LARGEST_FAST_M, _LARGEST_FAST_M))
 
     def indicators(self, second: float) -> list[int]:
-        """Return the UDREI (L5: DFREI) of `satellites`: the value of the settings, or do not use during a fault."""
+        """Return the UDREI (DFREI on L5) of `satellites`: the value of the settings, or "do not use" during a fault."""
         settings = self._settings
         usual = settings.udrei if settings.band == "L1" else settings.dfrei
         at = self._instant(second - settings.alert_s + settings.latency_s)
@@ -222,7 +222,7 @@ class Service:
         return bands
 
     def delays_m(self, second: float, points: list[tuple[int, float, float]]) -> list[float]:
-        """Return the vertical delays of grid points [m], the sum of model and error of the simulated ionosphere."""
+        """Return the vertical delays on L1 at grid points [m], model plus error of the simulated ionosphere."""
         at = self._instant(second)
         latitude, longitude = (np.array([point[k] for point in points]) for k in (1, 2))
         time = self._start + timedelta(at)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def message(kind: int, second: int, *fields: Field) -> Bytes:
     """Return an L5 message of type `kind` with its parity, as bytes of shape (32,).
 
-    The fields (value, length in bits) begin at bit 10. Raise ValueError where a value does not fit its length.
+    The fields (value, length in bits) begin at bit 10. Raise ValueError if a value does not fit its length.
     """
     return pack_message(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
 
@@ -53,7 +53,7 @@ def correction(
 ) -> Bytes:
     """Return a type 32 message, the correction of one satellite.
 
-    `moved` are the corrections of position and clock [m], `rates` their rates [m/s]. `covariance` has the scale
+    `moved` has the corrections of position and clock [m], `rates` their rates [m/s]. `covariance` has the scale
     exponent and the upper triangular factor in units of 2^(exponent - 5).
     """
     exponent, factor = covariance
@@ -71,7 +71,7 @@ def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm:
     """Return a type 34 message, changes of the DFREI of the satellites in the mask.
 
     `change` is, for each satellite, 0 for no change, 1 for the next value of `dfrei`, 2 for an increase by one, and 3
-    for do not use.
+    for "do not use".
     """
     every = [*change, *([0] * (AUGMENTED - len(change)))]
     grades = [*dfrei, *([0] * (7 - len(dfrei)))]
@@ -79,7 +79,7 @@ def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm:
 
 
 def integrity(second: int, dfrei: Sequence[int], *, kind: int = 35, iodm: int = 0) -> Bytes:
-    """Return a message of type 35 or 36, the DFREI of the first 53 satellites in the mask, or of the others."""
+    """Return a message of type 35, the DFREI of the first 53 satellites in the mask, or of type 36, for the others."""
     count = 53 if kind == 35 else 39
     fields = [(grade, 4) for grade in [*dfrei, *([15] * (count - len(dfrei)))]]
     return message(kind, second, *fields, (0, 2 if kind == 35 else 58), (iodm, 2))
@@ -95,8 +95,8 @@ def parameters(
 ) -> Bytes:
     """Return a type 37 message, degradation parameters that are equal for all constellations.
 
-    `valid_s` is the validity of corrections, `degradation` their interval [s], step [m] and rate [m/s], and `scale` the
-    code of the DFREI scale.
+    `valid_s` is the time for which corrections are valid, `covariance` the covariance parameter, `degradation` the
+    interval [s], step [m] and rate [m/s] of the degradation, and `scale` the code of the DFREI scale.
     """
     interval, step, rate = degradation
     each = [(round(interval / 6.0) - 5, 5), (round(step / 0.01), 8), (round(rate / 0.0002), 8)]
@@ -117,13 +117,14 @@ class SimulatedDfmc(Service):
 
     @staticmethod
     def slot(name: str) -> int:
-        """Return the slot of a satellite in the mask, 0 for a satellite without a slot."""
+        """Return the slot of a satellite in the mask; 0 for a satellite without a slot."""
         return SLOT_OF.get(name, 0)
 
     def clocks_m(self, second: float) -> Floats:
         """Return the clock corrections for ionosphere-free codes [m].
 
-        They refer to GPS codes without group-delay correction, and to the clocks of Galileo F/NAV and BeiDou B-CNAV1.
+        The corrections refer to GPS codes without group-delay correction, and to the clocks of Galileo F/NAV and BeiDou
+        B-CNAV1.
         """
         names, at = self.satellites, self._instant(second)
         first, other = (
@@ -141,7 +142,7 @@ class SimulatedDfmc(Service):
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 35 and 36 as functions of the second and of an issue, which they do not use."""
+        """Return the messages of types 35 and 36 as functions of the second and of an issue, which has no effect."""
 
         def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
             return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)
@@ -174,11 +175,11 @@ LOST: Final = 53  #: Stream of random numbers: lost messages.
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
     """Return the SBAS messages of a run, one per second, from `lead_s` before its start to its end.
 
-    On L1 the fast corrections of all satellites (types 2 to 5, 24) are sent every 6 s, and between them, in turn, the
-    masks, long-term corrections, grid delays, degradation and integrity. The corrections cancel the errors that
+    On L1, the fast corrections of all satellites (types 2 to 5, 24) are sent every 6 s; between them follow, in turn,
+    the masks, long-term corrections, grid delays, degradation and integrity. The corrections cancel the errors that
     `Scenario.errors` adds to clocks, group delays, orbits and ionosphere of GPS, within the resolution of the messages
-    (0.125 m). On L5 integrity (types 35, 36) is sent every 6 s, and between them mask, degradation and the corrections
-    of GPS, Galileo and BeiDou. Messages are lost with the probability `lost_chance`.
+    (0.125 m). On L5, integrity (types 35, 36) is sent every 6 s; between these messages follow, in turn, mask,
+    degradation and the corrections of GPS, Galileo and BeiDou. Messages are lost with the probability `lost_chance`.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario
@@ -215,7 +216,10 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
 
 
 def write_sbas(messages: SbasMessages, path: FilePath) -> None:
-    """Write messages in RTKLIB's .sbs format, which `railfix run --sbas` reads; OutputError if that fails."""
+    """Write messages in RTKLIB's .sbs format, which `railfix run --sbas` reads.
+
+    Raise OutputError if the file cannot be written.
+    """
     lines, digits = [], 58 if messages.band == "L1" else 63  # RTKLIB's format for L1 has no parity
     for time, prn, kind, bits in zip(messages.time, messages.prn, messages.type, messages.bits, strict=True):
         week, tow = to_week(time)

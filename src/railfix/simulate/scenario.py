@@ -59,10 +59,10 @@ class RunSettings(ScenarioSettings):
     acceleration_mps2: Positive = 0.7
     deceleration_mps2: Positive = 0.8
     first_stand_s: NotNegative = 15.0  #: Duration of the standstill at the start of the run.
-    stand_s: NotNegative = 10.0  #: Duration of the standstill at an end of the line without a station.
+    stand_s: NotNegative = 10.0  #: Duration of the standstill at each end of the line, if no stations are given.
     #: Distance between the end of the line and the middle of the vehicle where the train reverses.
     end_margin_m: NotNegative = 20.0
-    #: Stops by rising chainage, including the first and the last; without stations the train runs from end to end.
+    #: Stops by rising chainage, including the first and the last; without stations, the train runs from end to end.
     stations: tuple[Station, ...] = ()
 
     limits: tuple[SpeedLimit, ...] = ()
@@ -111,14 +111,15 @@ class SkySettings(ScenarioSettings):
     """Satellites and atmosphere."""
 
     #: Letters of the constellations: G (30 satellites in 6 planes), J (3 inclined geosynchronous, 1 geostationary), E
-    #: (24 in 3 planes), C (24 in 3 planes, 3 inclined geosynchronous); with `nav`, constellations used from the file.
+    #: (24 in 3 planes), C (24 in 3 planes, 3 inclined geosynchronous); with `nav`, the constellations that are used
+    #: from the file.
     systems: str = "GJE"
-    #: RINEX navigation file, used instead of simulated satellites; in a scenario file relative to the file's folder.
+    #: RINEX navigation file, used instead of simulated satellites; in a scenario file, relative to the file's folder.
     nav: str | None = None
     cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
     #: Satellites whose records are unhealthy, except for the record before the run.
     unhealthy: tuple[str, ...] = ("G02",)
-    #: Largest number of tracked satellites, those with the highest elevation at each epoch; None for no limit.
+    #: Largest number of tracked satellites at an epoch, the highest in the sky; None for no limit.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
     ionosphere_scale: NotNegative = 1.0  #: Ionospheric delay as a multiple of the model; 1 leaves no residual error.
     troposphere_scale: NotNegative = 1.0  #: Tropospheric delay as a multiple of the model; 1 leaves no residual error.
@@ -144,23 +145,29 @@ class ReceiverSettings(ScenarioSettings):
     sin(elevation)`` with the C/N0 that is written.
     """
 
-    signals_per_satellite: Literal[1, 2] = 1  #: Number of signals, each with code, phase, Doppler and C/N0.
-    #: Second signals. L2: L2C, E5b and B3I; L5: L5, E5a and B2a, with B1C and B-CNAV1 instead of B1I and D1.
+    #: Number of signals of a satellite, each with code, phase, Doppler and C/N0.
+    signals_per_satellite: Literal[1, 2] = 1
+    #: Second signals: "L2" stands for L2C, E5b and B3I, "L5" for L5, E5a and B2a, with B1C and B-CNAV1 instead of B1I
+    #: and D1.
     second: Literal["L2", "L5"] = "L2"
     code_sigma_m: NotNegative = 0.5  #: Standard deviation of the code noise at 45 dB-Hz in the zenith.
     phase_sigma_m: NotNegative = 0.002  #: Standard deviation of the carrier-phase noise.
     doppler_sigma_hz: NotNegative = 0.05  #: Standard deviation of the Doppler noise.
     cn0_sigma_dbhz: NotNegative = 0.7  #: Standard deviation of the C/N0 noise.
-    #: Time constant of the low-pass filter of the code's multipath error while locked, as with carrier smoothing.
+    #: Time constant of the low-pass filter of the code's multipath error while locked, as with carrier smoothing; 0 for
+    #: none.
     code_smoothing_s: NotNegative = 0.0
     cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ  #: C/N0 of an unobstructed signal at the horizon.
     cn0_rise_db: Finite = CN0_RISE_DB  #: Increase of C/N0 to the zenith, proportional to the sine of the elevation.
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
     clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers share one hardware clock.
-    #: Clock bias of the front receiver at the start; separate clocks of other receivers are fixed multiples of it.
+    #: Clock bias of the front receiver at the start; separate clocks of other receivers have fixed multiples of this
+    #: bias.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
-    clock_drift: Finite = 2.0e-7  #: Clock drift of the front receiver [s/s], with multiples as for the bias.
-    #: "millisecond": a clock bias above half a millisecond is reduced by a whole millisecond.
+    #: Clock drift of the front receiver [s/s]; other receivers have multiples, as for the bias.
+    clock_drift: Finite = 2.0e-7
+    #: With "millisecond", the receivers step their clocks by whole milliseconds, so that the bias stays within half a
+    #: millisecond.
     clock_steps: Literal["none", "millisecond"] = "none"
 
     @property
@@ -172,7 +179,7 @@ class ReceiverSettings(ScenarioSettings):
 class ReferenceStation(ScenarioSettings):
     """Receiver near the line under an open sky, with its own clock and noise."""
 
-    #: Name of the station and of its log: lower-case letters, digits and hyphens.
+    #: Name of the station and of its log: a lower-case letter, then lower-case letters, digits and hyphens.
     name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")
     chainage_m: Finite = 0.0
     lateral_m: Finite = 50.0  #: Distance to the right of the track axis.
@@ -183,7 +190,7 @@ class ReferenceStation(ScenarioSettings):
 class Scenario(ScenarioSettings):
     """Settings of one simulated run."""
 
-    seed: Seed = 20_240_305  #: Seed of all random numbers except those of the line and the structures along it.
+    seed: Seed = 20_240_305  #: Seed of all random numbers except for the line and the structures along it.
     start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")  #: First time tag, GPS time.
     duration_s: float = Field(default=200.0, gt=0.0, le=LONGEST_S)
     rate_hz: float = Field(default=10.0, gt=0.0, le=1000.0)  #: Epochs per second; 1 / rate is a multiple of 100 ns.
@@ -228,7 +235,7 @@ class Scenario(ScenarioSettings):
         return self
 
     def check_room(self, length_m: float) -> None:
-        """Raise SettingsError where the vehicle or a station is beyond an end of a line of the given length [m]."""
+        """Raise SettingsError if the vehicle or a station is beyond an end of a line of the given length [m]."""
         if problem := self._room_problem(length_m):
             raise SettingsError(problem)
 

@@ -1,6 +1,6 @@
 """Scenario files in TOML: the settings of `Scenario` for one run, or a recipe of several runs.
 
-With ``duration_s = "run"`` the run ends at the end of the last stop. A recipe names a base, which is another file in
+With ``duration_s = "run"``, the run ends at the end of the last stop. A recipe names a base, which is another file in
 its folder or a shipped scenario, and the settings of each run that differ from the base::
 
     description = "two runs"
@@ -50,13 +50,13 @@ class Recipe:
 
     path: Path
     description: str
-    names: tuple[str, ...]  #: Names of the runs; one empty name if the file is not a recipe.
+    names: tuple[str, ...]  #: Names of the runs; a single empty name if the file is not a recipe.
     tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, with absolute paths.
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
-        """Return the scenario of a run, counted from 0; the settings `changes` override those of the file.
+        """Return the scenario of a run, counted from 0; the settings `changes` override the settings of the file.
 
-        Raise SettingsError where a setting is misspelt, of the wrong type, or out of range; InputFileError where the
+        Raise SettingsError if a setting is misspelt, of the wrong type, or out of range, and InputFileError if the
         duration depends on a track file that cannot be read.
         """
         table = _over(self.tables[number], changes or {})
@@ -91,7 +91,7 @@ def list_scenarios() -> dict[str, Path]:
 def find_scenario(name: FilePath) -> Path:
     """Return the path of a scenario file, given by its path or as the name of a shipped scenario.
 
-    Raise InputFileError where the name is neither.
+    Raise InputFileError if the name is neither.
     """
     shipped, path = list_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
@@ -104,7 +104,7 @@ def find_scenario(name: FilePath) -> Path:
 def load_recipe(name: FilePath) -> Recipe:
     """Read a scenario file of one or several runs, given by its path or as the name of a shipped scenario.
 
-    Raise InputFileError where the file is missing, unreadable, or not TOML; SettingsError where a recipe is invalid
+    Raise InputFileError if the file is missing, unreadable, or not TOML, and SettingsError if a recipe is invalid
     (repeated names, unknown keys). The settings of a run are checked by `Recipe.scenario`.
     """
     check_path(name, what="a path or the name of a shipped scenario")
@@ -142,7 +142,7 @@ def load_recipe(name: FilePath) -> Recipe:
 def _run_table(
     base: Mapping[str, Any], run: Mapping[str, Any], parts: Mapping[str, Any], path: Path
 ) -> Mapping[str, Any]:
-    """Return the settings of one of [[runs]]: the base, overridden by the parts that it names, then by its settings."""
+    """Return the settings of a run: the base, overridden by the parts that the run names, then by its own settings."""
     for name in run.get("parts", []):
         if not isinstance(parts.get(name), dict):
             raise SettingsError(f"{path}: parts has no table {name!r}; it has {', '.join(parts) or 'none'}")
@@ -153,8 +153,8 @@ def _run_table(
 def load_scenario(name: FilePath) -> Scenario:
     """Read the scenario of a file with one run, given by its path or as the name of a shipped scenario.
 
-    Raise InputFileError where the file is missing, unreadable, or not TOML; SettingsError where a setting is misspelt,
-    of the wrong type, or out of range, or the file has several runs.
+    Raise InputFileError if the file is missing, unreadable, or not TOML, and SettingsError if a setting is misspelt, of
+    the wrong type, or out of range, or the file has several runs.
     """
     recipe = load_recipe(name)
     if recipe.names[0]:

@@ -23,7 +23,7 @@ _STEP_S = 0.1  #: Spacing of the instants between which the passing of a balise 
 
 
 def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Balise, ...]:
-    """Return the balises of the settings, and the balises at a spacing of `spacing_m`, in order of chainage."""
+    """Return the given balises, and further balises at a spacing of `spacing_m`, in order of chainage."""
     length = float(simulation.line.point_chainage_m()[-1])
     spaced = np.arange(settings.spacing_m, length, settings.spacing_m) if settings.spacing_m else np.empty(0)
     drawn = [Balise(name=f"B{k + 1:03d}", chainage_m=at) for k, at in enumerate(spaced.tolist())]
@@ -43,7 +43,8 @@ def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.Da
 def balise_tables(simulation: Simulation, settings: BaliseSettings) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return the readings, and the ground truth of all passings, see `railfix.simulate.sensor_columns.COLUMNS`.
 
-    Errors, missed readings and wrong identities are drawn once per balise, so every passing of a balise has the same.
+    Errors, missed readings and wrong identities are drawn once per balise, so that they are the same at every passing
+    of a balise.
     """
     scenario, balises = simulation.scenario, balises_along(simulation, settings)
     time = np.arange(0.0, scenario.duration_s + 1e-9, _STEP_S)
@@ -105,7 +106,7 @@ def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame
 
 
 def dropouts(settings: RadarSettings, seed: int, duration_s: float) -> list[tuple[float, float]]:
-    """Return start and end of each interval without a measurement [s], first the given, then the drawn intervals."""
+    """Return start and end of each interval without a measurement [s]: the given, then random intervals."""
     found = [(d.start_s, d.end_s) for d in settings.dropouts]
     if settings.dropouts_per_hour > 0.0:
         rng = np.random.default_rng([seed, _DROPOUTS])
@@ -229,7 +230,7 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
 
 
 def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
-    """Return the tables of the sensors in `Scenario.sensors` by name; empty where it is None.
+    """Return the tables of the sensors in `Scenario.sensors` by name; empty if it is None.
 
     The tables are ``tachometer`` and ``wheel_slips`` (ground truth), ``inertial``, ``radar``, ``ranging`` and
     ``ranging_units``, ``balises``, ``balise_list`` and ``balise_truth`` (ground truth), with the columns `COLUMNS`;

@@ -39,7 +39,10 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 def beyond_start(to_m: float, info: ValidationInfo) -> float:
-    """Return the end of a part of the line; ValueError where it is not beyond the start `from_m`."""
+    """Return the end of a part of the line.
+
+    Raise ValueError if the end is not beyond the start `from_m`.
+    """
     if to_m <= info.data.get("from_m", -np.inf):
         raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
     return to_m
@@ -62,7 +65,10 @@ AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 
 def _gps_time(value: Any) -> np.datetime64:
-    """Return the GPS time of a TOML time, a text or a datetime64; ValueError for other values."""
+    """Return the GPS time of a TOML time, a text or a datetime64.
+
+    Raise ValueError for other values.
+    """
     with suppress(ValueError):
         if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
             return time
@@ -95,7 +101,8 @@ class Interval(ScenarioSettings):
     """Time interval within a run."""
 
     start_s: Finite  #: Time after the start of the run.
-    end_s: Annotated[float, Field(allow_inf_nan=False)] | None = None  #: Time after the start; None for the end.
+    #: Time after the start of the run; None for the end of the run.
+    end_s: Annotated[float, Field(allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
     def _forward(self) -> Interval:
@@ -160,7 +167,7 @@ class InterSystemSettings(ScenarioSettings):
 
     offset_m: Finite = 0.0  #: Inter-system bias at the start of the run.
     drift_mps: Finite = 0.0  #: Drift of the inter-system bias.
-    #: Bias of the rear receiver less that of the front receiver, with common and with separate clocks.
+    #: Bias of the rear receiver less the bias of the front receiver, with common and with separate clocks.
     rear_difference_m: Finite = 0.0
 
 
@@ -172,9 +179,9 @@ class NoiseSettings(ScenarioSettings):
     code_correlation_time_s: Positive = 1.0
     #: Standard deviation of the Gauss-Markov variation of C/N0, independent for each channel.
     cn0_wander_sigma_db: NotNegative = 0.0
-    cn0_wander_time_s: Positive = 10.0  #: Correlation time of this variation.
+    cn0_wander_time_s: Positive = 10.0  #: Correlation time of the C/N0 variation.
     #: Observables whose noise depends on C/N0: only codes, or also phase and Doppler, by the same law (10 times the
-    #: noise at 20 dB less; the sigmas of `ReceiverSettings` are those at 45 dB-Hz).
+    #: noise at a C/N0 20 dB lower; the sigmas of `ReceiverSettings` refer to 45 dB-Hz).
     weak_signals: Literal["code", "all"] = "code"
 
 
@@ -185,8 +192,8 @@ class TrackingSettings(ScenarioSettings):
     #: C/N0 from which a signal lost by its C/N0 is trackable again; None for `threshold_dbhz`.
     reacquisition_dbhz: NotNegative | None = None
     reacquisition_s: NotNegative = 0.0  #: Time for which a lost signal remains absent after it is trackable again.
-    #: "after_loss": after a loss the phase has another number of whole cycles, and bit 0 of the loss-of-lock indicator
-    #: is set at its first epoch.
+    #: With "after_loss", the phase changes by a random number of whole cycles at each loss of lock, and bit 0 of the
+    #: loss-of-lock indicator is set at the first epoch after the loss.
     slips: Literal["none", "after_loss"] = "none"
 
 
@@ -221,10 +228,11 @@ class DrawnSlips(ScenarioSettings):
 
     slip_chance: Share = 0.0  #: Probability of a slip in each acceleration phase of the run.
     slide_chance: Share = 0.0  #: Probability of a slide in each braking phase of the run.
-    #: Largest magnitude of the ratio of `SlipInterval`; ratios are uniform between a fifth of it and the full value.
+    #: Largest magnitude of the ratio of `SlipInterval`; ratios are uniformly distributed between a fifth of this value
+    #: and the full value.
     ratio: Share = 0.3
-    #: Largest duration; durations are uniform between a fifth of it and the full value, at most the duration of the
-    #: phase.
+    #: Largest duration; durations are uniformly distributed between a fifth of this value and the full value, and at
+    #: most the duration of the phase.
     duration_s: Positive = 3.0
 
 
@@ -236,7 +244,7 @@ class TachometerSettings(ScenarioSettings):
     diameter_error_m: Finite = 0.0  #: True minus nominal wheel diameter.
     resolution_s: NotNegative = 0.0  #: Resolution of the pulse times; 0 for one nanosecond.
     jitter_s: NotNegative = 0.0  #: Standard deviation of the white noise of the pulse times.
-    lowest_mps: NotNegative = 0.0  #: Speed of the wheel below which there are no pulses.
+    lowest_mps: NotNegative = 0.0  #: Speed of the wheel below which no pulses are sent.
     #: Standard deviation of the position errors of the teeth, as a fraction of their spacing; equal in every turn.
     tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
     lost_chance: Share = 0.0  #: Probability that a pulse is not detected.
@@ -274,7 +282,8 @@ class InertialSettings(ScenarioSettings):
     #: Standard deviation of the Gauss-Markov part of each gyroscope bias.
     gyro_drift_sigma_radps: NotNegative = 0.0
     gyro_drift_time_s: Positive = 1000.0  #: Correlation time of the gyroscope biases.
-    gyro_drift_walk_radps_per_sqrt_s: NotNegative = 0.0  #: Random walk of each gyroscope bias, from 0 at the start.
+    #: Standard deviation of the random walk of each gyroscope bias after one second, from 0 at the start.
+    gyro_drift_walk_radps_per_sqrt_s: NotNegative = 0.0
     velocity_walk_mps_per_sqrt_s: NotNegative = 0.0  #: White noise of the accelerometers, as velocity random walk.
     angle_walk_rad_per_sqrt_s: NotNegative = 0.0  #: White noise of the gyroscopes, as angle random walk.
     accel_scale: Three = (0.0, 0.0, 0.0)  #: Scale-factor errors of the accelerometers, measured / true - 1.
@@ -304,15 +313,15 @@ class RadarSettings(ScenarioSettings):
     bias_mps: Finite = 0.0
     scale: Finite = 0.0  #: Scale-factor error, measured / true - 1, as caused by an error of the mounting angle.
     noise_sigma_mps: NotNegative = 0.0  #: Standard deviation of the white noise.
-    #: Standard deviation of the Gauss-Markov part of the scale-factor error, as caused by pitching of the body.
+    #: Standard deviation of the Gauss-Markov part of the scale-factor error, which pitching of the body causes.
     sway_ratio_sigma: NotNegative = 0.0
-    sway_time_s: Positive = 0.5  #: Correlation time of this part.
+    sway_time_s: Positive = 0.5  #: Correlation time of the Gauss-Markov part.
     lowest_mps: NotNegative = 0.0  #: Lowest speed that is measured.
     highest_mps: Positive = 200.0 / 3.6  #: Highest speed that is measured.
 
     dropouts: tuple[Dropout, ...] = ()  #: Given dropouts.
     dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts, with exponentially distributed intervals.
-    dropout_duration_s: Positive = 5.0  #: Mean of their exponentially distributed durations.
+    dropout_duration_s: Positive = 5.0  #: Mean of the exponentially distributed durations of random dropouts.
 
 
 class GroundUnit(ScenarioSettings):
@@ -322,7 +331,7 @@ class GroundUnit(ScenarioSettings):
     chainage_m: Finite
     lateral_m: Finite = 3.0  #: Distance to the right of the track axis.
     height_m: Finite = 3.0  #: Height above the rails.
-    delay_bias_m: Finite = 0.0  #: Range error by the error of the constant response delay.
+    delay_bias_m: Finite = 0.0  #: Range error caused by an error of the constant response delay.
 
 
 class RangingSettings(ScenarioSettings):
@@ -337,7 +346,7 @@ class RangingSettings(ScenarioSettings):
     noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the white noise.
     #: Standard deviation of the multipath error, which is constant and independent in each cell along the line.
     multipath_sigma_m: NotNegative = 0.0
-    multipath_cell_m: Positive = 0.25  #: Length of a cell.
+    multipath_cell_m: Positive = 0.25  #: Length of a cell of constant multipath error.
     echo_chance: Share = 0.0  #: Fraction of the cells in which an echo is measured instead of the direct path.
     echo_delay_m: NotNegative = 0.8  #: Mean of the exponentially distributed excess path of an echo.
     lost_chance: Share = 0.0  #: Probability that a response is lost.
@@ -373,7 +382,7 @@ class BaliseSettings(ScenarioSettings):
 
 
 class SensorSettings(ScenarioSettings):
-    """On-board sensors; None for no sensor of a kind."""
+    """On-board sensors; None means that the vehicle has no such sensor."""
 
     tachometer: TachometerSettings | None = TachometerSettings()
     inertial: InertialSettings | None = InertialSettings()
@@ -396,8 +405,8 @@ class SbasSettings(ScenarioSettings):
     delay_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each grid delay.
     #: Largest difference in latitude and in longitude between a grid point in the mask and the start of the line.
     grid_radius_deg: Positive = 25.0
-    alert_m: Positive = 10.0  #: Range error by a fault above which a satellite is set to "do not use".
-    alert_s: NotNegative = 6.0  #: Delay of this alert.
+    alert_m: Positive = 10.0  #: Range error of a faulty satellite above which the satellite is set to "do not use".
+    alert_s: NotNegative = 6.0  #: Time from the fault to its "do not use" alert.
     lost_chance: Share = 0.0  #: Probability that a message is not received.
     #: Time by which the messages begin before the run, so that all corrections are available at its start.
     lead_s: NotNegative = 300.0

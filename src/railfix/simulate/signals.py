@@ -1,8 +1,8 @@
 """Simulated observations of all receivers, composed of ranges, clocks, delays, errors and noise.
 
-Ionospheric delays are those of Klobuchar's model (IS-GPS-200, 20.3.3.5.2.5), tropospheric delays those of
-Saastamoinen's model with the standard atmosphere and 70 % relative humidity. A receiver that applies these models
-corrects the delays exactly, unless a scale or an error of the scenario changes them.
+Ionospheric delays follow Klobuchar's model (IS-GPS-200, 20.3.3.5.2.5), tropospheric delays follow Saastamoinen's model
+with the standard atmosphere and 70 % relative humidity. A receiver that applies these models corrects the delays
+exactly, unless a scale or an error of the scenario changes them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Resolution of the reported C/N0 [dB-Hz].
 CHUNK_EPOCHS: Final = 2000  #: Number of epochs of a chunk.
-_LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are searched [s].
+_LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are sought [s].
 _RATE_S: Final = 0.005  #: Half the interval of the differences from which range rates are computed [s].
 #: C/N0 to which the sigmas of `ReceiverSettings` refer, and C/N0 above which the noise is constant [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
@@ -49,7 +49,7 @@ class Piece:
     clock_m: Floats  #: Receiver clock bias times the speed of light, shape (T,).
     code_sigma_m: Floats  #: Standard deviation of the code noise, shape (T, M).
     clean_code_m: Floats  #: Codes without noise and without disturbances, shape (T, M).
-    error_m: Floats  #: Part of `clean_code_m` by `Scenario.errors`, which no model corrects, shape (T, M).
+    error_m: Floats  #: Part of `clean_code_m` that `Scenario.errors` adds and no model corrects, shape (T, M).
 
 
 class Simulation:
@@ -95,7 +95,7 @@ class Simulation:
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
-        """Return the satellite and atmospheric errors of satellites; those of one do not depend on the others."""
+        """Return the errors of satellites and atmosphere; a satellite's errors do not depend on other satellites."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,
@@ -150,7 +150,7 @@ class Simulation:
     def header(self, antenna: str) -> ObservationHeader:
         """Return the header of the log of a receiver.
 
-        The approximate position of an antenna is rounded to 100 m, that of a reference station to 0.1 mm.
+        The approximate position of an antenna is rounded to 100 m, the position of a reference station to 0.1 mm.
         """
         place = self.truth(antenna, np.zeros(1))[0].ecef_m[0]
         return ObservationHeader(
@@ -190,18 +190,18 @@ class _Instant:
     azimuth_deg: Floats
     path_m: Floats  #: Range plus tropospheric delay and `path_error_m`, less satellite clock.
     ionosphere_m: Floats  #: Ionospheric delay on L1, including `ionosphere_error_m`.
-    path_error_m: Floats  #: Error by orbit, clock and troposphere.
+    path_error_m: Floats  #: Sum of the errors of orbit, satellite clock and troposphere.
     ionosphere_error_m: Floats  #: Error of the ionospheric delay on L1.
 
 
 def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
-    """Return the signals of `Simulation.satellites` that arrive at the antenna `late_s` before the tags."""
+    """Return directions and delays of the signals that arrive at the antenna `late_s` before the time tags."""
     scale, navigation = simulation.scenario.sky, simulation.navigation
     found = simulation.satellite_table.links(time, late_s, antenna_ecef_m)
     sky = found.satellite_ecef_m
     elevation, azimuth = elevation_azimuth(sky, antenna_ecef_m)
     latitude, longitude, height = geodetic_from_ecef(antenna_ecef_m)
-    # Below the horizon no signal is tracked, but the delays must be finite.
+    # Below the horizon, no signal is tracked, but the delays must be finite.
     raised = np.maximum(elevation, 1.0)
     troposphere = saastamoinen_delay_m(latitude, height, raised)
     ionosphere = klobuchar_delay_m(
@@ -335,7 +335,7 @@ def _disturb(
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
-    """Return range errors by satellite faults and faults of a station's receiver [m], and their rates [m/s], (T, M)."""
+    """Return range errors caused by faults of satellites and a station's receiver [m], and rates [m/s], (T, M)."""
     names = receiver.names.tolist()
     fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:

@@ -160,12 +160,12 @@ REGIONAL: Final = {
     "NZGD2000": "EPSG:4959", "SIRGAS 2000": "EPSG:4989", "Hartebeesthoek94": "EPSG:4941",
 }  # fmt: skip
 MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
-#: Largest scale of a grid for a single line, less 1: national grids have up to 0.005.
+#: Largest accepted deviation of the scale of a grid from 1 along a line; national grids deviate by up to 0.005.
 LARGEST_SCALE: Final = 0.01
 MODERN_M: Final = 0.5  #: Worst accuracy of a PROJ transformation between modern frames [m]; older datums are worse.
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
-#: Operations with a worse accuracy are not used [m]; 999 in the EPSG dataset means unknown.
+#: Worst accuracy of an operation that is used [m]; 999 in the EPSG dataset means unknown.
 WORST_M: Final = 100.0
 #: Parts of a PROJ operation's name that do not change the datum.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
@@ -176,8 +176,8 @@ Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 def kind_of_frame(crs: str) -> Kind:
     """Return the kind of a CRS by its relation to the ITRF; raise SettingsError if the CRS is unknown.
 
-    "moves with its plate" is a frame fixed to a plate, "dynamic" an ITRF realisation, and "older datum" a datum without
-    a transformation to ITRF2020 of at most `MODERN_M`.
+    "wgs84" is WGS 84 without a realisation, "moves with its plate" a frame fixed to a plate, "dynamic" an ITRF
+    realisation, and "older datum" a datum without a transformation to ITRF2020 of at most `MODERN_M`.
     """
     geodetic = get_geodetic_frame(crs)
     name = geodetic.name
@@ -210,7 +210,8 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
     """Return the CRS of a file, which the user gives or the file names; None without either.
 
-    Raise SettingsError if the two CRS contradict each other, or a CRS is unknown.
+    If both name the same CRS, a given compound CRS is returned, because it has a height datum. Raise SettingsError if
+    the two CRS contradict each other, or a CRS is unknown.
     """
     if given is None or named is None:
         used = given or named
@@ -314,9 +315,10 @@ def name_operation(description: str, crs: str | None = None) -> str:
 
 
 def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operations:
-    """Find PROJ's operations between two CRS whose areas of use contain a box, except ballpark operations.
+    """Find PROJ's operations between two CRS that are valid in a box, except ballpark operations.
 
-    Without a box all operations are returned in PROJ's order. With a box, operations worse than `WORST_M` are left out.
+    Without a box, all operations are returned in PROJ's order. With a box, operations worse than `WORST_M` are left
+    out.
     """
     area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():

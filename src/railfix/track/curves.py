@@ -21,7 +21,7 @@ from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
 #: Largest difference between the middle ordinates of a chord by the map's radius and by neighbouring points [m]. With a
-#: larger difference the radius is not used: it belongs to another point, or has the wrong sign.
+#: larger difference, the radius is not used, because it belongs to another point or has the wrong sign.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Smallest change of direction that is a corner, which the curve does not round [rad].
 #: Minimum distance of a ramp's end from either point, as a fraction of the distance between the points, and minimum
@@ -35,8 +35,8 @@ _CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `cur
 class CentreCurve:
     """Curve through the V points of a track."""
 
-    chainage_m: Floats  #: Values of the points, shape (V,).
-    points_m: Floats  #: ECEF, shape (V, 3).
+    chainage_m: Floats  #: Chainages of the points, shape (V,).
+    points_m: Floats  #: ECEF coordinates of the points, shape (V, 3).
     #: Directions at start and end of each segment relative to its chord, to the right and upward, (V - 1, 2) [rad].
     to_right: Floats
     to_top: Floats
@@ -55,7 +55,7 @@ class CentreCurve:
         return np.stack([along, right, np.cross(right, along)], axis=1)
 
     def at(self, chainage_m: Floats) -> Floats:
-        """Return points of the curve, shape (n, 3) ECEF [m]; beyond both ends of the line its chords are extended."""
+        """Return points of the curve, shape (n, 3) ECEF [m]; beyond the ends, the outermost chords are extended."""
         last = len(self.length_m) - 1
         segment = np.clip(np.searchsorted(self.chainage_m, chainage_m, side="right") - 1, 0, last)
         along = chainage_m - self.chainage_m[segment]
@@ -157,7 +157,10 @@ def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def curved_line(track: Track) -> Trajectory:
-    """Compute the centreline of a track as a trajectory whose chords are within 2 mm of the curve."""
+    """Compute the centreline of a track as a trajectory whose chords are within 2 mm of the curve.
+
+    Unknown cant is replaced by 0, unless the cant of all points is unknown.
+    """
     curve = centre_curve(track)
     chainage = curve.chords_m(_CHORD_M)
     cant = np.interp(chainage, track.chainage_m, np.where(np.isnan(track.cant_m), 0.0, track.cant_m))

@@ -107,7 +107,7 @@ class Stations:
 
     #: Distance in plan of the start and of each jump, in rising order, and the stations just before and after it [m].
     rows: tuple[tuple[float, float, float], ...]
-    last_sign: float = 1.0  #: Direction of the stations after the last row: 1 rising, -1 falling.
+    last_sign: float = 1.0  #: 1 if the stations rise after the last row, -1 if they fall.
     jump_m: float = 0.05  #: Half length of the interval between points in which the kilometrage jumps.
 
     @property
@@ -248,7 +248,7 @@ def plan_starts(plan: Sequence[Plan]) -> Floats:
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return for each element that is needed the mask of the distances within it, and its index.
+    """Return the mask of the distances within an element, and its index, for each element that contains a distance.
 
     A distance belongs to the last element that begins before it, or to the first element.
     """
@@ -365,7 +365,8 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Check that a profile covers the plan up to `_PROFILE_BEYOND_M`; return a note if it is shorter than the plan.
+    """Check that a profile covers the plan, except at most `_PROFILE_BEYOND_M`, and return a note on any uncovered
+    length.
 
     Raise InputFileError otherwise.
     """
@@ -397,7 +398,7 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
     """Return the sign of the curvature at each point or, on straight track, of the nearest curve, shape (n,).
 
-    A cant ramp can begin on straight track. Without any curve the sign is 1.
+    A cant ramp can begin on straight track. Without any curve, the sign is 1.
     """
     if not bent.any():
         return np.ones(len(curvature))

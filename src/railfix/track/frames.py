@@ -167,7 +167,7 @@ def in_map_frame(
 ) -> tuple[Floats, FrameShift]:
     """Transform positions, shape (n, 3) [m], from the frame of the satellites to the frame of a map.
 
-    The shift of `points_at` is subtracted. NaN stays NaN; MismatchError if all positions are NaN.
+    The shift of `points_at` is subtracted. Unknown positions stay NaN. Raise MismatchError if all positions are NaN.
     """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
@@ -181,7 +181,7 @@ def in_map_frame(
 def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return ITRF coordinates of an epoch in ITRF2020 at the epoch of the log, with a description and notes."""
+    """Return ITRF coordinates transformed to ITRF2020 at the epoch of the log, with a description and notes."""
     name = get_geodetic_frame(crs).name
     moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
@@ -233,8 +233,8 @@ def _by_parameters(
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Transform JGD2011 by a semi-dynamic correction, and from its epoch on by plate motion.
 
-    The correction is computed once per cell of a thousandth of a degree. InputFileError if the file is not valid or
-    does not cover the map.
+    The correction is computed once per cell of a thousandth of a degree. Raise InputFileError if the file is not valid
+    or does not cover the map.
     """
     with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans

@@ -1,7 +1,7 @@
 """Transformation of map coordinates to latitude and longitude in a modern frame, with its accuracy.
 
-PROJ operations (https://proj.org) are used whose area of use contains the map and whose grids are installed. Ballpark
-operations, which do not change the datum, are not used.
+Of the operations of PROJ (https://proj.org), only those are used whose area of use contains the map and whose grids are
+installed. Ballpark operations, which do not change the datum, are not used.
 """
 
 from __future__ import annotations
@@ -145,7 +145,8 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
     """Return the coordinates of positions in a CRS (inverse of `georeference`), shape (n,) each.
 
-    Modern frames are not distinguished, which causes errors of up to 2 m. SettingsError as in `georeference`.
+    Modern frames are not distinguished, which causes errors of up to 2 m. Raise SettingsError if PROJ has no installed
+    operation for the positions.
     """
     if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
         conversion, unit, origin = _to_datum(crs)
@@ -226,7 +227,7 @@ def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
     """Return the accuracy of the first operation [m], as stated by PROJ or implied by the other operations.
 
     If another operation differs from the first operation by more than the accuracy of that other operation, the first
-    operation may be wrong by the excess. NaN if PROJ states no accuracy and no other operation differs.
+    operation may be wrong by the excess. NaN if PROJ states no accuracy of the first operation.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -278,7 +279,9 @@ def _bounds(crs: str) -> Box:
 
 
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Raise InputFileError if the lengths in the grid and on the ground differ, as coordinates are of another grid."""
+    """Raise InputFileError if lengths in the grid and on the ground differ, because the coordinates are of another
+    grid.
+    """
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
     if len(xy) < 2 or method in _UNEVEN:

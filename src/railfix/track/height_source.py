@@ -31,7 +31,7 @@ RASTERS: Final = (
 HeightSource = FilePath | PositionLog  #: File with heights, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest spacing of points with heights [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are read at once.
-_NEAR_M: Final = 15.0  #: Largest distance in plan of positions that belong to the line [m].
+_NEAR_M: Final = 15.0  #: Largest distance in plan from the line of positions that are used [m].
 _REACH_M: Final = 200.0  #: Largest distance along the line between a point and the positions that give its height [m].
 #: Standard deviation of the Gaussian weights along the line [m], for RTK fixed positions, and for single-point
 #: positions, whose errors persist for hundreds of metres. The latter causes up to 5 m error in a vertical curve of 2 km
@@ -151,7 +151,7 @@ def _from_raster(
 def _sample(raster: Any, place: Floats) -> Floats:
     """Interpolate a raster at rows and columns, shape (2, n); the result has shape (n,), and is NaN without a value.
 
-    It is read in windows around successive points.
+    The raster is read in windows around successive points.
     """
     from scipy.ndimage import map_coordinates
 

@@ -93,7 +93,8 @@ def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidM
 def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
     """Compute the heights of the geoid EGM96 above the WGS 84 ellipsoid, shape (n,) [m].
 
-    They are interpolated by a cubic spline in the 15' grid (NGA, WW15MGH), within 5 mm of the published test values.
+    The heights are interpolated by a cubic spline in the 15' grid (NGA, WW15MGH), within 5 mm of the published test
+    values.
     """
     place = (90.0 - latitude_deg) * 4.0, (longitude_deg % 360.0) * 4.0 + _WRAP
     return np.asarray(scipy.ndimage.map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
@@ -176,9 +177,9 @@ def heights_of_file(
 ) -> EllipsoidalHeights:
     """Convert the heights of a file to ellipsoidal heights.
 
-    `datum`, `geoid` and `geoid_m` are those stated in the file; `reading` has those given by the user, which take
-    precedence. Raise InputFileError if the file names an unknown datum, SettingsError if no datum is known or if two
-    datums contradict each other.
+    `datum`, `geoid` and `geoid_m` are stated in the file. A datum and a geoid in `reading` are given by the user, and
+    take precedence. Raise InputFileError if the file names an unknown datum, SettingsError if no datum is known or if
+    two datums contradict each other.
     """
     check_height_datum(reading.height_datum)
     if datum is not None and datum not in HEIGHT_DATUMS:

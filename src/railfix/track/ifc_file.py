@@ -39,7 +39,7 @@ _LAWS: Final = {
 _ARCS: Final = {
     "CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle", "CLOTHOID": "clothoid",
 }  # fmt: skip
-#: Minimum reduction of the distance to the next element by another form of the cubic parabola [m].
+#: Smallest reduction of the distance to the next element for which another form of the cubic parabola is used [m].
 _SIMILAR_M: Final = 1e-3
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
 _PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
@@ -114,7 +114,7 @@ def _values(text: str) -> list[Any]:
 def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the alignments of an IFC file as segments.
 
-    Heights are of the middle between the rail tops (IfcSegmentedReferenceCurve). Raise InputFileError if there is no
+    Heights refer to the middle between the rail tops (IfcSegmentedReferenceCurve). Raise InputFileError if there is no
     alignment with a horizontal layout, or an element is not valid or not supported.
     """
     step = _Step(path)
@@ -240,7 +240,7 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return the references of placements from an object to the world; InputFileError if a placement is not local."""
+    """Return the references of placements from an object to the world; raise InputFileError if one is not local."""
     found: list[Any] = []
     while reference is not None and reference not in found:
         entity = step.at(reference, what="ObjectPlacement")

@@ -157,8 +157,9 @@ def _point(element: Any, name: str, scale: float, easting_first: bool) -> np.nda
 def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -> tuple[list[Plan], tuple[str, ...]]:
     """Return the elements in plan, and a note if the file has easting before northing, which violates LandXML.
 
-    The order is that in which the coordinates are in the area of the CRS. If both are, it is the order with fewer
-    breaks of direction between elements. Raise InputFileError if the two criteria contradict each other.
+    The order is used in which the coordinates lie in the area of the CRS. If this is true of both orders or of neither,
+    the order with fewer breaks of direction between elements is used. Raise InputFileError if the two criteria
+    contradict each other.
     """
     plans, broken, inside = [], [], []
     for easting_first in (False, True):
@@ -319,7 +320,8 @@ def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement]
     """Return the elements between cant stations, and notes.
 
     The outer rail is raised unless the file has another rotation point. Cant is in millimetres, or in inches if lengths
-    are imperial (LandXML 1.2); InfraModel has metres.
+    are imperial (LandXML 1.2). If all values are below 1, they are assumed to be in the unit of length of the file, as
+    in InfraModel, with a note.
     """
     if cant is None:
         return [], ()

@@ -31,8 +31,8 @@ _LEAST_RADIUS_M: Final = 150.0
 _ROUNDS: Final = 20  #: Largest number of searches for outliers, each without the outliers found before.
 _ENOUGH: Final = 10  #: Minimum number of positions for a search.
 _ACCELERATION_MPS2: Final = 2.0  #: Acceleration that is allowed for in the distance along the line.
-#: The path between neighbours counts as straight if they are this near in time [s], or if the cosine of the change of
-#: direction before and after them is at least this.
+#: The path between the neighbours of a position counts as straight if both are at most this far from it in time [s], or
+#: if the cosine of the change of direction before and after them is at least this.
 _NEAR_S: Final = 2.5
 _STRAIGHT: Final = 0.87
 _STANDING_WINDOW_S: Final = 3.0  #: Half length of the window over which the displacement is computed [s].
@@ -42,11 +42,11 @@ class ThinningLimits(Settings):
     """Limits for the selection of positions as points of a map."""
 
     spacing_m: float = Field(default=5.0, gt=0)  #: Smallest distance between consecutive points.
-    #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). Beyond it the farthest
+    #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). Beyond it, the farthest
     #: position becomes a point, too. Times are required, to distinguish a bend from noise at standstill.
     chord_m: float = Field(default=0.30, gt=0)
     #: Horizontal speed below which the antenna is stationary, so that its positions are noise or drift. Times are
-    #: required; with 0 all positions are kept.
+    #: required; with 0, all positions are kept.
     standing_mps: float = Field(default=0.2, ge=0)
     #: Longest distance between consecutive points that is not reported as a gap.
     jump_m: float = Field(default=50.0, gt=0)
@@ -62,9 +62,10 @@ class Thinned:
 
     kept: Indices  #: Rows of the positions that became points of the map, in ascending order, shape (V,).
     dropped: dict[str, int]  #: Number of dropped rows by reason.
-    jumps: Indices  #: Points before a gap of more than `ThinningLimits.jump_m`, shape (j,).
-    jump_m: Floats  #: Length of these gaps, shape (j,).
-    #: Points at which the path turns by more than 120 degrees, at reversals or wrong positions, shape (t,).
+    jumps: Indices  #: Indices of the points before a gap of more than `ThinningLimits.jump_m`, shape (j,).
+    jump_m: Floats  #: Length of each gap in `jumps`, shape (j,).
+    #: Indices of the points at which the path turns by more than 120 degrees, at reversals or wrong positions, shape
+    #: (t,).
     turns: Indices
 
 
@@ -92,8 +93,8 @@ def thin(
     """Select the positions, shape (n, 3) ECEF [m], that become points of a map.
 
     Rows that are NaN, not `usable`, out of reach, outliers or stationary are dropped first, so that noise and drift at
-    standstill cause no loops. Further points are at least a spacing apart. The last position is also kept if it is at
-    least a fifth of the spacing ahead.
+    standstill cause no loops. The points are at least `ThinningLimits.spacing_m` apart, except in bends
+    (`ThinningLimits.chord_m`). The last position is also kept if it is at least a fifth of the spacing ahead.
     """
     limits = limits or ThinningLimits()
     finite = np.isfinite(ecef_m).all(axis=1)
@@ -228,7 +229,7 @@ def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
 
 
 def _at_spacing(points: Floats, spacing_m: float) -> Indices:
-    """Return the indices of points at least the spacing apart, and of the last point if it is a fifth of it ahead."""
+    """Return the indices of points at least the spacing apart, and of the last point if it is a fifth of this ahead."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
     kept = [0]
@@ -300,7 +301,10 @@ def create_track(
     gap_m: float = 2000.0,
     accuracy: str = "",
 ) -> Track:
-    """Create a track of the positions selected by `thin`; ValueError for fewer than two points or too long a gap."""
+    """Create a track of the positions selected by `thin`.
+
+    Raise ValueError if fewer than two points are left, or a gap is longer than `gap_m`.
+    """
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
         dropped = f" ({dropped})" if dropped else ""
@@ -319,7 +323,7 @@ def create_track(
     if len(thinned.turns):
         notes.append(
             f"the path turns back at {plural(thinned.turns, 'point')}: where it lies beside itself, positions are "
-            "ambiguous and the filter may follow the wrong leg, so give positions of one way"
+            "ambiguous and the filter may follow the wrong leg, so give positions of a run in one direction"
         )
     return Track.from_ecef(
         ecef_m[thinned.kept],
@@ -403,7 +407,7 @@ def from_position_log(
     if len(back):
         line = int(log.line[timed[back[0] + 1]])
         raise InputFileError(
-            log.path, "the time is before that of the preceding position; sort them by time", line=line
+            log.path, "the time is before the time of the preceding position; sort the positions by time", line=line
         )
     thinned = thin(log.time, log.ecef_m, usable=usable, limits=limits)
     plan, height, accuracy = _accuracy(log, thinned.kept)

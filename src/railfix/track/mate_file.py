@@ -75,7 +75,7 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Largest distance between two successive segments of an edge [m].
+#: Largest accepted gap (`_gap`) between two successive segments of an edge [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
@@ -101,7 +101,7 @@ def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
     """Return the rows of each edge, sorted by their distance from its start.
 
-    They are from the file, or from another `table` in its folder; without that table the result is empty.
+    The rows are from the file, or from another `table` in its folder; if that table is missing, the result is empty.
     """
     file = Path(path)
     if table is not None:
@@ -229,7 +229,7 @@ def _profile(path: str, row: Row) -> ProfileElement:
 
 
 def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
-    """Create an element of cant, with the rails raised and lowered by half of it.
+    """Create an element of cant, with the rails raised and lowered by half of the cant.
 
     The sharpest curve within the element determines which rail is the outer rail.
     """

@@ -237,7 +237,7 @@ class Network(NotebookTable):
         return distance, np.where(np.isfinite(distance), sample, 0).astype(np.intp)
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
-        """Return up to `most` tracks within `within_m` in plan of each position; coordinates have shape (n,)."""
+        """Return up to `most` tracks within `within_m` in plan of each position; coordinates have shape (n,) [deg]."""
         parts = [
             self._near(latitude_deg[k : k + _TOGETHER], longitude_deg[k : k + _TOGETHER], within_m, most)
             for k in range(0, max(len(latitude_deg), 1), _TOGETHER)
@@ -274,7 +274,7 @@ class Network(NotebookTable):
         )
 
     def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-        """Return the chainage on given tracks of positions, and their distance in plan, shape (n,) each [m].
+        """Return the chainages of positions on given tracks, and their distances in plan, shape (n,) each [m].
 
         Both are NaN without a track (-1) or a position (NaN).
         """
@@ -340,7 +340,9 @@ class Network(NotebookTable):
         return reached
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
-        """Return the indices of the tracks of the shortest route over given tracks in order; MismatchError if none."""
+        """Return the indices of the tracks of the shortest route over given tracks in order; raise MismatchError if
+        none.
+        """
         route = self.route_over(stops)
         if route is None:
             first = next(stop for k, stop in enumerate(stops, start=1) if self.route_over(stops[:k]) is None)

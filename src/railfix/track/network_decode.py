@@ -25,9 +25,9 @@ from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Netwo
 _UNMAPPED_COST: Final = 5.0
 #: Distances to the right of the nearest track at which an unmapped track can be parallel to it [m].
 SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
-#: Prior probabilities of `SHIFTS_M`, in inverse proportion to the distance, as most parallel tracks are adjacent.
+#: Prior probabilities of `SHIFTS_M`, in inverse proportion to the distance, because most parallel tracks are adjacent.
 _SHARES: Final = 1.0 / np.abs(SHIFTS_M) / (1.0 / np.abs(SHIFTS_M)).sum()
-#: Probability per position that the distance of a parallel unmapped track changes to an adjacent one of `SHIFTS_M`.
+#: Probability per position that the distance of a parallel unmapped track changes to an adjacent value of `SHIFTS_M`.
 _DRIFTS: Final = 1e-3
 _SHIFT_STEP_M: Final = 2.0  #: Spacing of `SHIFTS_M` on either side [m].
 _FREEDOM: Final = 8.0  #: Degrees of freedom of Student's t for position errors.
@@ -74,7 +74,7 @@ class Residuals:
     above_m: Floats  #: Height of the position above the expected antenna height, shape (n, m); NaN without a height.
     clear: Masks  #: Whether a track at each of `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
     moved_m: Floats  #: Distance of the nearest track to the right of the previous position's nearest track, (n,).
-    turned: Masks  #: Whether these two tracks have opposite directions, shape (n,).
+    turned: Masks  #: Whether the nearest tracks of this and the previous position have opposite directions, (n,).
     sigma_m: Floats  #: Standard deviation of a position per horizontal axis, shape (n,).
     sigma_up_m: Floats  #: Standard deviation of the height, shape (n,).
     weight: Floats  #: Fraction of the correlation time that a position represents, shape (n,).
@@ -149,7 +149,7 @@ class Transitions:
     def _way(self, k: int, i: int, j: int) -> float:
         """Return the path length from candidate i of position k to candidate j of k + 1 over ends of tracks [m].
 
-        It is infinite beyond the search limit.
+        The length is infinite beyond the search limit.
         """
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
@@ -223,7 +223,9 @@ class _CommonError:
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
-        """Return values multiplied by the matrix of each axis; with one matrix for all axes, threads would wait."""
+        """Return values multiplied by the matrix of each axis in turn; a product with one large matrix would wait for
+        threads.
+        """
         axis, heights = len(plan), len(up)
         east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
         north = np.matmul(plan, east.reshape(-1, axis, axis, heights))
@@ -272,8 +274,9 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     Returns
     -------
     tuple
-        Column of the candidate of each position in the sequence with the most expected pairs of right tracks, m for no
-        track, shape (n,); probability of each candidate given the whole log, and of no track, shape (n, m + 1).
+        Column of each position's candidate in the sequence that maximises the expected number of successive pairs on
+        the right tracks, m for no track, shape (n,); and the probabilities of the candidates and of no track given the
+        whole log, shape (n, m + 1).
     """
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
@@ -320,7 +323,7 @@ def _forward(
 ) -> Iterator[tuple[int, _At]]:
     """Yield the forward recursion at the positions from `start` to before `stop`.
 
-    It begins with the state probabilities `first` or, if `first` is None, with the prior.
+    The recursion begins with the state probabilities `first` or, if `first` is None, with the prior.
     """
     m = residuals.offset_m.shape[1]
     states = m + len(SHIFTS_M) + 1

@@ -104,7 +104,9 @@ def _check_region(network: Network, log: PlanLog) -> None:
     turned = ecef_from_geodetic(np.clip(longitude, -90.0, 90.0), latitude, zeros)
     swapped = float(np.min(tree.query(turned)[0])) <= ANOTHER_PLACE_M
     what = (
-        "latitude and longitude are swapped in one of them" if swapped else "is it the map of that line, its CRS right?"
+        "latitude and longitude are swapped in one of them"
+        if swapped
+        else "check whether it is the map of that line and its CRS is right"
     )
     raise MismatchError(f"{log.path}: the map lies {apart / 1000.0:.0f} km from where the log was recorded; {what}")
 
@@ -173,7 +175,7 @@ def match(
     sigma_m : float, optional [m]
         Standard deviation of the distance of positions from their track; by default as stated in the log, or estimated.
     within_m : float, optional [m]
-        Largest distance of a position from its track; by default five sigmas, but 30 to 100 m.
+        Largest distance of a position from its track; by default five standard deviations, limited to 30 to 100 m.
     correlation_s : float [s]
         Correlation time of the position errors.
 
@@ -229,7 +231,7 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
     """Estimate the standard deviation of the distances from a track [m], and return it with a clause on its basis.
 
-    It is computed from the median distance of positions near a single track, because with parallel tracks an error
+    The estimate is from the median distance of positions near a single track, because near parallel tracks, an error
     cannot be distinguished from a position on another track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
@@ -269,7 +271,7 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
     """Return a mask of the positions far from all tracks that are wrong, shape (n,).
 
-    These are positions between two positions near a track that are at most `_WRONG_S` apart.
+    A position is wrong if the last position near a track before it and the next after it are at most `_WRONG_S` apart.
     """
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):

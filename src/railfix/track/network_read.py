@@ -33,8 +33,8 @@ def read_network(
 ) -> Network:
     """Read a network of tracks from map files.
 
-    Tracks are connected as the files state. Without such statements they are connected where ends, or an end and
-    another track, are within `tolerance_m`. Raise InputFileError or SettingsError as `railfix.track.read_track`.
+    Tracks are connected as the files state. Without such statements, they are connected where two ends, or an end and
+    another track, are within `tolerance_m`. Raise InputFileError or SettingsError as `railfix.track.read_track` does.
     """
     tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]
     check_order(tracks)
@@ -127,7 +127,7 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
 def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
     """Return the connections of ends within `tolerance_m` of each other.
 
-    They are navigable if the direction changes by less than 60 deg. Ends on different levels are not connected.
+    A connection is navigable if the direction changes by less than 60 deg. Ends on different levels are not connected.
     """
     ends, outward = end_points(network)
     pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")

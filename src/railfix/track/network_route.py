@@ -31,15 +31,16 @@ class Filled:
 
     track: Indices  #: Index of the track; -1 without a position or a route.
     chainage_m: Floats  #: Chainage on the track.
-    #: Largest distance between the train and a filled position if the train is on the route; infinite outside known
-    #: positions, and NaN where the position is not filled.
+    #: Largest distance between the train and a filled position if the train is on the route; infinite before the first
+    #: and after the last known position, and NaN where the position is not filled.
     bound_m: Floats
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
     """Fill rows without a usable position along the shortest route between known positions.
 
-    The speed on the route is constant. If the log has positions off the map, their speed is used; see `Rows`.
+    The speed on the route is assumed to be constant. If the log has positions off the map, and `rows_to_fill` includes
+    them, their speed is used instead.
     """
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
@@ -97,7 +98,8 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 def _distance_m(log: PlanLog) -> Floats:
     """Return the distance travelled, shape (n,) [m]; NaN without a position.
 
-    It is the sum of the steps between positions, each replaced by the median over `_STEPS` because positions jump.
+    The distance is the sum of the steps between positions, each replaced by the median over `_STEPS`, because positions
+    jump.
     """
     from scipy.ndimage import median_filter
 
@@ -113,7 +115,7 @@ def _put_on(
 ) -> None:
     """Place rows on a route in proportion to `at`, of which the first value is at the start of the route.
 
-    The last value of `at` is at the end of the route. With `ends_known` the position at the end is known, too.
+    The last value of `at` is at the end of the route. With `ends_known`, the position at the end is known, too.
     """
     numbers, enter, leave = legs
     share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
@@ -129,9 +131,10 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Return the tracks of the shortest route between two positions, and the chainages at entry and exit; None if none.
+    """Return the tracks of the shortest route between two positions, and the chainages at which they are entered and
+    left.
 
-    The positions are given by track index and chainage [m].
+    The positions are given by track index and chainage [m]. The result is None if there is no route.
     """
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])

@@ -154,7 +154,7 @@ class _GeojsonLine:
 
 
 def _crs_member(path: str, document: dict[str, Any]) -> str | None:
-    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs still write; None without."""
+    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs write; None if absent."""
     member = document.get("crs")
     if member is None:
         return None
@@ -333,7 +333,7 @@ def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColum
 
 
 def _check_columns(table: NamedColumns) -> tuple[str, ...]:
-    """Reject a header without coordinates or with a misspelt column; return notes on unused columns."""
+    """Return notes on unused columns; raise InputFileError if coordinates are missing or a column is misspelt."""
     close = misspelt(table.cells, KNOWN_COLUMNS)
     for wrong, right in close.items():
         if right not in table:

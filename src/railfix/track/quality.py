@@ -42,7 +42,7 @@ class MapLimits(Settings):
 
     mid_chord_m: float = Field(default=0.30, gt=0)  #: Largest distance of chord and arc in mid-segment (P1 4.1(3)).
     spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment; tens of metres on straight track in P1 2.2(1).
-    #: Longest segment that is not a gap: a longer one has a point off the line, or part of the line is missing.
+    #: Longest segment that is not reported as a gap, which indicates a wrong point or a missing part of the line.
     gap_m: float = Field(default=2000.0, gt=0)
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
     gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest gradient of a segment.

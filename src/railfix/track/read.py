@@ -165,7 +165,7 @@ def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
 def _without_repeated(segment: Segment, reading: MapReading) -> Segment:
     """Return a segment without repeated consecutive points; raise InputFileError if fewer than two points remain.
 
-    With duplicates "keep" the repeated points remain.
+    With duplicates "keep", the repeated points remain.
     """
     points = np.stack([segment.latitude_deg, segment.longitude_deg, np.nan_to_num(segment.height_m)])
     new = np.concatenate([[True], (np.diff(points) != 0.0).any(axis=0)])

@@ -194,8 +194,8 @@ def join(
 ) -> Track:
     """Join segments to one track.
 
-    A point shared by two segments is kept once. Its attributes are from the earlier segment or, where that has none,
-    from the later segment. Raise InputFileError if segments do not meet, MismatchError if their frames differ.
+    A point shared by two segments is kept once. Its attributes are from the earlier segment or, where this segment has
+    none, from the later segment. Raise InputFileError if segments do not meet, MismatchError if their frames differ.
     """
     pieces = orient(segments, max_gap_m=max_gap_m)
     ends = _ends(pieces)
@@ -234,7 +234,7 @@ def join(
 
 
 def one_frame(pieces: Sequence[Segment]) -> str:
-    """Return the frame of all pieces; raise MismatchError if frames differ, which would make a step of up to 2 m."""
+    """Return the frame of all pieces; raise MismatchError if frames differ, which would cause a step of up to 2 m."""
     frames = {piece.frame: piece.source for piece in pieces}
     if len(frames) > 1:
         what = "; ".join(f"{source} in {frame}" for frame, source in frames.items())
@@ -249,8 +249,8 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
     """Return the worst standard deviation of the pieces [m], including the transformation from their datum.
 
-    It is the value of the files' metadata `key`, or `default` where a file states none. Raise InputFileError if a value
-    is not a positive number.
+    The standard deviation of a piece is stated in the metadata `key` of its file, or is `default` if the file states
+    none. Raise InputFileError if a value is not a positive number.
     """
     sigmas: list[float] = []
     for piece in pieces:

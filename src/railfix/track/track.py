@@ -22,7 +22,8 @@ SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about t
 #: Note on a section whose points are joined in reverse order; it follows the name of the section.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
-#: Largest difference, plus a twentieth of the length, between length and kilometrage without a break [m].
+#: Largest difference of a segment's change of kilometrage from its length that is no break, in addition to a twentieth
+#: of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of ellipsoidal heights of railways, including tunnels below the sea [m].
 ANOTHER_PLACE_M = 100_000.0  #: Distance of a log from a map beyond which they are at different locations [m].
@@ -103,7 +104,8 @@ class Track(NotebookTable):
     ) -> Track:
         """Create a track from geodetic coordinates (WGS 84, ellipsoidal height), shape (V,).
 
-        `attributes` are the fields of `TrackFields`; an attribute that is not given is NaN. TypeError for others.
+        `attributes` are the fields of `TrackFields`; an attribute that is not given is NaN. Raise TypeError for other
+        names.
         """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"a track has no {', '.join(sorted(unknown))}")
@@ -161,7 +163,7 @@ class Track(NotebookTable):
 def section_spans(track: Track) -> list[tuple[float, float]]:
     """Return the chainages of the first and the last point of each section [m].
 
-    They decrease if the section was joined in reverse order.
+    The chainages decrease if the section was joined in reverse order.
     """
     ends = [0.0, *track.chainage_m[np.flatnonzero(np.diff(track.section, append=len(track.sections)))].tolist()]
     backwards = [f"{source} {BACKWARDS}" in track.provenance.notes for source in track.sections]
@@ -183,10 +185,11 @@ def _jumps(length_m: Floats, change_m: Floats) -> Masks:
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """Interpolate the kilometrage at chainages of any shape; NaN if a point of the segment has none, and for NaN.
+    """Interpolate the kilometrage at chainages of any shape.
 
-    The kilometrage is linear between two points. Within a segment that has a break, it is extrapolated from the nearer
-    point in the direction of the kilometrage on that side of the break.
+    The result is NaN for NaN, and where a point of the segment has no kilometrage. The kilometrage is linear between
+    two points, and is extrapolated beyond the ends. Within a segment that has a break, it is extrapolated from the
+    nearer point in the direction of the kilometrage on that side of the break.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2

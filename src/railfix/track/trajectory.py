@@ -58,7 +58,7 @@ class NearestOnPolyline:
     def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
         """Return the nearest segment, the distance along it and the distance from it for positions (n, 3), shape (n,).
 
-        For a position that is NaN the segment is -1, and the distances are NaN.
+        For a position that is NaN, the segment is -1, and the distances are NaN.
         """
         points = np.asarray(ecef_m, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
@@ -90,10 +90,10 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Return the nearest of C candidate segments (n, C) to each point (n, 3), and the fraction of it and distance."""
+    """Return the nearest of C candidate segments (n, C) to each point (n, 3), its fraction, and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
-    # of equally near segments the first on the line is returned, whatever the order of the candidates
+    # of equally near segments, the first on the line is returned, whatever the order of the candidates
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
     row, column = np.arange(len(points_m)), place.argmin(axis=1)
     return segment[row, column], share[row, column], best
@@ -182,7 +182,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     def from_antenna_path(cls, track: Track) -> Trajectory:
         """Create a trajectory from a map that is the antenna's path itself, as from a survey; `notes` records this.
 
-        On a train the antenna is above the track, and its path differs in curves: `antenna_trajectory` computes it.
+        On a train, the antenna is above the track, so that its path differs in curves; `antenna_trajectory` computes
+        it.
         """
         check_type(track, Track, "track")
         return cls(

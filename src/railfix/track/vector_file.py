@@ -2,7 +2,7 @@
 
 OpenStreetMap ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Export
 programs write the tags as columns, as an object or JSON text (`tags`), as hstore text (`other_tags` of GDAL), or as a
-class (`fclass` in the shapefiles of Geofabrik), and the id in a dozen forms.
+class (`fclass` in the shapefiles of Geofabrik), and the id in many forms.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
-    """Return whether a feature is from OpenStreetMap, which its id or kind shows."""
+    """Return whether the id or the kind of a feature shows that it is from OpenStreetMap."""
     names = (str(row.get(key) or "") for key in ("@id", "id"))
     of_id = any(row.get(key) is not None for key in _IDS[:4])
     of_kind = any(row.get(key) in ("way", "relation") for key in _KINDS)
@@ -106,7 +106,8 @@ def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
 def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the origin of a feature from OpenStreetMap, with its name ("way/7 Main Line") and non-zero level.
 
-    Without an id there is no name and no level. Another feature has an origin only if it is a railway in use.
+    Without an id, there is no name and no level. A feature that is not recognised as from OpenStreetMap has an origin
+    only if it has the tag of a railway in use.
     """
     tags = get_tags(row)
     if not is_of_openstreetmap(row):

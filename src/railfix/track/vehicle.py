@@ -131,7 +131,7 @@ class _VehicleLine:
         return bool(np.isnan(self.joins[0])), bool(np.isnan(self.joins[1]))
 
     def at(self, chainage: Floats) -> Floats:
-        """Return ECEF points, shape (n, 3) [m]; at an open end the last segment is extended straight."""
+        """Return ECEF points, shape (n, 3) [m]; at an open end, the last segment is extended straight."""
         points = self._straight_on(chainage)
         before, after = self.joins
         ends = (
@@ -148,7 +148,7 @@ class _VehicleLine:
         return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
-        """Return the roll by cant, shape (n,) [rad]; it is constant beyond an open end."""
+        """Return the roll by cant, shape (n,) [rad], which is constant beyond an open end."""
         before, after = self.joins
         last = self.chainage[-1]
         open_start, open_end = self.open_ends
@@ -160,7 +160,7 @@ class _VehicleLine:
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
     """Return the cant, positive for roll to the right, shape (V,) [m], and notes.
 
-    The sign follows from the radius, or from the bend of the points where the map has no radius. On straight track it
+    The sign follows from the radius, or from the bend of the points where the map has no radius. On straight track, it
     follows from the nearest curve. Raise MismatchError if there is cant but no curve.
     """
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
@@ -242,7 +242,7 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Return the chainage of the centreline point abeam the antenna, in the plane through it across the body [m]."""
+    """Return the chainage of the centreline point abeam the antenna, in the plane across the body [m]."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
@@ -255,8 +255,8 @@ def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> F
 def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
     """Return chainages of the body's middle at which the antenna's path is computed [m].
 
-    They are the chainages of the track's points, and more where the path deviates from a chord by more than
-    `PATH_TOLERANCE_M`.
+    These are the chainages of the track's points, and further chainages where the path deviates from a chord by more
+    than `PATH_TOLERANCE_M`.
     """
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
@@ -306,7 +306,7 @@ def antenna_trajectory(
 ) -> Trajectory:
     """Compute the trajectory of a roof antenna of a vehicle on the track.
 
-    Both bogie centres are on the centreline, with the bogie distance as chord. At each bogie the track rolls by
+    Both bogie centres are on the centreline, with the bogie distance as chord. At each bogie, the track rolls by
     ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean of both rolls (P1
     3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the vertical rotated by the roll. The
     path begins and ends where a bogie reaches the end of the track. On a closed track it begins and ends where the
@@ -319,7 +319,7 @@ def antenna_trajectory(
     antenna : {"front", "rear"}
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
         Point of the vehicle to which the chainage refers: the centreline point abeam the antenna, the middle between
-        the bogies, or the centre of the bogie at the vehicle's front or rear. Beyond the ends of the track the
+        the bogies, or the centre of the bogie at the vehicle's front or rear. Beyond the ends of the track, the
         centreline is extended straight.
 
     Returns

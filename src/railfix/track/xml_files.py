@@ -40,7 +40,7 @@ class Relation:
 
 
 def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a LandXML or railML 3 file as segments; InputFileError for other files, or without lines."""
+    """Read the lines of a LandXML or railML 3 file as segments; raise InputFileError if there are none."""
     root = read_root(path)
     kind = tag(root)
     if kind == "LandXML":

@@ -266,10 +266,10 @@ class GlonassStates:
         return position, velocity
 
 
-#: Points of the interpolation polynomial (order 12). With positions every 15 minutes the error is within 3 mm for the
+#: Points of the interpolation polynomial (order 12). With positions every 15 minutes, the error is within 3 mm for the
 #: two Galileo satellites in elliptic orbits, where the usual 11 points cause errors of 17 mm near perigee, and within a
-#: micrometre for other satellites. In the first and last interval of a file it is up to 0.7 m for these two satellites,
-#: and 0.05 mm for others.
+#: micrometre for other satellites. In the first and last interval of a file, the error is up to 0.7 m for these two
+#: satellites, and 0.05 mm for others.
 POINTS: Final = 13
 #: An interval longer than this multiple of the usual interval is a gap, within which there are no states.
 _GAP: Final = 1.5
@@ -292,7 +292,8 @@ def precise_state(
 
     `column` is -1 where the ephemeris lacks a satellite; `offset_s` is a fraction of a second. The result is NaN where
     a node is missing, and where the time is outside the file or in a gap. The clock includes the relativistic
-    correction -2 r.v / c^2, which SP3 clocks do not contain. ValueError: the ephemeris has fewer than `POINTS` epochs.
+    correction -2 r.v / c^2, which SP3 clocks do not contain. Raise ValueError if the ephemeris has fewer than `POINTS`
+    epochs.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")

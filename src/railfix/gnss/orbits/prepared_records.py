@@ -57,8 +57,10 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return the record row of each satellite (-1 without records), whether the record is valid (`limit` by row),
-        and whether it was transmitted after the epoch; shapes (M, T).
+        """Return the record of each satellite at each time, its validity, and whether it was sent later, shapes (M, T).
+
+        The record is a row of the record table, -1 without records. It is valid if toe is within `limit`, given by row,
+        of the epoch.
         """
         shape = (len(number), len(time))
         if not len(self.sent_key):
@@ -156,7 +158,8 @@ def _index_issues(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Return the row of `navigation.kepler` with an `issue` (T, M) and the nearest toe, -1 without a valid record.
+    """Return the row of `navigation.kepler` with the given issue and the nearest toe, shape (T, M); -1 if none is
+    valid.
 
     The times of transmission are not considered.
     """
@@ -201,11 +204,12 @@ _ANY: Final = -1  #: All bits.
 
 
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
-    """Return which records flag a signal as unhealthy, shape (n,).
+    """Return whether each record flags a signal as unhealthy, shape (n,).
 
-    GPS LNAV is unhealthy with any of the six bits, QZSS and Galileo with the bits of the signal, CNAV with the bit of
-    the band, and BeiDou with SatH1 or HS. Galileo is also unhealthy without a predicted accuracy (SISA "NAPA", written
-    as -1, marginal by OS SDD 1.3, 2.3.1.4), and every record with an accuracy above `LARGEST_ACCURACY_M`.
+    A signal is flagged by any of the six health bits of GPS LNAV, by the bits of the signal of QZSS and Galileo, by the
+    bit of the band of CNAV, and by SatH1 or HS of BeiDou. It is also unhealthy if a Galileo record predicts no accuracy
+    (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
+    `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
     bits = np.full(len(records), _ANY, dtype=np.int64)
@@ -230,12 +234,13 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
     Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 uses
              the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1:
              BGD E5a/E1 is used instead. NaN on E6, whose delay is not broadcast.
-    BeiDou The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
+    BeiDou   The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
              CNV1, CNV2 (B1C ICD 1.0, 7.6; B2a ICD 1.0, 7.6): TGD_B1Cp and TGD_B2ap on the pilots, with ISC on
              the data signals. CNV3: TGD_B2bI on B2b. NaN on signals whose delay the message does not contain.
     ======== =====================================================================================
 
-    Clock source: the record ("broadcast"), or SP3 files ("ionosphere_free": the pairs L1/L2, E1/E5a, B1I/B3I).
+    `clock` is the source of the satellite clock: the record ("broadcast") or SP3 files ("ionosphere_free"), whose
+    clocks refer to the pairs L1/L2, E1/E5a and B1I/B3I.
     """
     delay = np.full(len(records), np.nan)
     system = records.satellite.astype("<U1")

@@ -38,7 +38,7 @@ class SatelliteStates:
     #: whose delay is not broadcast (`prepared_records.group_delay_s`); shape (T, M).
     group_delay_m: Floats
     age_s: Floats  #: Epoch minus toe of the record, 0 for a precise ephemeris; shape (T, M).
-    accuracy_m: Floats  #: As broadcast; NaN for GLONASS and for a precise ephemeris; shape (T, M).
+    accuracy_m: Floats  #: Accuracy as broadcast; NaN for GLONASS and for a precise ephemeris; shape (T, M).
     #: Row in the record table of the constellation, -1 without a record; set also where the record is too old or the
     #: channel has no code; shape (T, M).
     record: Integers

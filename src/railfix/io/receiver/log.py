@@ -139,7 +139,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit (interference not cancelled) and spoofing bit (misleading or unauthentic); None if broken."""
+    """Return the jamming bit (interference not cancelled) and spoofing bit (misleading or unauthentic), or None."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])

@@ -2,7 +2,7 @@
 
 The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths
 in the early, late and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14). The
-autocorrelation is the triangle of unlimited bandwidth. Within its straight parts the zero is a quotient, so that a few
+autocorrelation is the triangle of unlimited bandwidth. Within its straight parts, the zero is a quotient, so that a few
 iterations suffice.
 """
 
@@ -20,7 +20,7 @@ from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSet
 
 Singles = NDArray[np.float32]
 
-#: Number of iterations; three suffice for errors of a few hundredths of a chip, a wide spacing requires more.
+#: Number of iterations; three suffice for errors of a few hundredths of a chip, but a wide spacing requires more.
 _ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12
 _NARROW_CHIPS: Final = 0.2  #: Largest early-late spacing of a narrow correlator [chips].
@@ -49,8 +49,8 @@ def track_paths(
 
     `field` are the complex amplitudes of the paths relative to the unobstructed direct signal, `extra_m` their extra
     delays and `rate_mps` the rates of the delays, shape (P, N). The loops lock to the strongest path, and the code
-    error relative to this path is at most half the early-late spacing. Paths whose phase relative to it changes with a
-    frequency f are attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``.
+    error relative to this path is at most half the early-late spacing. Paths whose phase relative to the strongest path
+    changes with a frequency f are attenuated by ``1 / sqrt(1 + (f / loop_hz)^2)``.
     """
     column = np.arange(field.shape[1])
     strength = np.sqrt(field.real**2 + field.imag**2)
@@ -86,7 +86,7 @@ def track_paths(
 
 
 def _carrier(real: Singles, imaginary: Singles, rate_mps: Floats, anchor: Complexes) -> tuple[Floats, Floats]:
-    """Return the phase of the sum of paths [rad], and its rate relative to that of the main path [m/s]."""
+    """Return the phase of the sum of paths [rad], and its rate relative to the rate of the main path [m/s]."""
     carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
     angle = np.arctan2(
         quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
@@ -128,7 +128,7 @@ CLEAR_V: Final = -0.78  #: Fresnel parameter below which the loss of a knife edg
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
     """Return the ratio of Fresnel parameter to clearance [1/m] for an edge at a distance and a source at infinity.
 
-    The formula is that of ITU-R P.526-15, 4.1.
+    The formula is from ITU-R P.526-15, 4.1.
     """
     return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
 
@@ -169,8 +169,8 @@ def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Fl
     """Return the right-handed and left-handed amplitudes of a right-handed wave reflected by a smooth dielectric wall.
 
     ``G_perp = (c - r) / (c + r)``, ``G_par = (e c - r) / (e c + r)`` with c the cosine of incidence from the wall's
-    normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); ``|G_par + G_perp| / 2`` right-handed,
-    ``|G_par - G_perp| / 2`` left-handed.
+    normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel). The amplitudes are ``|G_par + G_perp| /
+    2`` (right-handed) and ``|G_par - G_perp| / 2`` (left-handed).
     """
     root = np.sqrt(permittivity - 1.0 + cosine**2)
     perpendicular = (cosine - root) / (cosine + root)

@@ -82,8 +82,8 @@ class Conductor:
     def scatter(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return amplitude, extra path [m] and direction (p, q) of the signal scattered to the antenna.
 
-        Only conductors on the side opposite the satellite scatter. The amplitude is that of a metal cylinder in
-        geometrical optics, sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and bistatic angle b; half of the
+        Only conductors on the side opposite the satellite scatter. A metal cylinder scatters the amplitude sqrt(a
+        cos(b/2) / (2 rho)) in geometrical optics, with radius a, distance rho and bistatic angle b; half of the
         scattered power has the antenna's polarisation. The extra path is rho c (1 - cos(phi)), where c is the component
         of the ray perpendicular to the conductor and phi the angle between this component and the direction to the
         conductor.
@@ -112,7 +112,7 @@ class Electrification:
         self.settings = settings
 
     def _number(self, chainage_m: Floats, every: int) -> Floats:
-        """Return the chainage of the nearest of every n-th mast."""
+        """Return the chainage of the nearest mast, counting only every n-th mast (`every`)."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 
@@ -178,7 +178,7 @@ class Electrification:
     def scatter(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
         """Return the signals that the nearest mast and beam scatter to the antenna.
 
-        Each has amplitude, extra path [m] and growth of the extra path with the chainage [m/m], of shape (N,).
+        Each signal has amplitude, extra path [m] and growth of the extra path with the chainage [m/m], shape (N,) each.
         """
         sign = np.where(rays.y > 0.0, -1.0, 1.0)
         conductors = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
@@ -194,7 +194,7 @@ class Electrification:
         return rows
 
 
-#: Chip length relative to that of C/A, by constellation and band; 1 for all other signals (BPSK(1), BOC(1,1)).
+#: Ratio of the chip length to a C/A chip, by constellation and band; 1 for all other signals (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle.
 _NO_FIELD: Final = 0.01  #: Amplitude below which reflections are neglected.

@@ -47,13 +47,13 @@ class ElectrificationSettings(ScenarioSettings):
     """Masts, beams across the tracks, and wires above the track."""
 
     spacing_m: Positive = 50.0  #: Spacing of the masts.
-    first_m: Finite = 10.0  #: Chainage of one mast; the others are at multiples of the spacing from it.
+    first_m: Finite = 10.0  #: Chainage of one mast; the other masts are at multiples of the spacing from it.
 
     sides: Sides = "both"  #: Sides of the line with masts.
     lateral_m: Positive = 3.0  #: Distance of the axis of a mast from the track axis.
     width_m: Positive = 0.35  #: Width of a mast.
     height_m: Positive = 9.0  #: Height of the top of a mast above the rails.
-    beam_every: int = Field(default=1, ge=0)  #: A beam across the tracks at every n-th mast; 0 for no beams.
+    beam_every: int = Field(default=1, ge=0)  #: Number n if every n-th mast has a beam; 0 for no beams.
     beam_height_m: Positive = 7.5  #: Height of the middle of a beam above the rails.
     beam_depth_m: Positive = 0.4  #: Depth of a beam.
     wire_height_m: Positive = 5.1  #: Height of the contact wire above the rails, over the track axis.
@@ -111,8 +111,8 @@ class SectionSettings(ScenarioSettings):
     from_m: Finite  #: Chainage of the start.
     to_m: Finite  #: Chainage of the end.
     kind: Kind  #: Kind of section, one of `KINDS`, which determines the usual walls and roofs.
-    rows: tuple[RowSettings, ...] | None = None  #: Rows of walls; None for those of the kind.
-    roofs: tuple[RoofSettings, ...] | None = None  #: Roofs; None for those of the kind.
+    rows: tuple[RowSettings, ...] | None = None  #: Rows of walls; None for the usual rows of the kind.
+    roofs: tuple[RoofSettings, ...] | None = None  #: Roofs; None for the usual roofs of the kind.
 
     _forward = field_validator("to_m")(beyond_start)
 
@@ -246,25 +246,25 @@ class SightGeometry:
     """Positions of one antenna, and directions to satellites, at T epochs for M channels."""
 
     antenna: str  #: "front" or "rear".
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time tags, shape (T,).
     satellite: Strings  #: Satellite of each channel, shape (M,).
     signal: Strings  #: Signal of each channel, shape (M,).
     chainage_m: Floats  #: Chainage of the centreline point abeam the antenna, shape (T,).
     speed_mps: Floats  #: Speed, negative toward falling chainage, shape (T,).
     antenna_ecef_m: Floats  #: Position of the antenna, shape (T, 3).
     heading_deg: Floats  #: Azimuth of the forward axis of the vehicle, shape (T,).
-    elevation_deg: Floats  #: Shape (T, M).
-    azimuth_deg: Floats  #: Shape (T, M).
+    elevation_deg: Floats  #: Elevation of the satellites, shape (T, M).
+    azimuth_deg: Floats  #: Azimuth of the satellites, shape (T, M).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """Terms that are added to the observations of T epochs and M channels, shapes (T, M)."""
 
-    code_m: Floats  #: NaN where the signal is lost; all observables are then absent.
+    code_m: Floats  #: Code error; NaN where the signal is lost, so that all observables are absent.
     phase_m: Floats
     doppler_hz: Floats
-    cn0_db: Floats  #: Negative where the signal is attenuated.
+    cn0_db: Floats  #: Change of C/N0, negative where the signal is attenuated.
 
 
 #: Function that computes disturbances from the geometry only, so that results do not depend on the chunks.

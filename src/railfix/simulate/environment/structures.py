@@ -104,7 +104,7 @@ SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arra
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """n structures that do not overlap on a side, first those on the left, then those on the right, by chainage."""
+    """n structures that do not overlap on a side: first on the left, then on the right, each side by chainage."""
 
     start_m: Floats  #: Chainage of the start, shape (n,).
     end_m: Floats  #: Chainage of the end, shape (n,).
@@ -172,7 +172,8 @@ def build_structures(sections: Sequence[SectionSettings], line_length_m: float, 
 def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int) -> tuple[Strips, ...]:
     """Return rows of trees along the whole line, one per element of `settings`.
 
-    Their properties are `distance_m`, `height_m`, `crown_m`, `attenuation_db_per_m`, `most_db` and `scatter`.
+    The properties of the trees are `distance_m`, `height_m`, `crown_m`, `attenuation_db_per_m`, `most_db` and
+    `scatter`.
     """
     reach = 4.0 * (line_length_m + 2.0 * BEYOND_M)
     names = ("distance_m", "height_m", "crown_m", "attenuation_db_per_m", "most_db", "scatter")

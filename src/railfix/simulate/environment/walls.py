@@ -35,7 +35,7 @@ class Rays(RowArrays):
     x: Floats  #: Component x of the unit vector to the satellite, shape (N,).
     y: Floats  #: Component y of the unit vector to the satellite, shape (N,).
     z: Floats  #: Component z of the unit vector to the satellite, shape (N,).
-    wavelength_m: Floats  #: Shape (N,).
+    wavelength_m: Floats  #: Wavelength of the signal, shape (N,).
 
 
 def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:
@@ -103,7 +103,7 @@ class Reflections:
     x_m: Floats  #: Coordinate x of the mirror image of the antenna, relative to the antenna.
     y_m: Floats  #: Coordinate y of the mirror image of the antenna, relative to the antenna.
     back_x: Floats  #: Component x of the unit vector from the antenna toward the reflected signal.
-    back_y: Floats  #: Component y of this unit vector.
+    back_y: Floats  #: Component y of the unit vector from the antenna toward the reflected signal.
     cosine: Floats  #: Cosine of the angle of incidence from the normal of the wall.
 
 

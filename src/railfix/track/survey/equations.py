@@ -14,7 +14,7 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the second difference of the line relative to the reference line [m]. Across the line it is
+#: Standard deviation of the second difference of the line relative to the reference line [m]. Across the line, it is
 #: larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends the line.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
@@ -24,7 +24,8 @@ _CORNER_M: Final = 5.0
 class ReferenceLine:
     """Line before the adjustment, J points."""
 
-    #: ECEF positions of the points, and unit vectors across the line and upward, in which points move; shape (J, 3).
+    #: ECEF positions of the points, and unit vectors across the line and upward, along which points are adjusted; shape
+    #: (J, 3).
     ecef_m: Floats
     across: Floats
     up: Floats
@@ -194,7 +195,7 @@ def tie_equations(
     line: ReferenceLine, ties: Ties, runs: Sequence[RunColumns], start: int, origin: Floats, limits: SurveyLimits,
     unknowns: int,
 ) -> Equations:  # fmt: skip
-    """Return the equations of passes: a run is on the line within an error correlated along the line."""
+    """Return the equations of passes, at which a run is on the line up to an error correlated along the line."""
     share = np.full(len(ties.point), min(1.0, limits.spacing_m / max(limits.correlation_m, 1e-9)))
     white = np.stack([line.across[ties.point], line.up[ties.point]], axis=1) / limits.apart_m
     first = np.array([columns.row[0] for columns in runs])[ties.run]

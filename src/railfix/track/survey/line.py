@@ -74,7 +74,8 @@ def adjust(
     """Adjust the positions of all runs, and the points of the line if `line` and `ties` are given.
 
     `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` is the number of times that the run
-    passes the position of each row; the weight of the row is divided by it. ``sigmas="line"`` computes `line_sigma_m`.
+    passes the position of each row; the weight of the row is divided by this number. ``sigmas="line"`` computes
+    `line_sigma_m`.
     """
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
@@ -114,7 +115,8 @@ def adjust(
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
     """Return the weight of each row as a fraction of an independent position, shape (n,).
 
-    It increases with the time and the distance since the previous row, up to 1 at twice the correlation time or length.
+    The weight increases with the time and the distance since the previous row, up to 1 at twice the correlation time or
+    length.
     """
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
@@ -176,7 +178,7 @@ def _line_sigmas(
     """Compute the standard deviations of the line, across and in height, shape (J, 2) [m].
 
     The expected information of an observation with Student's t errors is ``(freedom + size) / (freedom + size + 2)``
-    times that with normal errors; the smaller of this and the weight is used.
+    times the information with normal errors. The smaller of this factor and the weight is used.
     """
     expected = [
         np.full(len(weight), (limits.freedom + system.size) / (limits.freedom + system.size + 2.0))
@@ -207,8 +209,8 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 
 _ROUNDS: Final = 3  #: Number of adjustments with the line; passes are searched before each of them.
-#: Distance of the two directions, in standard deviations of a run's offset, beyond which they are on separate tracks:
-#: three standard deviations of the difference of two offsets.
+#: Distance between the passes of both directions, in standard deviations of a run's offset, beyond which they are on
+#: separate tracks. It is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
 _TURN_M: Final = 40.0  #: Distance over which a reversal is searched for [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
@@ -293,7 +295,8 @@ def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
     """Return additional standard deviations of the common error of a single run, plan and height, shape (2,) [m].
 
     If there is no second run, the common error is not observable. The addition then doubles
-    `SurveyRun.common_sigma_m`: without it, sigmas of single runs of low-cost receivers were half of their errors.
+    `SurveyRun.common_sigma_m`: without this addition, sigmas of single runs of low-cost receivers were half of their
+    errors.
     """
     return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
@@ -393,7 +396,7 @@ def _notes(
     if len(bridged := steps[steps > _TURN_M]):
         notes.append(
             f"{plural(bridged, 'gap')} in the runs bridged by a curve, the longest {bridged.max():.0f} m: the accuracy "
-            "there is that of its ends"
+            "there is the accuracy at its ends"
         )
     if len(runs) == 1:
         plan, height = (2.0 * value for value in runs[0].common_sigma_m)
@@ -407,7 +410,7 @@ def _notes(
         )
     if apart:
         notes.append(
-            f"the runs of one direction lie {apart:.1f} m beside those of the other: another track, left out; give the "
-            "runs of each track by themselves"
+            f"the runs of one direction lie {apart:.1f} m beside the runs of the other: they are on another track, and "
+            "are left out; give the runs of each track separately"
         )
     return tuple(notes)

@@ -45,7 +45,7 @@ class SurveyLimits(Settings):
         gt=0,
     )
     apart_m: float = option(
-        "Standard deviation of the distance of a pass from the line: lanes, antennas at other positions on the "
+        "Standard deviation of the distance of a pass from the line, for example with an antenna elsewhere on the "
         "vehicle.",
         0.5,
         name="--apart",
