@@ -30,7 +30,7 @@ class AntennaRows:
 
     @classmethod
     def on(cls, line: Trajectory | SearchIndex | AntennaRows) -> AntennaRows:
-        """Return `line` if it already is an `AntennaRows`, else the assignment of all rows to one antenna on it."""
+        """Return `line` if it is an `AntennaRows`, otherwise the assignment of all rows to one antenna on this line."""
         if isinstance(line, AntennaRows):
             return line
         return cls((line if isinstance(line, SearchIndex) else SearchIndex(line),), (EVERY,))
@@ -51,7 +51,7 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function for each antenna, with its search index, rows and item of each list; return the results."""
+        """Call a function for each antenna with its search index, rows, and item of each list; return the results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
@@ -66,7 +66,7 @@ class AntennaRows:
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
-        """Yield the search index of each antenna with its part of `rows`, which ascend; skip antennas without a row."""
+        """Yield each antenna's search index and its part of `rows` (ascending); skip antennas without a row."""
         if len(self.parts) == 1:
             if len(rows):
                 yield self.indices[0], rows

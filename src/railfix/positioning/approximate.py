@@ -16,7 +16,7 @@ from railfix.positioning.section_search import SectionLimits, find_section
 
 #: Standard deviation of raw ranges for the approximate position of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: Largest last step: after a step of this length the error of a range is 0.03 m [m].
+#: The iteration ends at a step shorter than this, after which the error of a range is at most 0.03 m [m].
 _TOLERANCE_M: Final = 1000.0
 #: Largest distance of a raw 3-D position from the line at which it is moved to the line [m].
 MAX_FROM_LINE_M: Final = 1e5
@@ -34,12 +34,12 @@ class ApproximatePosition(NamedTuple):
 def approximate_position(
     ranges: Ranges, line: Line, *, limits: SinglePointLimits | None = None, section: SectionLimits | None = None
 ) -> ApproximatePosition:
-    """Estimate approximate positions from the raw codes without gross errors (P1 2.2(2): to predict delays).
+    """Estimate approximate positions from raw codes without gross errors, at which delays are computed (P1 2.2(2)).
 
-    A 3-D position is estimated from raw ranges of equal weight, at every epoch from the middle of the line, so that
-    epochs are independent. It is moved to the nearest trajectory point unless it is far from the line. Without a 3-D
-    position, or with a gross error that cannot be identified, the best-fitting point of the line is returned, or the
-    middle of the line where there is none.
+    A 3-D position is estimated from raw ranges of equal weight. The iteration of every epoch starts from the middle of
+    the line, so that epochs are independent. The position is moved to the nearest trajectory point unless it is far
+    from the line. Without a 3-D position, or with a gross error that cannot be identified, the best-fitting point of
+    the line is returned; if no point fits, the middle of the line.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Robust fits of an epoch's ranges.
 
 Fits are iteratively reweighted least squares with the IGG-III weights (Yang, Song and Xu, Journal of Geodesy 76, 2002)
-and the median of the absolute residuals as scale: no noise level is assumed.
+and the median of the absolute residuals as scale, so that no noise level has to be assumed.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def robust_fit(
 
     `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which they are linearised.
 
-    `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`), with which one
-    position unknown remains; there are three without it.
+    `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`). With it, the
+    number of position unknowns is one; without it, three.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0

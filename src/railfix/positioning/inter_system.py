@@ -31,11 +31,11 @@ class ClockOffsetLimits(Settings):
     #: Standard deviation of a bias about its mean; with infinity every constellation keeps a separate clock. On an
     #: urban recording the standard deviation was 1.0 m (Galileo, BeiDou).
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
-    #: Epochs closer together than this are not independent: errors of a train at rest are correlated over tens of
-    #: seconds.
+    #: Epochs closer together than this count as one sample, because the errors of a train at rest are correlated over
+    #: tens of seconds.
     correlation_s: float = Field(default=30.0, gt=0)
-    #: Time constant of exponential forgetting: biases are stable to a metre over hours, and within half an hour the
-    #: effect of a receiver restart or an undetected error decays.
+    #: Time constant of exponential forgetting. Biases are stable to a metre over hours; with this constant, the effect
+    #: of a receiver restart or of an undetected error decays within half an hour.
     window_s: float = Field(default=1800.0, gt=0)
 
 
@@ -78,8 +78,9 @@ def tie_clocks(
 ) -> tuple[InterSystemBiases, list[OffsetState]]:
     """Estimate the inter-system biases at each epoch from earlier epochs (P1 3.3); also return the new states.
 
-    `ranges` are untied ranges that agree with each other, and `clocks` the letters of their groups; `free` are
-    positions from them with separate clocks. `parts` are the rows of each receiver, one for each of `states`.
+    `ranges` are untied ranges that agree with each other, `clocks` the letters of their groups, and `free` the
+    positions computed from them with separate clocks. `parts` are the rows of each receiver, one item for each item of
+    `states`.
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
@@ -121,14 +122,14 @@ class PointPositions(NamedTuple):
 
     point: SinglePoint  #: Conventional position, with a clock for each constellation.
     tied: SinglePoint  #: Conventional position from the ranges tied by known biases.
-    free: SinglePoint  #: Position with separate clocks from the ranges that agree with each other in space.
-    disagreeing: Masks  #: Used ranges that do not agree with the others in space, shape (T, K).
+    free: SinglePoint  #: Position with separate clocks, from the ranges that are consistent with one 3-D position.
+    disagreeing: Masks  #: Used ranges that are inconsistent with the 3-D position of the other ranges, shape (T, K).
     ties: InterSystemBiases
-    gross: Masks  #: Ranges alone on their clock that contradict the known biases by over `GROSS_M`, shape (T, K).
+    gross: Masks  #: Sole ranges of a clock that contradict the known biases by more than `GROSS_M`, shape (T, K).
 
 
 class TieLimits(NamedTuple):
-    """Limits of the positions, of the robust fit in space, and of the inter-system biases."""
+    """Limits of the 3-D positions, of their robust fit, and of the inter-system biases."""
 
     single_point: SinglePointLimits = SinglePointLimits()
     robust_fit: RobustFitLimits = RobustFitLimits()
@@ -149,8 +150,8 @@ def tie_constellations(
     """Return ranges tied by the inter-system biases known before each epoch, 3-D positions (P1 5), and the new states.
 
     Each additional constellation requires one satellite for its clock, unless its bias is known to a metre. A bias is
-    the difference of two receiver clocks in positions from ranges that agree with each other, averaged over earlier
-    epochs; results therefore do not depend on the division of a log into chunks.
+    the difference of two receiver clocks, estimated with positions from ranges that agree with each other, and averaged
+    over earlier epochs. The results therefore do not depend on the division of a log into chunks.
 
     Parameters
     ----------
@@ -203,7 +204,7 @@ def _tie(
 def _agreeing(
     ranges: Ranges, point: SinglePoint, start_ecef_m: Floats, limits: TieLimits
 ) -> tuple[Ranges, SinglePoint, Masks]:
-    """Return the ranges that agree with each other in space, 3-D positions from them, and a mask of the others."""
+    """Return the ranges consistent with one 3-D position, the 3-D positions from them, and a mask of the others."""
     dropped = (ranges.weight > 0) & ~robust_fit(ranges, start_ecef_m, limits=limits.robust_fit).kept
     changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):

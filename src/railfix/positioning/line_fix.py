@@ -25,7 +25,7 @@ from railfix.positioning.section_search import Section, SectionLimits, find_sect
 class FixLimits(NamedTuple):
     """Limits of the stages from 3-D position to position on the line."""
 
-    min_satellites: int = 3  #: Fewest satellites of a position; 2 give wrong sections on sharp curves (P1 3.2).
+    min_satellites: int = 3  #: Fewest satellites for a position; with 2, sections in sharp curves are wrong (P1 3.2).
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
     constrained: ConstrainedLimits = ConstrainedLimits()
@@ -41,7 +41,7 @@ class LineFix(NotebookTable):
 
 
 def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimits | None = None) -> LineFix:
-    """Compute section and position on the line (P1 2.2(2), (3)); no position below `FixLimits.min_satellites`."""
+    """Compute section and position on the line (P1 2.2(2), (3)); NaN with too few satellites (`min_satellites`)."""
     limits, antennas = limits or FixLimits(), AntennaRows.on(line)
     section = find_section(ranges, antennas, point, limits=limits.section)
     vertex = np.where(ranges.n_used >= limits.min_satellites, section.vertex, -1)
@@ -52,7 +52,7 @@ def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimit
 
 
 def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
-    """Return positions in which some epochs, in ascending order, are replaced by positions from `ranges`."""
+    """Return `fix` with the positions of `epochs` (ascending) recomputed from `ranges`."""
     for index, own in antennas.split(epochs):
         part = ranges.take(own)
         solved = fix_on_line(

@@ -31,10 +31,10 @@ _SUMS: Final = 9  #: Number of sums per window.
 class MapOffsetLimits(Settings):
     """Limits of the test of the map."""
 
-    #: Time constant of exponential forgetting: six independent samples, short enough to detect local map errors.
+    #: Time constant of exponential forgetting. It has six independent samples, and detects local map errors.
     window_s: float = Field(default=120.0, gt=0)
     correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
-    least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision: one minute.
+    least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision.
     #: False-alarm probability of the note and of the status, by noise alone (chi-square, two degrees of freedom).
     #: The nominal sigmas are assumptions; on the recordings, with a correct map and all screens, the statistic stays
     #: below the threshold of the status, 13.8 (``tests/references/results/bounds.txt``).
@@ -55,13 +55,13 @@ class MapOffsetLimits(Settings):
 
     @cached_property
     def detectable_sigmas(self) -> float:
-        """Offset that the status misses with the probability `missed` (non-central chi-square) [sigmas]."""
+        """Offset that the test of the status misses with the probability `missed` (non-central chi-square) [sigmas]."""
         return float(np.sqrt(scipy.special.chndtrinc(self.threshold, 2, self.missed)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetState:
-    """Decayed sums after the last epoch."""
+    """State after the last epoch: exponentially decayed sums over its window."""
 
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -116,15 +116,15 @@ class OffsetErrors(NamedTuple):
     """Errors of the ranges of T epochs."""
 
     nominal_m: Floats  #: Standard deviations of satellite and atmospheric errors, shape (T, M).
-    variance: Floats  #: Variance of the ranges relative to their weights, shape (T,).
+    variance: Floats  #: Variance of the ranges as a multiple of the variance assumed by their weights, shape (T,).
 
 
 class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
     arc_m: Floats  #: Arc length; NaN without a position; shape (T,).
-    #: Epochs at which the train is off the line, shape (T,). They have a separate window, because positions off the
-    #: line contain no information on the map after the train returns to it.
+    #: Epochs at which the train is off the line, shape (T,). Their sums are separate, because positions off the line
+    #: give no information on the map after the train returns to it.
     off_map: Masks
 
 
@@ -139,7 +139,7 @@ def map_offset(
     *,
     limits: MapOffsetLimits | None = None,
 ) -> tuple[MapOffset, list[MapOffsetState]]:
-    """Compute the mean offset of 3-D positions from the line up to each epoch, and the new state of each antenna."""
+    """Compute the mean offset of 3-D positions from the line over the window up to each epoch, and the new states."""
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)
@@ -216,9 +216,8 @@ def terms_of_epochs(
 def means_of_windows(
     sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of sums (T, 9).
-
-    They are fields of `MapOffset`. `detectable_sigmas` is a property of `MapOffsetLimits`.
+    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of sums (T, 9). The
+    results are fields of `MapOffset`. `detectable_sigmas` is a property of `MapOffsetLimits`.
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])

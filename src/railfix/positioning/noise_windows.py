@@ -19,7 +19,7 @@ class Windows(NamedTuple):
 
     step_s: Floats  #: Time since the previous epoch; 0 without one; shape (T,).
     growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).
-    decay: Floats  #: Factor of the running sums for the spans begun since the previous epoch; 1 for none; shape (T,).
+    decay: Floats  #: Decay factor of the running sums for spans begun since the previous epoch; 1 if none; shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).
     last: list[Dated]  #: Last epoch of each antenna.
 
@@ -29,8 +29,8 @@ class Windows(NamedTuple):
     ) -> Windows:
         """Compute the ages from the rows of each antenna and its last earlier epoch (`before`).
 
-        A window is `window_s` or `least_epochs` epochs, whichever is longer: a gap counts as at most 1 / `least_epochs`
-        of a window.
+        A window is `window_s` or `least_epochs` epochs, whichever is longer. A gap therefore counts as at most 1 /
+        `least_epochs` of a window.
         """
         times, ages = zip(*before, strict=True)
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
@@ -43,7 +43,8 @@ class Windows(NamedTuple):
         return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, last)
 
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
-        """Return the sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
+        """Return, for each epoch, the sum of `values` (T, K) over earlier epochs, each times ``exp(-difference of the
+        ages)``.
 
         `start`, shape (A, K), are the running sums after the previous epochs; the running sums after the last epochs
         are also returned.
@@ -64,9 +65,10 @@ def correlated_sums(
 ) -> tuple[Floats, Floats, Floats, list[Dated]]:
     """Compute sums over a window of epochs whose errors are correlated over `correlation_s`.
 
-    An epoch has the time since the previous epoch divided by `correlation_s`, at most 1, as its weight. Arguments are
-    as for `Windows`. Returns the decayed sums before each epoch (T, K), the weighted values of each epoch (T, K), the
-    running sums after the last epochs (A, K), and the last epochs.
+    The weight of an epoch is the time since the previous epoch divided by `correlation_s`, at most 1. `start` is
+    described at `Windows.sums`, `parts` and `before` at `Windows.of`. Returns the decayed sums before each epoch (T,
+    K), the weighted values of each epoch (T, K), the running sums after the last epochs (A, K), and the last epoch of
+    each antenna.
     """
     windows = Windows.of(time, parts, before, window_s=window_s, least_epochs=window_s / correlation_s)
     own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values

@@ -34,13 +34,13 @@ class NormalEquations:
     """Fit of ranges at a position, with the clocks eliminated."""
 
     matrix: Floats  #: Normal matrix of the position in ECEF, shape (T, 3, 3) [1/m^2].
-    vector: Floats  #: Right-hand side: the step that lowers `wsse` most is ``matrix^-1 vector``; shape (T, 3) [1/m].
+    vector: Floats  #: Right-hand side; the least-squares step is ``matrix^-1 vector``; shape (T, 3) [1/m].
     wsse: Floats  #: Weighted sum of squared residuals at the position itself, shape (T,).
     #: Receiver clock of each group at the position; NaN where the group has no satellite; shape (T, G).
     clock_m: Floats
     residual_m: Floats  #: Code - range - clock; 0 where the weight is 0; shape (T, M).
-    clock_slope: Floats  #: Decrease of `clock_m` by a step from the position, per metre of each axis; shape (T, 3, G).
-    design: Floats  #: Decrease of `residual_m` by a step from the position, per metre of each axis; shape (T, 3, M).
+    clock_slope: Floats  #: Decrease of `clock_m` per metre of a step along each axis, shape (T, 3, G).
+    design: Floats  #: Decrease of `residual_m` per metre of a step along each axis, shape (T, 3, M).
 
 
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
@@ -54,10 +54,10 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 
 
 def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
-    """Return the weighted sum of squared residuals at positions (n, 3) [m], the clocks eliminated, shape (n,):
-    `normal_equations(...).wsse` without the derivatives.
+    """Return the weighted sum of squared residuals at positions (n, 3) [m], with the clocks eliminated, shape (n,).
 
-    `epochs`: epoch of each position; by default one position per epoch, in order.
+    Same as `normal_equations(...).wsse`, without the derivatives. `epochs` is the epoch of each position; by default,
+    there is one position per epoch, in order.
     """
     of = np.arange(len(ranges)) if epochs is None else epochs
     return kernels.ranges.misfits(ranges.arrays, kernel_array(place_ecef_m), of)
@@ -66,9 +66,9 @@ def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) 
 class ConstrainedLimits(Settings):
     """Limits of the iteration along the line."""
 
-    #: Largest last step inside a section: after a step of 5 m the error is 0.03 mm (`railfix.kernels.ranges`).
+    #: Largest last step inside a section, which leaves an error of 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including those between sections.
+    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including steps to another section.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -79,9 +79,9 @@ class Constrained(NotebookTable):
     section: Indices  #: Section that contains the position, -1 without a position; shape (T,).
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
     exact_map_sigma_m: Floats  #: Part of `sigma_m` from the weights alone, as for an exact map; shape (T,).
-    #: Sigma along the line for unit, equal weights and an exact map; infinite where undetermined; shape (T,).
+    #: Sigma along the line for unit weights and an exact map; infinite where not determined; shape (T,).
     dilution: Floats
-    #: Distance beyond the end of the line implied by the ranges of a position clamped to it; 0 elsewhere; shape (T,).
+    #: Distance beyond an end of the line implied by the ranges of a position clamped to this end; else 0; shape (T,).
     overshoot_m: Floats
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
     wsse: Floats  #: Weighted sum of squared residuals, with the map error taken into account; shape (T,).
@@ -96,8 +96,8 @@ def position_on_line(
 
     The iteration consists of Newton steps in d inside a section, with the receiver clocks eliminated. A step beyond the
     section stops at its end, and the iteration continues in the neighbouring section. Where the steps from both
-    neighbouring sections lead back to their common point, that point is the solution. At an open end the position is
-    clamped, and `overshoot_m` is the distance beyond it implied by the ranges.
+    neighbouring sections lead back to their common point, that point is the solution. At an open end of the line, the
+    position is clamped to the end, and `overshoot_m` is the distance beyond the end implied by the ranges.
 
     Parameters
     ----------
@@ -134,7 +134,8 @@ def _on_line(
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
     """Return arc lengths (T,), and the values of `_from` with the epochs on the last axis.
 
-    Positions clamped to an end of a closed line are also solved from where the line continues; the better fit is kept.
+    For positions clamped to an end of a closed line, the iteration is repeated from the point at which the line
+    continues; the better fit is kept.
     """
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
@@ -178,9 +179,9 @@ class SectionArrays(NamedTuple):
 class SinglePointLimits(Settings):
     """Limits of the iteration of 3-D positions, and of their validation (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: Largest last step: after a step of 1 m the error is 0.01 mm.
+    tolerance_m: float = Field(default=1.0, gt=0)  #: Largest last step, which leaves an error of 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
-    #: Probability that noise alone fails the chi-square test of the residuals.
+    #: False-alarm probability of the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
     #: Largest position dilution of precision; RTKLIB limits the geometric dilution of precision to 30.
     dilution_limit: float = Field(default=30.0, gt=0)

@@ -1,9 +1,9 @@
 """Receiver noise scale and single-epoch sigma.
 
-Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting. The robust scale, from
-the ranges of each epoch that agree with each other, is used in the RAIM test and does not depend on its results. The
-stated scale, from the ranges that RAIM accepted, is used in every sigma and protection level. Epochs that RAIM did not
-resolve, and epochs off the map, contribute to neither scale.
+Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting. The robust scale is
+estimated from the ranges of each epoch that agree with each other. It is used in the RAIM test, and does not depend on
+the results of RAIM. The stated scale is estimated from the ranges that RAIM accepted, and is used in every sigma and
+protection level. Epochs that RAIM did not resolve, and epochs off the map, contribute to neither scale.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ class NoiseScaleLimits(Settings):
     """Limits of the estimation of a receiver's noise scale."""
 
     #: Time constant of exponential forgetting. Code errors are correlated over about 20 s (0.6 after 10 s on
-    #: recordings): five correlation times give enough independent samples for a mean, and are short enough that the
-    #: effect of a street or station decays before the next.
+    #: recordings). Five correlation times have enough independent samples for a mean, and are short enough that the
+    #: effect of one street or station decays before the next.
     window_s: float = Field(default=100.0, gt=0)
-    #: Weight of the prior scale as a number of redundant ranges: two or three epochs. With infinity the scale is the
-    #: prior scale.
+    #: Weight of the prior scale, as a number of redundant ranges; the default corresponds to two or three epochs. With
+    #: infinity the scale is the prior scale.
     prior: float = Field(default=20.0, gt=0)
     least_epochs: float = Field(default=20.0, ge=1)  #: Fewest epochs in the window; gaps are not counted.
-    #: Degrees of freedom of the scale between epochs: the noise of single epochs varies more than chi-square predicts,
-    #: so the variance stated for an epoch combines the window's variance, weighted by this number, with the squared
-    #: residuals of the epoch. Student's t of code errors on recordings also has 4 degrees of freedom.
+    #: Degrees of freedom of the variation of the scale between epochs. The noise of single epochs varies more than
+    #: chi-square predicts, so the variance stated for an epoch combines the window's variance, weighted by this number,
+    #: with the squared residuals of the epoch. Student's t of code errors on recordings also has 4 degrees of freedom.
     spread: float = Field(default=4.0, gt=0)
 
 
@@ -64,10 +64,10 @@ def noise_scale(
     limits: NoiseScaleLimits,
     least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Return the ratio of the ranges' standard deviation to the assumed value (1 in P4), and the new sums (A, 2).
+    """Return the ratio of the ranges' standard deviation to the assumed value (P4 assumes 1), and the new sums (A, 2).
 
     The ratio, shape (T,), at least `least`, is the root mean square of the normalised residuals of earlier epochs with
-    exponential forgetting, combined with `prior`, shape (T,). Epochs outside of `teaching` are left out. `start`,
+    exponential forgetting, combined with `prior`, shape (T,). Only epochs in the mask `teaching` are used. `start`,
     shape (A, 2), are the sums after the previous epochs.
     """
     use = teaching & (freedom > 0) & np.isfinite(wsse)
@@ -82,8 +82,8 @@ def noise_scale(
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
     """Return the variance of the ranges of each epoch relative to their weights, shape (T,).
 
-    It is the scale of the posterior of a variance that has a scaled inverse chi-square distribution about the window's
-    variance with `spread` degrees of freedom, given the residuals of the epoch.
+    The prior of the variance is a scaled inverse chi-square distribution about the variance of the window with `spread`
+    degrees of freedom; the result is the scale of the posterior given the residuals of the epoch.
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
@@ -93,8 +93,8 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
 def epoch_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
     """Return the single-epoch sigma along the line, shape (T,) [m].
 
-    It is the standard deviation from the weights, times the larger of the receiver's scale and the scale of the epoch's
-    residuals, times the ratio of the 97.5 % quantiles of Student's t and of the normal distribution.
+    The sigma is the standard deviation from the weights, times the larger of the receiver's scale and the scale of the
+    epoch's residuals, times the ratio of the 97.5 % quantiles of Student's t and of the normal distribution.
     """
     freedom = np.maximum(redundancy, 1)
     shown = np.sqrt(np.maximum(wsse, 0.0) / freedom)
@@ -118,10 +118,10 @@ class RobustClock:
 def robust_clock(
     residual_m: Floats, sigma_m: Floats, groups: tuple[slice, ...], *, least_ranges: int = 4
 ) -> RobustClock:
-    """Estimate the receiver clock of each group of channels: the Huber-weighted mean of residuals, from their median.
+    """Estimate the receiver clock of each group of channels as the Huber-weighted mean of residuals.
 
     `residual_m`, shape (T, K), are range errors plus the clock, and `sigma_m` their standard deviations; channels with
-    NaN are left out. `least_ranges` is the fewest ranges for a clock estimate.
+    NaN are left out. The iteration starts from the median. `least_ranges` is the fewest ranges for an estimate.
     """
     clock = np.full((len(residual_m), len(groups)), np.nan)
     share = np.zeros(residual_m.shape)

@@ -36,19 +36,20 @@ class SearchIndex:
 
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
-        """Middle points and radii [m] of the stretches of all levels, shape (S,), and where each level starts."""
+        """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first index of each level."""
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
     @cached_property
     def arc_of_points_m(self) -> Floats:
-        """Arc length of each point, the smallest value where the line passes it several times, shape (V,) [m]."""
+        """Arc length of each point, shape (V,) [m]; the smallest value if the line passes the point several times."""
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a horizontal distance from positions on the line within which it lies on the tangent, shape (T,) [m].
+        """Return a horizontal distance from positions on the line within which the line lies on its tangent, shape (T,)
+        [m].
 
-        The distance, at most `CLEAR_M`, is computed once per section and valid for all positions on it.
+        The distance, at most `CLEAR_M`, is computed once per section, and is valid for all positions on the section.
         """
         line = self.trajectory
         section = line.segment_at(arc_m)[0]

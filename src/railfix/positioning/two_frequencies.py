@@ -1,14 +1,14 @@
-"""Combination of both codes of a satellite to one pseudorange, with the ionospheric delay measured.
+"""Combination of the two codes of a satellite to one pseudorange, with an estimate of the ionospheric delay.
 
-The difference of the two corrected codes of a satellite has no geometry. With ``ratio = (f1/f2)^2`` it is
+The difference of the two corrected codes of a satellite does not depend on the geometry. With ``ratio = (f1/f2)^2``,
 
     ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
 
 where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
 receiver. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as prior) and a
 residual of each satellite. I and B are estimated from the mean differences of all satellites by best linear prediction.
-The range is then the least-squares estimate from both codes less the predicted ionosphere; only the unpredicted part of
-the ionosphere distinguishes the codes.
+The range is then the least-squares estimate from both codes less the predicted ionosphere, where the remaining
+ionospheric error affects the two codes differently.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.second_codes import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
-_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples with the noise assumed by the weights.
+_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples, whose noise is the noise assumed by the weights.
 _CLIP: Final = 2.5  #: Limit of the mean difference of a satellite [sigma].
 _LEAST_SUSPICION_M: Final = 3.0  #: Least difference of the two codes that is suspected [m].
 
@@ -37,7 +37,7 @@ class TwoFrequencyLimits(Settings):
 
     #: Time constant of the mean differences of the codes. The error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
-    #: Epochs closer together than this are one sample: the multipath of a train at rest is correlated over this time.
+    #: Epochs closer together than this count as one sample, because multipath errors of a train at rest are correlated.
     correlation_s: float = Field(default=60.0, gt=0)
     #: Standard deviation of the difference of two signals' broadcast group delays.
     delay_sigma_m: float = Field(default=0.2, gt=0)
@@ -59,7 +59,7 @@ class TwoFrequencyState:
     age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
-        """Return the state with the pairs of a chunk added, and the index of each of these pairs in it."""
+        """Return the state with the pairs of a chunk added, and the index in this state of each pair of the chunk."""
         if names == self.names:
             return self, np.arange(len(names))
         known = {name: i for i, name in enumerate(self.names)}
@@ -96,7 +96,7 @@ def combine_codes(
     state: TwoFrequencyState,
     limits: TwoFrequencyLimits,
 ) -> tuple[Combined, TwoFrequencyState]:
-    """Combine the two codes of each satellite, with the ionosphere estimated from earlier epochs, and the new state.
+    """Return the combined codes, with the ionosphere estimated from earlier epochs, and the new state.
 
     `code_m`, shape (T, K), are corrected first codes, NaN where unusable, and `noise_m` the sigmas of their noise.
     `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionosphere on the first frequency by its
@@ -123,7 +123,7 @@ def combine_codes(
     known = both & (information > 0.0)
     mean[known] = before[np.nonzero(known)[0], size + at[known]] / information[known]
     scale, of_scale = _noise_scale(time, difference - mean, variance, known, own, ages)
-    # errors constant over a time C: the mean over a time T has 1 + T / C independent samples
+    # for errors that are constant over a time C, the mean over a time T has 1 + T / C independent samples
     of_mean = scale[:, None] / (information + 1.0 / np.where(known, variance, 1.0))
     lever = second.ratio - 1.0
     delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2
@@ -132,7 +132,7 @@ def combine_codes(
     error = of_mean + delay + lever**2 * own_m2
     group = np.where(known, groups[second.pair], -1) if size else second.pair
     weight = np.where(known, 1.0 / error, 0.0)
-    for _ in range(2):  # in the second pass an outlying satellite has little weight
+    for _ in range(2):  # in the second pass an outlying satellite has a small weight
         field, of_field, bias, of_bias = _fit_field(mean, basis[..., :3], lever, weight, group)
         rest = mean - bias - lever * field
         weight = np.where(known, 1.0 / (error + (rest / _CLIP) ** 2), 0.0)
@@ -165,8 +165,8 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
 
-    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise is not smoothed over epochs. `delays_m` are the group delays of
-    the first and the second code that the corrections contain; they are added back; shapes (T, K).
+    The combination is ``P = (ratio P1 - P2) / (ratio - 1)``; its noise is not smoothed over epochs. `delays_m` are the
+    group delays contained in the corrections of the first and the second code, shapes (T, K); they are added back.
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]

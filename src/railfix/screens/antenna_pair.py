@@ -1,11 +1,11 @@
 """Comparison of the pseudoranges of two antennas, given their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
 The range from the rear antenna to a satellite is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
-gradient)``, with L the antenna spacing. Another difference indicates multipath at one of the two antennas, but does not
+gradient)``, with L the antenna spacing. A different value indicates multipath at one of the two antennas, but does not
 show at which antenna.
 
-With clocks "common" the receivers must share a clock: where the median difference exceeds `SEPARATE_CLOCKS_M`, the
-screen is not run (P1 6). With clocks "median" the clock difference is the median over the satellites of a
+With clocks "common" the receivers must share a clock: where the median difference exceeds `SEPARATE_CLOCKS_M`, no
+satellite is tested (P1 6). With clocks "median" the clock difference is the median over the satellites of a
 constellation. If range rates are given, the satellites' motion between the two time tags is removed (0.8 m in 1 ms at
 most).
 
@@ -150,7 +150,7 @@ def ambiguity_m(
 ) -> Floats:
     """Return the largest change of the expected difference that angle errors can cause [m].
 
-    For 18.2 m spacing and the default errors it is at most 1.1 m (P1 2.3(3)), for a low satellite abeam.
+    For a spacing of 18.2 m and the default errors, the change is at most 1.1 m, for a low satellite abeam (P1 2.3(3)).
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def antenna_pair_screen(
     spacing : Spacing
         Returned by `spacing_direction`.
     tags : TagDifference, optional
-        Without it the observations of both receivers are assumed simultaneous.
+        If None, the observations of both receivers are assumed to be simultaneous.
 
     Returns
     -------

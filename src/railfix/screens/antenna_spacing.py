@@ -18,7 +18,7 @@ from railfix.screens.pairs import FilteredMotion, PairedEpochs, PositionScreen
 class AntennaSpacingLimits(Settings):
     """Limits of the antenna-spacing screen."""
 
-    #: Largest difference between the distance of the two positions and the antenna spacing; P1 table 6: 5.
+    #: Largest difference between the distance of the two positions and the antenna spacing; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Smallest rejected difference of filter positions or speeds, in standard deviations. It applies in addition to the
     #: limits in m and m/s, because the filter may predict over gaps.
@@ -92,7 +92,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge(
         self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict for pairs of positions; NaN and no rejection where the spacing is unknown."""
+        """Return metric and verdict for pairs of positions; where the spacing is unknown, NaN and no rejection."""
         unknown = np.isnan(pair.along_m)
         along = np.where(unknown, 0.0, pair.along_m)
         found = antenna_spacing_screen(

@@ -89,7 +89,7 @@ class ScreenPicture:
     metric: Floats  #: Shape (T, M).
     reject: Masks  #: Shape (T, M).
     limit: Floats | float  #: Broadcasts to (T, M).
-    #: Rejected values: those whose size exceeds the limit ("both"), those above it, or those below it.
+    #: Which values are rejected: values whose magnitude exceeds the limit ("both"), values above, or values below it.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -101,7 +101,7 @@ class ObservationPicture(NamedTuple):
     label: str
     metric: str  #: Column of the observations.
     reason: Reason  #: Reason of the rejected observations.
-    limit: str  #: Field of the screen's limits (if it is None, there is no picture), or column of the observations.
+    limit: str  #: Field of the screen's limits (no picture if the field is None), or column of the observations.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -121,9 +121,9 @@ class RunTables(Protocol):
 class Screen(ABC, Generic[Limits]):
     """Base class of `ObservationScreen`, `PairScreen` and `PositionScreen`, from which a new screen is derived."""
 
-    name: ClassVar[str]  #: Name in `Config.screens` and of its settings group.
+    name: ClassVar[str]  #: Name of the screen in `Config.screens`, and of its settings group.
     limits: Limits  #: Default limits, whose type defines the settings group.
-    needs: ClassVar[str]  #: Required data, as quoted in the note that the screen was not run.
+    needs: ClassVar[str]  #: Data that the screen requires, quoted in the note that the screen was not run.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
@@ -155,5 +155,6 @@ class ObservationScreen(Screen[Limits]):
         Parameters
         ----------
         state : object
-            State returned for the previous chunk; None at the start. A screen without memory returns it unchanged.
+            State returned for the previous chunk; None at the start. A screen that does not use earlier epochs returns
+            it unchanged.
         """

@@ -93,7 +93,7 @@ def cn0_screen(
 
 
 class Cn0Screen(ObservationScreen[Cn0Limits]):
-    """C/N0 screen with a floor, and a curve over elevation."""
+    """Screen of C/N0, with an absolute floor and an open-sky curve over elevation."""
 
     name = "cn0"
     limits = Cn0Limits()
@@ -120,7 +120,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
         return setup.cn0_curve is None and limits.floor_dbhz is None
 
     def notes(self, limits: Cn0Limits, setup: ScreenSetup) -> tuple[str, ...]:
-        """Return a note if the curve is missing; it reports whether the floor is applied."""
+        """Return a note if the curve is missing; the note states whether the floor is applied."""
         if setup.cn0_curve is not None or limits.floor_dbhz is None:
             return super().notes(limits, setup)
         return (f"screen cn0: no curve over elevation (cn0_curve), only the floor of {limits.floor_dbhz:g} dB-Hz used",)
@@ -128,7 +128,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
     def judge(
         self, antenna: AntennaRanges, limits: Cn0Limits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdicts of floor and curve on a chunk, and the state unchanged: the screen has no memory."""
+        """Return the verdicts of floor and curve on a chunk, and the unchanged state (no earlier epochs are used)."""
         result = cn0_screen(
             antenna.cn0_dbhz,
             antenna.elevation_deg,

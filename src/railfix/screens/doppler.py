@@ -2,14 +2,15 @@
 
 A pseudorange has jumped if its change differs from the change computed from the Dopplers at both epochs. A constant
 multipath error is not detected. A step of the receiver clock changes all pseudoranges equally, and is removed with the
-median over a constellation. The interval is first corrected for the clock step (4 ms times 800 m/s are 3.2 m).
+median over a constellation. The interval is first corrected for the clock step: at a range rate of 800 m/s, a step of 4
+ms changes the range by 3.2 m.
 
 P1 uses epochs 0.1 s apart. Over longer intervals the limit grows with the uncorrelated part of the pseudorange noise,
 ``sqrt(1 - exp(-dt / correlation_s))``, and the change of acceleration, ``jerk dt^3 / 12``. The limit has three modes,
-none of which goes below P1's limit: "fixed" is P1's limit; "receiver" is `factor` times the noise scale of the
+and is never smaller than P1's limit: "fixed" is P1's limit; "receiver" is `factor` times the noise scale of the
 receiver, estimated from its pseudorange changes; "sigma" is `factor` times the standard deviation of each pseudorange
 change, with the Doppler noise ``sigma dt`` included. In urban recordings at 1 Hz the mode "sigma" detects a quarter of
-the faulty pseudoranges, at an equal loss of good ones.
+the faulty pseudoranges, and rejects the same fraction of fault-free pseudoranges.
 """
 
 from __future__ import annotations
@@ -107,8 +108,9 @@ def receiver_limit_m(
     """Return the limit of mode "receiver", shape (T,) [m], and the sum and number of the log noise scales so far.
 
     The noise scale of an epoch is the median absolute change over the satellites, reduced to `short_interval_s`. The
-    logarithms are averaged over the epochs, so that an epoch with much multipath does not dominate. With a dozen
-    satellites the scale is a tenth to a seventh too small, because the median of the same changes has been subtracted.
+    logarithms of the scales are averaged over the epochs, so that an epoch with large multipath errors does not
+    dominate. With a dozen satellites, the scale is too small by a tenth to a seventh, because the median of the same
+    changes has been subtracted.
     """
     growth = _growth(interval_s, limits)
     shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
@@ -136,7 +138,7 @@ class DopplerScreened(Screened):
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerState:
-    """Observations of the last epoch, and the suspicions at that epoch; shapes (M,)."""
+    """Observations and suspected satellites at the last epoch; shapes (M,)."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     #: Satellite and signal of each channel; the next chunk may have different channels.
@@ -182,10 +184,10 @@ def doppler_screen(
     receiver clock (GPS and QZSS share a clock).
 
     A single difference does not show which of its two epochs is faulty. A satellite whose metric exceeds the limit is
-    suspected and rejected, and the metric is summed to an offset. As soon as the offset is within the limit, the
-    satellite is used again, although its jump back exceeds the limit. If the offset does not return within `hold_s`,
-    the new pseudorange is accepted. A temporary reflection therefore removes only its own epochs. The end of a
-    reflection that was present from the first epoch on removes `hold_s` of good epochs.
+    suspected and rejected, and its metric is summed over the following epochs to an offset. As soon as the offset is
+    within the limit, the satellite is used again, although the jump back exceeds the limit. If the offset does not
+    return within `hold_s`, the new pseudorange is accepted. A temporary reflection is therefore rejected only while it
+    lasts. When a reflection that was present from the first epoch ends, good epochs are rejected for `hold_s`.
 
     Parameters
     ----------
@@ -320,7 +322,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     def judge(
         self, antenna: AntennaRanges, limits: DopplerLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdict on a chunk, and the state with its last observations and suspicions."""
+        """Return the verdict on a chunk, and the state after its last epoch."""
         screened, after = doppler_screen(
             antenna.time, np.where((antenna.reason & int(Reason.IMPLAUSIBLE_CODE)) == 0, antenna.code_m, np.nan),
             antenna.doppler_hz, channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),

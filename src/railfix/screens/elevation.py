@@ -53,7 +53,7 @@ class ElevationScreen(ObservationScreen[ElevationLimits]):
     def judge(
         self, antenna: AntennaRanges, limits: ElevationLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdict on a chunk, and the state unchanged: the screen has no memory."""
+        """Return the verdict on a chunk, and the state unchanged, because no earlier epochs are used."""
         screened = elevation_screen(antenna.elevation_deg, limits=limits)
         return (Verdict(name="elevation", reason=Reason.ELEVATION_MASK, screened=screened),), state
 

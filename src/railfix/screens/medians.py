@@ -12,7 +12,7 @@ from railfix.core.constants import CLOCK_GROUP
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
-    """Return the median of `values` over the channels that share a receiver clock, at each channel, shape (T, M).
+    """Return for each channel the median of `values` over all channels of the same receiver clock, shape (T, M).
 
     The median is NaN where fewer than `least` satellites of the clock have a value.
     """

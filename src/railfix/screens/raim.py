@@ -1,4 +1,4 @@
-"""Settings and picture of RAIM, which the pipeline runs on the solved positions."""
+"""Name, settings and picture of the screen `raim`; the pipeline itself runs RAIM, on the computed positions."""
 
 from __future__ import annotations
 
