@@ -1,9 +1,9 @@
 """Stanford diagram along the track: position error against protection level.
 
-Every epoch belongs to one region, defined by the alarm limit AL, the protection level PL and the absolute error:
+Every epoch belongs to one region, which depends on the alarm limit AL, the protection level PL and the absolute error:
 
 - no position: both the level and the error are missing;
-- unjudged: the level is known, but the error is not, for lack of a reference;
+- unjudged: the level is known, but the error is unknown, because there is no reference;
 - nominal: error <= PL <= AL;
 - misleading: PL < error <= AL;
 - hazardously misleading: PL <= AL < error;
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
 _BINS: Final = 100  #: Number of bins per axis, which extends to twice the alarm limit.
-_GAP: Final = 1.5  #: Two epochs are separated by a gap if their interval exceeds the median interval times this.
+_GAP: Final = 1.5  #: Two epochs are separated by a gap if their interval exceeds this multiple of the median interval.
 
 
 class Region(IntEnum):
@@ -44,7 +44,7 @@ class Continuity:
     """Continuity over windows of one length that start at an available epoch."""
 
     window_s: float  #: Length of the windows.
-    windows: int  #: Number of windows that end within the run.
+    windows: int  #: Number of windows that start at an available epoch and end within the run.
     kept: int  #: Number of windows without an unavailable epoch and without a gap.
     probability: float  #: Ratio kept / windows; NaN without windows.
 
@@ -89,7 +89,7 @@ def stanford(
         Protection level; infinite where no error can be excluded, NaN without a position. Where an error is known but
         no level, the level counts as infinite.
     windows_s : sequence of float [s]
-        Lengths of the continuity windows. The default of 15 s is taken from aviation approaches, 60 s from the travel
+        Lengths of the continuity windows. The default of 15 s is taken from aviation approaches, and 60 s is a travel
         time between two stations.
     block_s : float [s]
         Length of the time blocks, counted from the first epoch.

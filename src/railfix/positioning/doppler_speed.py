@@ -32,8 +32,8 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_avail
 
 _STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_PASSES: Final = 3  #: Number of outlier rejections, with the noise scale estimated from the fit before.
-_TELLING: Final = 2.0  #: Mean squares of residuals within this many standard deviations of 1 are within the noise.
+_PASSES: Final = 3  #: Number of rounds of outlier rejection; each uses the noise scale of the previous fit.
+_TELLING: Final = 2.0  #: A mean square of residuals up to this many standard deviations above 1 is within the noise.
 _FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
 
 
@@ -83,7 +83,7 @@ class DopplerSpeed:
     used: Masks
     rejected: Masks
     n_used: Integers  #: Number of Dopplers used, shape (T,).
-    scale: float  #: Standard deviation of the receiver's Dopplers relative to the limits, over the whole log.
+    scale: float  #: Ratio of the receiver's Doppler noise over the whole log to the noise assumed in the limits.
 
 
 def dopplers_of_log(
@@ -91,8 +91,8 @@ def dopplers_of_log(
 ) -> Dopplers:
     """Return the Dopplers of a log with their satellite positions; one signal per satellite and epoch.
 
-    Unhealthy satellites, satellites without navigation records, unknown carrier frequencies, and channels without a
-    plausible code, from which the time of transmission is computed, are left out.
+    Unhealthy satellites, satellites without navigation records, and channels without a known carrier frequency or
+    without a plausible code are left out. The time of transmission is computed from the code.
     """
     columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
     satellite, signal = obs.satellite[columns], obs.signal[columns]
@@ -123,8 +123,9 @@ def doppler_speed(
     """Estimate speed along the track and clock drift by weighted least squares, all epochs at once.
 
     Outliers are removed one by one, the largest first, while enough satellites remain. The noise scale is estimated
-    from the median of the log's normalised residuals. `ecef_m`, shape (T, 3), are antenna positions, NaN for epochs
-    without a speed; an error of 10 m changes a range rate by 2 mm/s. `tangent`, shape (T, 3), are unit vectors.
+    from the median of the normalised residuals of the whole log. `ecef_m`, shape (T, 3), are antenna positions; no
+    speed is computed where they are NaN. A position error of 10 m changes a range rate by 2 mm/s. `tangent`, shape (T,
+    3), are unit vectors along the track.
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)
@@ -183,7 +184,7 @@ def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Flo
 
 @dataclass(frozen=True, kw_only=True)
 class _SpeedFit:
-    """Speed, drift and variance of the speed (unscaled), residuals, and normalised residuals."""
+    """Speed, drift and unscaled variance of the speed, residuals, normalised residuals, and weighted sum of squares."""
 
     speed: Floats
     drift: Floats
@@ -221,7 +222,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
 def _reject_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
 ) -> tuple[Masks, _SpeedFit]:
-    """Return the Dopplers that remain after the worst outlier of each epoch is repeatedly rejected, and their fit."""
+    """Return the Dopplers that remain after repeated rejection of the largest outlier of each epoch, and their fit."""
     used = offered.copy()
     fit = _fit(measured, slope, sigma, used)
     for _ in range(limits.most_rejected):

@@ -1,9 +1,9 @@
 """Detect grossly wrong codes before any fit to all codes.
 
-A least-squares position absorbs part of every error: a code error of 10 km moves it by kilometres, to where neither the
-atmospheric models nor the map are valid, and other satellites have the largest residuals. The position with the
-least sum of absolute residuals does not move further when an error grows, because each outlying range has the same
-influence.
+A least-squares position absorbs part of every error. A code error of 10 km moves the position by kilometres, to a point
+at which neither the atmospheric models nor the map are valid, and at which other satellites have the largest residuals.
+The position with the least sum of absolute residuals does not move further when an error grows, because the influence
+of an outlying range does not depend on the size of its error.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from railfix.track.trajectory import Trajectory
 GROSS_M: Final = 100.0
 #: The remaining codes agree with each other if the median of their absolute residuals is below this [m].
 AGREEING_M: Final = 30.0
-#: Least number of redundant ranges after an exclusion at a 3-D position, so that the remaining ranges are checked.
+#: Least number of redundant ranges after an exclusion at a 3-D position, so that the remaining ranges are tested.
 _LEFT_IN_SPACE: Final = 3
 #: Where fewer redundant ranges remain, every other exclusion must fit worse by this factor.
 _CLEARER: Final = 5.0
-#: A corrected code disagrees with the others if its residual exceeds this multiple of the robust scale.
+#: A corrected code is inconsistent with the other codes if its residual exceeds this multiple of the robust scale.
 _DISAGREE: Final = 5.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 #: Largest number of iterations. Residuals that divide weights are at least `_COARSE` sigmas in the first
@@ -46,8 +46,8 @@ _SINGULAR: Final = 1e-15  #: A normal matrix of unit trace with a determinant up
 def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
     """Estimate the positions with the least sum of absolute weighted residuals, clocks eliminated, shape (T, 3) [m].
 
-    Iteratively reweighted least squares from `start_ecef_m`, shape (T, 3), accurate to a few thousand kilometres. NaN
-    where the ranges do not determine a position.
+    The method is iteratively reweighted least squares from `start_ecef_m`, shape (T, 3), accurate to a few thousand
+    kilometres. The position is NaN where the ranges do not determine it.
     """
     place, factor = start_ecef_m.copy(), np.ones(ranges.weight.shape)
     root = np.sqrt(ranges.weight)
@@ -68,7 +68,7 @@ def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
 
 
 def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, 3), each clock at the median of its ranges, (T, M) [m]; NaN where not used."""
+    """Return residuals at positions (T, 3), less the median residual of each clock, (T, M) [m]; NaN where not used."""
     even = replace(ranges, weight=kernel_array((ranges.weight > 0).astype(np.float64)), ties=None)
     residual = normal_equations(even, np.nan_to_num(place_ecef_m)).residual_m
     value = np.where(ranges.weight > 0, residual, np.nan)
@@ -78,7 +78,7 @@ def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 
 
 def _median(values: Floats) -> Floats:
-    """Return the median of each row without its NaN, shape (T,); 0 for a row of NaN only."""
+    """Return the median of each row, NaN ignored, shape (T,); 0 for a row of NaN only."""
     some = np.isfinite(values).any(axis=1)
     middle = np.zeros(len(values))
     middle[some] = np.nanmedian(values[some], axis=1)
@@ -88,8 +88,8 @@ def _median(values: Floats) -> Floats:
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     """Find the raw codes with errors above `GROSS_M`, shape (T, M), where the other codes agree on a 3-D position.
 
-    At least `_LEFT_IN_SPACE` redundant ranges must remain and agree. With fewer ranges, a single range is rejected if
-    the others agree without it, and do not agree without any other single range.
+    At least `_LEFT_IN_SPACE` redundant ranges must remain and agree. With fewer redundant ranges, a single range is
+    rejected if the other ranges agree, and if ranges do not agree after the exclusion of any other single range.
     """
     place = least_absolute(ranges, start_ecef_m)
     residual = residuals_at(ranges, place)
@@ -106,7 +106,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return the range without which the others agree within `AGREEING_M`, shape (T, M); none if ambiguous."""
+    """Return a mask of the range without which all others agree within `AGREEING_M`, (T, M); none if ambiguous."""
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -144,10 +144,10 @@ def _step(matrix: Floats, vector: Floats) -> Floats:
 
 
 def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Find the corrected ranges that disagree with the majority of an epoch, shape (T, M).
+    """Find the corrected ranges that are inconsistent with the majority of an epoch, shape (T, M).
 
-    Their residuals at the position of least absolute residuals exceed `_DISAGREE` robust scales; the scale is at least
-    one sigma. None is returned where fewer than `_LEFT_IN_SPACE` redundant ranges would remain.
+    The residuals of these ranges at the position of least absolute residuals exceed `_DISAGREE` robust scales, where
+    the scale is at least one sigma. No range is marked where fewer than `_LEFT_IN_SPACE` redundant ranges would remain.
     """
     place = least_absolute(ranges, start_ecef_m)
     white = np.abs(residuals_at(ranges, place)) * np.sqrt(ranges.weight)
@@ -164,7 +164,7 @@ _COARSE_M: Final = 100.0
 _FINE_M: Final = 12.5
 #: Largest product of points, epochs and channels that are computed together.
 _BLOCK: Final = 2_000_000
-#: Every other exclusion must cost more by this fraction of `GROSS_M`.
+#: The cost of every other exclusion must be larger by this fraction of `GROSS_M`.
 _CLEAR: Final = 0.7
 #: Least number of redundant ranges that must agree with a point of the line.
 _LEFT_ON_LINE: Final = 2
@@ -176,14 +176,15 @@ class LineScan(NamedTuple):
     arc_m: Floats  #: Point with the least cost, shape (T,).
     gross: Masks  #: Ranges whose residuals at the point exceed `GROSS_M`, shape (T, M).
     agreed: Masks  #: Epochs at which enough redundant ranges agree with the point, shape (T,).
-    clear: Masks  #: Epochs at which all points that imply other gross errors cost clearly more, shape (T,).
+    clear: Masks  #: Epochs at which all points that imply other gross errors have a clearly larger cost, shape (T,).
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
-    """Find the point of a line with which most raw ranges agree, at each epoch.
+    """Find the point of a line that agrees best with the raw ranges of each epoch, robustly.
 
-    The cost of a point is the sum of absolute residuals about the median of their clock, each limited to `GROSS_M`, so
-    that larger errors cost no more. Points `_COARSE_M` apart are evaluated first, then points around the best of them.
+    The cost of a point is the sum of absolute residuals, less the median residual of their clock, each limited to
+    `GROSS_M`, so that larger errors do not increase the cost. Points `_COARSE_M` apart are evaluated first, then points
+    around the best of these points.
     """
     epochs = len(ranges)
     nodes = np.linspace(line.arc_m[0], line.arc_m[-1], max(int(np.ceil(np.ptp(line.arc_m) / _COARSE_M)), 1) + 1)
@@ -211,7 +212,7 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at N positions per epoch, (T, N, 3), each clock at its median, (T, N, M) [m]; NaN if unused."""
+    """Return residuals at positions (T, N, 3), less the median residual of each clock, (T, N, M) [m]; NaN if unused."""
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
     square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
@@ -243,7 +244,7 @@ class GrossErrors(NamedTuple):
     unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
 
 
-#: Plausible ellipsoidal heights of trains, with a margin [m]. Positions outside are not used.
+#: Plausible ellipsoidal heights of trains, with a margin [m]. Positions at other heights are not used.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: An epoch is examined if the root of the sum of its squared raw residuals is not below the first value, or its 3-D
 #: position is farther from the line than the second [m].
@@ -255,8 +256,9 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     """Find gross errors of raw ranges, given their least-squares 3-D positions `point`.
 
     Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
-    point of the line with which most ranges agree, if redundant ranges agree and every other exclusion costs clearly
-    more. Where the ranges agree with no point of the line, they are examined at a 3-D position.
+    best point of the line (`scan_line`), if redundant ranges agree with it and the cost of every other exclusion is
+    clearly larger. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
+    (`gross_in_space`).
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -278,7 +280,7 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
         gross[rows[sure]] = scan.gross[sure]
         open_arc = ~sure & (scan.agreed | nowhere[rows])
         arc[rows[open_arc]] = scan.arc_m[open_arc]
-        # where the ranges fit a point of the line, none of them is rejected
+        # ranges that agree with a point of the line, but not clearly, are not rejected
         unsure[rows[open_arc]] = scan.gross[open_arc].any(axis=1)
         left = np.flatnonzero(~scan.agreed)
         if len(left):
@@ -289,10 +291,11 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
 
 
 def gross_alone(weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases) -> Masks:
-    """Find ranges that are alone on their clock and contradict the known biases by more than `GROSS_M`, shape (T, M).
+    """Find sole ranges of a clock that contradict the known biases by more than `GROSS_M`, shape (T, M).
 
-    No other range checks such a range while its clock is estimated freely. `clock_m`, shape (T, G), are clocks
-    estimated without ties. The common clock is the median of the clocks less their biases, weighted by satellites.
+    No other range tests the sole range of a clock while this clock is estimated freely. `clock_m`, shape (T, G), are
+    clocks estimated without ties. The common clock is the median of the clocks less their biases, weighted by
+    satellites.
     """
     found = np.zeros(weight.shape, dtype=np.bool_)
     count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)

@@ -134,7 +134,7 @@ def weighted_ranges(
     code_m, sigma_m : array_like, shape (T, M) [m]
         Corrected pseudoranges and their standard deviations; NaN for unused codes.
     clock : sequence of str, length M
-        Letter of the constellation or receiver clock of each channel; channels of one clock are adjacent.
+        Letter of the constellation or receiver clock of each channel; channels of one clock must be adjacent.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
 def usable_ranges(
     states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
 ) -> Ranges:
-    """Return the ranges for the fit: those with a rejection reason, or NaN, have weight 0 and finite filler values."""
+    """Return the ranges for the fit; ranges with a rejection reason, or NaN, have weight 0 and finite filler values."""
     used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
     return Ranges(
         sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, FILLER_SATELLITE_M)),

@@ -1,10 +1,11 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
-P1 2.2(2) compares ranges with distances by between-satellite single differences. Their weighted sum of squares ``q``
-equals the sum for the residuals after each constellation's clock is eliminated. `find_section` returns the point with
-the least ``q`` in a time that does not grow with the length of the line. Where a 3-D position exists, ``q`` grows from
-it as a quadratic form, so stretches outside a ball are dropped. Otherwise the search is coarse to fine: the root of
-``q`` changes at most by the root of the summed weights times the distance moved. Both searches are exact.
+P1 2.2(2) compares between-satellite single differences of ranges and distances. The weighted sum of squares ``q`` of
+these differences equals the sum for the residuals with the clock of each constellation eliminated. `find_section`
+returns the point with the least ``q`` in a time that hardly depends on the length of the line. Where a 3-D position
+exists, ``q`` increases from this position as a quadratic form, so only the points inside a ball are evaluated.
+Otherwise the search is coarse to fine, and uses that the root of ``q`` changes at most by the root of the summed
+weights times the distance between two points. Both searches are exact.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Other positions are searched up to the excess that noise exceeds with this probability. It is larger than the limit
-#: of ambiguity, because a fault of one range can increase the excess of the true position.
+#: Other positions are searched for up to the excess of q that noise exceeds with this probability. This excess is
+#: larger than the limit of ambiguity, because a fault of one range can increase the excess of the true position.
 _REACH_RISK: Final = 1e-16
 
 
@@ -35,11 +36,11 @@ class SectionLimits(Settings):
     """Limits of ambiguous sections."""
 
     #: Probability that noise makes the true position fit worse than the best position by more than the threshold
-    #: (chi-square, one degree of freedom). P1 3.2: wrong sections on sharp curves.
+    #: (chi-square, one degree of freedom). P1 3.2 describes wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
     separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct positions.
-    #: Number of redundant ranges below which a section is doubtful: on recordings with two constellations a quarter of
-    #: the sections were wrong with one redundant range, 3 to 4 % with two.
+    #: Number of redundant ranges below which a section is doubtful. On recordings with two constellations, a quarter of
+    #: the sections were wrong with one redundant range, and 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
 
     @cached_property
@@ -57,7 +58,7 @@ class SectionLimits(Settings):
 class Section:
     """Best-fitting point of the trajectory, T epochs."""
 
-    vertex: Indices  #: Point with the least q; -1 where no range is redundant with the clocks; shape (T,).
+    vertex: Indices  #: Point with the least q; -1 where there are no more ranges than clocks; shape (T,).
     q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without one; shape (T,).
     #: Excess of q at the best alternative position over q at the best position, both interpolated between the points of
     #: the trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
@@ -94,14 +95,15 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
     point : SinglePoint
-        3-D positions from the same ranges (`point_position`), NaN where none exist: they only save time.
+        3-D positions from the same ranges (`point_position`), NaN where missing. They shorten the search, and do not
+        change its result.
     limits : SectionLimits, optional
         Limits of ambiguous sections (P1 3.2).
 
     Returns
     -------
     Section
-        Vertex -1 where no range is redundant with the clocks.
+        The vertex is -1 where there are no more ranges than clocks.
     """
     limits, antennas = limits or SectionLimits(), AntennaRows.on(line)
     epochs = len(ranges)
@@ -160,7 +162,8 @@ def _ball(
 def _in_ball(
     ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
-    """Return the points in the ball of each epoch; q is exact where its quadratic form does not determine the best."""
+    """Return the points in the ball of each epoch; q is exact where its quadratic form does not determine the least
+    q."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
         point.wsse[epochs], weight_norm[epochs],
@@ -176,9 +179,9 @@ def _in_ball(
 def _coarse_to_fine(
     ranges: Ranges, index: SearchIndex, weight_norm: Floats, freedom: Integers, limits: SectionLimits, epochs: Indices
 ) -> tuple[SectionCandidates, Integers]:
-    """Return the points that may fit within the noise, and the number of points evaluated at each epoch.
+    """Return the points that may agree within the noise, and the number of points evaluated at each epoch.
 
-    Stretches of the line on which no point can fit within the noise are dropped.
+    Stretches of the line on which no point can agree within the noise are skipped.
     """
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)

@@ -1,9 +1,9 @@
-"""Likelihood of the carrier phases of a train at rest and a base station, given a position of known error.
+"""Likelihood of the carrier phases of a train at rest and a base station, given a position and its covariance.
 
-Double differences have integer ambiguities that are constant while the train is at rest; along a track, integers that
-fit the phases of all satellites exist only near the true position (P1 2.5). Each satellite's phase has a constant
-error, which does not average out. Integers are found by LAMBDA: decorrelation and a search in a shrinking ellipsoid
-(Teunissen 1995, doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
+Double differences have integer ambiguities that are constant while the train is at rest. Along a track, there are
+integers that fit the phases of all satellites only near the true position (P1 2.5). Each satellite's phase has a
+constant error, which does not average out. Integers are found by LAMBDA: decorrelation and a search in a shrinking
+ellipsoid (Teunissen 1995, doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-#: Vectors whose square exceeds the least square by more than this have a relative likelihood below exp(-20); omitted.
+#: Vectors whose square exceeds the least square by more than this are omitted; their relative likelihood is below
+#: exp(-20).
 _WITHIN: Final = 40.0
-_ROUNDING: Final = 1e-9  #: Least relative decrease of a conditional variance for which two unknowns are exchanged.
+_ROUNDING: Final = 1e-9  #: Two unknowns are exchanged if this lowers a conditional variance by more than this fraction.
 
 
 class IntegerSearch:
@@ -43,7 +44,7 @@ class IntegerSearch:
 
 
 def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
-    """Return the integer transformation that nearly decorrelates the unknowns, and their L and d, d mostly falling."""
+    """Return the integer transformation that nearly decorrelates the unknowns, and their factors L and d."""
     n = len(variance)
     lower, variance, transform = lower.copy(), variance.copy(), np.eye(n, dtype=np.int64)
     rounded_to = n - 2
@@ -125,7 +126,7 @@ _NEGLIGIBLE: Final = -5.0
 class MeanPhases:
     """Mean double differences of one antenna's carrier phases, n pairs of satellites."""
 
-    difference_m: Floats  #: Observed less computed at the origin, up to multiples of the wavelength; shape (n,).
+    difference_m: Floats  #: Observed less computed value at the origin, up to multiples of the wavelength; shape (n,).
     away: Floats  #: Derivative of the double difference by position east, north and up; shape (n, 3).
     wavelength_m: Floats  #: Wavelength of the carrier of each pair, shape (n,).
     covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).
@@ -150,7 +151,8 @@ def phase_log_likelihood(
     """Return the log density of the phases of A antennas, given their codes, for U hypotheses of position, shape (U,).
 
     A hypothesis has the mean `expected_m` (U, 3 A) and the covariance `prior_m2`. Phases are known modulo the
-    wavelength. With the probability `fault_prior` they follow no model (slip, half cycle) and are uniform over it.
+    wavelength. With the probability `fault_prior` they do not follow the model (slip, half cycle), and are uniform over
+    the wavelength.
     """
     measured = np.concatenate([code.place_m for code in codes])
     of_codes = scipy.linalg.block_diag(*(code.covariance_m2 for code in codes))
@@ -170,5 +172,5 @@ def phase_log_likelihood(
 
 
 def uniform_log_likelihood(phases: Sequence[MeanPhases], *, fault_prior: float) -> float:
-    """Return the log density of phases that follow no model: a lower bound of `phase_log_likelihood`."""
+    """Return the log density of phases that do not follow the model, a lower bound of `phase_log_likelihood`."""
     return float(np.log(fault_prior) - sum(np.log(phase.wavelength_m).sum() for phase in phases))

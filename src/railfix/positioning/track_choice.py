@@ -2,9 +2,10 @@
 
 A hypothesis is a track and the facing of the train; *none* is a parallel track that is missing from the map. At rest
 each satellite's code has a constant bias, so the covariance of the mean does not fall with the number of epochs. The
-posterior of a hypothesis is proportional to its prior times its likelihood integrated along the track. A track is
-selected when the posterior of all other tracks together is below the allowed risk, which bounds the probability of a
-wrong decision if the error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
+posterior probability of a hypothesis is proportional to its prior times the likelihood integrated along the track. A
+track is selected when the posterior probability of all other tracks together is below the allowed risk. If the error
+model holds, this also bounds the probability of a wrong decision (a posterior is a martingale; Baum & Veeravalli 1994,
+doi:10.1109/18.340472).
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UN
 _ALONG_M: Final = 0.25
 _ACROSS_M: Final = 0.3
 #: Weight of an unmapped track within the clearance of a mapped track (possible only if the map is displaced), relative
-#: to an unmapped track farther away. It is 0 at distances below the second value [m].
+#: to an unmapped track farther away. The weight is 0 at distances below the second value [m].
 _BETWEEN_SHARE: Final = 0.1
 _BETWEEN_M: Final = 1.2
-#: A position farther than this from the most likely track, in standard deviations, gives no decision.
+#: No decision is made if the position is farther than this from the most probable track, in standard deviations.
 _LARGEST_MISFIT: Final = 4.0
 #: Length of track before and behind the code position over which the likelihood is integrated [m].
 _REACH_M: Final = 40.0
-_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are those at this elevation.
+_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are set to the errors at this elevation.
 #: Residual atmospheric error of the difference of phases at two positions, as a fraction of their distance.
 _PHASE_SHARE: Final = 1e-6
-#: Phases are evaluated for hypotheses whose log likelihood of the codes is less than this below the largest.
+#: Phases are evaluated for hypotheses whose log likelihood from the codes is at most this much below the largest.
 _UNLIKELY: Final = 25.0
 #: Standard deviation of the position along the track, and of the height, in the phase search [m].
 _ANY_PLACE_M: Final = 50.0
@@ -44,9 +45,9 @@ _ANY_PLACE_M: Final = 50.0
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the Student's t distribution of height errors.
-#: Probability that the phases of a standstill follow no model, by an undetected slip or half a cycle.
+#: Probability that the phases of a standstill do not follow the model, because of an undetected slip or half cycle.
 _PHASE_FAULT_PRIOR: Final = 1e-3
-_UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a missing track can lie.
+_UNMAPPED_WIDTH_M: Final = 60.0  #: Width of the strip in which a missing track can lie.
 
 
 class StandstillErrors(Settings):
@@ -65,7 +66,8 @@ class StandstillErrors(Settings):
     #: Map error across the track common to all tracks of a yard, including the shift of the antenna on canted track.
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
 
-    #: If not given, `ANTENNA_UP_M` with a standard deviation of `ANTENNA_SIGMA_M`, which covers bogies and roofs.
+    #: If None, `ANTENNA_UP_M` is used with the standard deviation `ANTENNA_SIGMA_M`, which covers usual vehicle
+    #: heights.
     antenna_up_m: float | None = option(
         "Height of the antennas above the rails, for tracks above each other; by default about 2.5 m.",
         None,
@@ -128,7 +130,7 @@ def standstill_fix(
     errors: StandstillErrors,
     receivers: int = 1,
 ) -> StandstillFix | None:
-    """Estimate the position of an antenna at rest from mean code residuals; None if satellites do not determine it.
+    """Estimate the position of an antenna at rest from mean code residuals; None if it is not determined.
 
     Arrays have shape (K,): `system` are clock letters, `residual_m` means over `seconds` of observed less computed
     codes at the origin, and `common_m` sigmas of satellite and atmospheric errors. `receivers` is 2 if the codes of a
@@ -180,7 +182,7 @@ class TrackPosterior:
     probability: Floats  #: Posterior probability of each of `names`, shape (tracks + 1,).
     with_rising: Floats  #: Probability that the train is on the track and faces its direction, shape (tracks,).
     fits: bool  #: Whether the codes agree with the error model.
-    #: Distance of the code position from each track, in its standard deviations; shape (tracks + 1,), NaN for `NONE`.
+    #: Distance of the code position from each track, in standard deviations; shape (tracks + 1,), NaN for `NONE`.
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
@@ -202,9 +204,9 @@ def track_posterior(
 ) -> TrackPosterior:
     """Compute the probability that a train at rest is on each track, or on none.
 
-    `arms_m` is the position of each antenna along the train, positive to its front. `prior` are weights of the tracks
-    by name, 0 for tracks not named; ValueError if all are 0. `phases` has one item per antenna, or none without a base
-    station.
+    `arms_m` is the position of each antenna along the train, positive to its front. `prior` has the weights of tracks
+    by name; a track that is not named has the weight 0, and a ValueError is raised if all weights are 0. `phases` has
+    one item per antenna, and is empty without a base station.
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -218,7 +220,7 @@ def track_posterior(
     width = len(shifts)
     likely = _shift_weights(shifts, tracks, nearest, fixes[0].east_north_m)
     shifts, likely = shifts[likely > 0.0], likely[likely > 0.0]
-    # hypotheses: each track, and shifts of the nearest one; each with both facings
+    # hypotheses: each track, and shifts of the nearest track, with both facings
     lines = [*((track, np.zeros(1)) for track in tracks), (tracks[nearest], shifts)]
     found = [
         [_places(track.points_m, places, covariance, arms_m, facing, across) for facing in (1.0, -1.0)]
@@ -257,8 +259,8 @@ def track_posterior(
 def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFix], errors: StandstillErrors) -> Floats:
     """Return the log likelihood of the codes' height on each track and on none, shape (tracks + 1,).
 
-    Student's t distribution limits the influence of a height that fits no track. A track of unknown height, and `NONE`,
-    have the largest likelihood of the other tracks.
+    Student's t distribution limits the effect of a height that agrees with no track. Tracks of unknown height, and
+    `NONE`, get the largest likelihood of the tracks with a known height.
     """
     codes = [fix.place for fix in fixes if fix.place is not None]
     up = np.array([track.up_m for track in tracks])
@@ -289,7 +291,7 @@ def _with_phases(
             evidence = item.log_evidence + lowest
             likely = item.log_evidence > best - _UNLIKELY
             if k == 1 and len(codes) == 1:
-                # one antenna does not show the facing
+                # with one antenna, both facings have the same likelihood
                 evidence = updated[0].log_evidence
             elif likely.any():
                 count = int(likely.sum())
@@ -307,7 +309,8 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Return the covariance of antenna positions, shape (3 A, 3 A); only along-track and map errors are common."""
+    """Return the covariance of antenna positions, shape (3 A, 3 A), with common errors along the track and of the
+    map."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
@@ -331,7 +334,7 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
 
 
 def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Floats:
-    """Return the weight of each shift of the nearest track: 1 away from all tracks, less between them, 0 on one."""
+    """Return the weight of each shift of the nearest track: 1 far from all tracks, less between them, 0 on a track."""
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
     share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)
@@ -357,18 +360,18 @@ def _distances(points_m: Floats, places_m: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Hypotheses of one track and facing, at U shifts across the track."""
+    """Hypotheses for one track and one facing, at U shifts across the track."""
 
     log_evidence: Floats  #: Likelihood integrated over the position along the track, shape (U,).
     expected_m: Floats  #: Most likely positions of the antennas, shape (U, A, 2).
-    heading: Floats  #: Unit vectors along the track there, shape (A, 2).
+    heading: Floats  #: Unit vectors along the track at the antennas, shape (A, 2).
     misfit: float = np.inf  #: Least distance of the code positions from the hypotheses, in standard deviations.
 
 
 def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
 ) -> _Places:
-    """Return the likelihoods of a track at shifts across it, given antenna positions; empty beyond the track's ends."""
+    """Return the hypotheses for a track at shifts across it, given antenna positions; empty beyond its ends."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)

@@ -1,8 +1,8 @@
-"""Carrier phase combined with code (P4's observation model): slips, smoothed codes, float ambiguities.
+"""Carrier phase combined with code by the observation model of P4: slips, smoothed codes, float ambiguities.
 
-The phase is precise to a few millimetres, up to an unknown constant per arc. `find_slips` detects where arcs end,
-`smooth_codes` is the Hatch filter, and `phase_positions` estimates positions from code and phase with the same
-geometry and clocks and one ambiguity per arc.
+The phase is precise to a few millimetres, up to an unknown constant per arc. `find_slips` detects the ends of arcs,
+`smooth_codes` is the Hatch filter, and `phase_positions` estimates positions from code and phase with one ambiguity per
+arc.
 """
 
 import lazy_loader

@@ -1,9 +1,9 @@
 """Ambiguities of positions along the line from code and phase (P4 with the map's constraint), and integer fixing.
 
-The unknowns of the epochs (distance and clocks) are eliminated: the normal matrix has one row per arc of phase.
+The unknowns of the epochs (distance and clocks) are eliminated, so that the normal matrix has one row per phase arc.
 Integers are fixed where the risk of a wrong integer is bounded, by Bayes' rule: the density of the float ambiguities
 around each vector of integers is compared with all other vectors and with non-integer phases (multipath, half cycles),
-which have the prior probability `PhaseLimits.no_integer_prior` and uniform density.
+which have the prior probability `PhaseLimits.no_integer_prior` and a uniform density.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
-FREE_AMBIGUITY_M: Final = 1e4  #: Prior sigma of an ambiguity about its first value [m]: loose prior for conditioning.
+FREE_AMBIGUITY_M: Final = 1e4  #: Prior sigma of an ambiguity about its first value, a loose prior for conditioning [m].
 FORGET_S: Final = 600.0  #: An arc not observed for this long is restarted.
 
 
@@ -31,17 +31,17 @@ class PhaseLimits(Settings):
     """Limits of the float ambiguities."""
 
     clocks: PhaseClocks = "own"  #: Clock of the phases: separate, or shared with the codes (P4).
-    #: [m/sqrt(s)] Random walk of an ambiguity: changes of ionosphere, satellite orbit and clock, and multipath in a
-    #: phase relative to the other phases. Without it, phases that drift by centimetres while satellites move by
-    #: hundredths of a radian bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0
-    #: holds ambiguities constant.
+    #: [m/sqrt(s)] Random walk of an ambiguity, for changes of ionosphere, satellite orbit and clock, and for multipath
+    #: in a phase relative to the other phases. Without a random walk, phases that drift by centimetres while satellites
+    #: move by hundredths of a radian bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about
+    #: 100 s. With 0, ambiguities are constant.
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
-    #: Correlation time of code errors: epochs closer together than this add no information on the ambiguities.
-    #: The variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes
-    #: alone. The positions do not change. The value for white noise, for example in simulations, is 0.
+    #: Correlation time of code errors. Epochs closer together than this add no information on the ambiguities, so the
+    #: variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes alone.
+    #: The positions do not change. Use 0 for white noise, for example in simulations.
     correlation_s: float = Field(default=20.0, ge=0)
-    #: Number of linearisations; each has its own state, so that results do not depend on chunks.
+    #: Number of linearisations. Each has a separate state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
     #: Largest probability of a wrong integer at which ambiguities are fixed, with a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
@@ -58,7 +58,7 @@ def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
 
 
 def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Return the number of epochs per correlation time at each epoch, at least 1, shape (T,); 1 for the first epoch."""
+    """Return the number of epochs per correlation time, from the interval before each epoch, at least 1, shape (T,)."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -70,9 +70,9 @@ class ArcAmbiguities:
     """Ambiguities of A arcs."""
 
     arc_id: Integers  #: Number of each arc (`number_arcs`), shape (A,).
-    #: Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With separate phase clocks,
-    #: ambiguities are known up to a common constant: the mean of the corrections to their first values is zero, and the
-    #: covariance refers to that mean; shape (A,).
+    #: Phase less range less clock, which contains whole cycles, phase wind-up and signal delays; shape (A,). With
+    #: separate phase clocks, ambiguities are determined up to a common constant: the mean of the corrections to their
+    #: first values is set to zero, and the covariance is relative to this mean.
     ambiguity_m: Floats
     covariance_m2: Floats  #: Covariance of noise alone, without the map error; shape (A, A).
 
@@ -97,8 +97,8 @@ class PhasePositions(NotebookTable):
     n_codes: Integers
     n_phases: Integers
     n_fixed: Integers  #: Number of ambiguity differences fixed to whole cycles, shape (T,).
-    #: Probability that a fixed difference is wrong, or one of the best candidates where none is fixed; NaN where there
-    #: are no differences; shape (T,).
+    #: Probability that a fixed difference is wrong, or, if none is fixed, that the best candidate is wrong; NaN where
+    #: there are no differences; shape (T,).
     integer_risk: Floats
     arcs: ArcAmbiguities | None  #: Arcs that continue after the last epoch; None in results of the pipeline.
 
@@ -128,8 +128,8 @@ def prepare_start(
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    A constant common to all ambiguities is unobservable with separate phase clocks. It is fixed by a zero mean of the
-    ambiguities where `held`, shape (..., A), is 1 (else 0), which changes no difference between them.
+    With separate phase clocks, a constant common to all ambiguities is unobservable. It is determined by a zero mean of
+    the ambiguities for which `held`, shape (..., A), is 1 (else 0). This does not change differences of ambiguities.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -171,7 +171,7 @@ def assemble_positions(
 
 
 _VECTORS: Final = 12  #: Number of integer vectors compared.
-#: Fractions of the differences that are fixed in turn, strongest phases first.
+#: Fractions of the differences that are tried one after another, beginning with the strongest phases.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
@@ -182,8 +182,8 @@ class Fixed:
     value_m: Floats  #: Ambiguities, and their responses to map errors of 1 m across and in height; shape (A, 3).
     covariance_m2: Floats  #: Covariance of noise alone, shape (A, A).
     count: int  #: Number of fixed differences; 0 for float ambiguities.
-    #: Probability that a fixed difference is wrong, or one of the best candidates where none is fixed; NaN where there
-    #: are no differences.
+    #: Probability that a fixed difference is wrong, or, if none is fixed, that the best candidate is wrong; NaN where
+    #: there are no differences.
     risk: float
 
 
@@ -197,7 +197,7 @@ def fix_integers(
     largest_risk: float,
     no_integer_prior: float,
 ) -> Fixed:
-    """Fix differences of float ambiguities to whole cycles; return the float ambiguities where the risk is too large.
+    """Fix differences of float ambiguities to whole cycles, or return the float ambiguities if the risk is too large.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def _fix_pairs(
     map_sigma_m: Floats,
     no_integer_prior: float,
 ) -> Fixed | None:
-    """Fix all differences of some pairs to the most probable integers; None where their covariance is singular."""
+    """Fix all differences of some pairs to the most probable integers; return None if their covariance is singular."""
     value, noise = ambiguities
     rows = np.arange(len(wavelength_m))
     design = np.zeros((len(rows), len(value)))
@@ -270,7 +270,7 @@ def _fix_pairs(
     log_density = -0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
     peak = max(float(log_density[0]), 0.0)
     weight = (1.0 - no_integer_prior) * np.exp(log_density - peak)
-    # density of phases that are not whole cycles: one per cycle
+    # the density of phases that are not whole cycles is one per cycle
     others = weight[1:].sum() + no_integer_prior * np.exp(-peak)
     step = np.zeros((len(rows), 3))
     step[:, 0] = cycles - integers[0]

@@ -1,13 +1,14 @@
 """Cycle slips and gaps of the phase, and carrier-smoothed codes (Hatch filter).
 
 The change of the phase is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or,
-where there are none, with the change of the code. The median over the channels is subtracted, because a step of the
-receiver clock is common to all channels. Codes follow the time tags, so the true interval is the difference of the time
-tags less the step of the codes. Phases either step with the codes, or continue and then differ by whole milliseconds,
-which are added in `Slips.phase_m`.
+where Dopplers are missing, with the change of the code. The median over the channels is subtracted, because a step of
+the receiver clock is common to all channels. Codes refer to the time tags, so the true interval is the difference of
+the time tags less the step of the codes. Phases either step together with the codes, or continue without a step. In the
+second case they differ from the codes by whole milliseconds, which are added in `Slips.phase_m`.
 
-The smoothed code is the phase plus the mean of code less phase over the arc so far. The ionosphere makes that mean
-drift by twice the change of its delay, which the window limits: at 1 mm/s a window of 100 s leaves up to 0.2 m.
+The smoothed code is the phase plus the mean of code less phase over the arc so far. The ionosphere makes this mean
+drift by twice the change of its delay. The window limits the effect: at 1 mm/s and with a window of 100 s, it is at
+most 0.2 m.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ _COMMON: Final = 3  #: Fewest channels whose median represents the receiver cloc
 
 
 class SlipReason(IntFlag):
-    """Reasons why the phase of an epoch and channel starts a new arc; 0 where the arc continues."""
+    """Reasons for a new arc of the phase at an epoch and channel; 0 where the arc continues."""
 
     JOINED = 0
-    NO_PHASE = 1 << 0  #: No phase at this epoch: no arc begins.
-    FIRST = 1 << 1  #: A phase, but no phase of this channel at the previous epoch.
+    NO_PHASE = 1 << 0  #: No phase at this epoch, so that no arc begins.
+    FIRST = 1 << 1  #: The channel had no phase at the previous epoch.
     LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator is set.
-    HALF_CYCLE = 1 << 3  #: Bit 1 of that indicator (half-cycle ambiguity) differs from the previous epoch.
+    HALF_CYCLE = 1 << 3  #: Bit 1 of the indicator (half-cycle ambiguity) differs from the previous epoch.
     GAP = 1 << 4  #: The interval since the previous epoch exceeds the limit.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
     DOPPLER = 1 << 6  #: The phase change disagrees with the Dopplers.
@@ -48,12 +49,12 @@ class SlipReason(IntFlag):
 
 
 class CycleSlipLimits(Settings):
-    """Limits of the tests, in metres for an interval dt in seconds.
+    """Limits of the slip tests, in metres, for an interval dt in seconds.
 
-    The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise of the phases,
-    noise of the mean Doppler, and the error of the trapezoidal rule for a motion with that jerk. One cycle on L1
-    (0.19 m) is detected up to intervals of about 1 s, two cycles up to 1.5 s; the test on the track
-    (`continuity.track_jumps`) has no such limit.
+    The Doppler test rejects a change above ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``. The terms are the
+    noise of the phases, the noise of the mean Doppler, and the error of the trapezoidal rule for a motion with this
+    jerk. One cycle on L1 (0.19 m) is detected up to intervals of about 1 s, two cycles up to 1.5 s; the test on the
+    track (`continuity.track_jumps`) has no such limit.
     """
 
     #: Longest interval without a new arc; station logs have intervals of 30 s.
@@ -78,7 +79,7 @@ class CycleSlipState:
     phase_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
     half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
-    step_ms: int = 0  #: Steps of the clock so far, in whole milliseconds, that are in the codes but not in the phases.
+    step_ms: int = 0  #: Clock steps so far that are in the codes but not in the phases, in whole milliseconds.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +88,8 @@ class Slips:
 
     slip: Masks  #: True where a phase starts a new arc, shape (T, M).
     reason: Integers  #: `SlipReason` bits, shape (T, M).
-    #: Phase times wavelength on the clock of the codes: steps of whole milliseconds of the codes alone are added. NaN
-    #: where the phase is missing or its wavelength is unknown; shape (T, M).
+    #: Phase times wavelength, referred to the clock of the codes: steps of whole milliseconds that only the codes have
+    #: are added. NaN where the phase is missing or its wavelength is unknown; shape (T, M).
     phase_m: Floats
     #: Metrics of the Doppler test and of the code test; NaN where a test is not possible; shape (T, M).
     doppler_metric_m: Floats
@@ -105,7 +106,7 @@ def median_or_zero(values: Floats) -> Floats:
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Return the values of the previous epoch at each epoch; `last` at the first epoch."""
+    """Return for each epoch the values of the previous epoch, and `last` for the first epoch."""
     return np.concatenate([last[None], values[:-1]])
 
 
@@ -195,7 +196,7 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Compute the clock step of the codes [m], whole milliseconds of it not in the phases, and metrics of both tests.
+    """Compute the clock step of the codes [m], its part not in the phases [ms], and the metrics of both tests.
 
     `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
     that epoch, and `range_mps` is the range rate from the Dopplers.
@@ -227,12 +228,13 @@ def linear_recursion(gain: Floats, drive: Floats) -> Floats:
 class SmoothingLimits(Settings):
     """Limits of the smoothing."""
 
-    #: Time constant: all codes of an arc have equal weight until the arc is this old; the weight of older codes then
-    #: decays (DO-229D 2.1.4.1.5: 100 s, because of the ionosphere's drift).
+    #: Time constant. All codes of an arc have equal weight until the arc has this age; then the weight of older codes
+    #: decays (DO-229D 2.1.4.1.5: 100 s, because of the drift of the ionospheric delay).
     window_s: float = Field(default=100.0, gt=0)
-    #: "own": the mean change of code less phase is a clock, subtracted before and added after averaging. It is for
-    #: telephones, whose codes jump together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m,
-    #: against 50 m with "shared"); results of other receivers were no worse with it.
+    #: With "own", the mean change of code less phase over all channels is a clock, which is subtracted before and added
+    #: after averaging. This is required for telephones, whose codes jump together by tens of metres: in a town, it
+    #: reduced the 95 % error along the line from 10.8 to 7.0 m, which was 50 m with "shared". Results of other
+    #: receivers were not worse with "own".
     clocks: Literal["own", "shared"] = "own"
 
 
@@ -254,14 +256,14 @@ class SmoothingState:
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
-    """Return values at the marked epochs, constant until the next mark, `first` before any; shapes (T, M) and (M,)."""
+    """Return values at marked epochs, constant until the next mark, and `first` before the first mark; shape (T, M)."""
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))
 
 
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
-    """Return the mean change of code less phase over the continuing channels, 0 without any; shape (T,)."""
+    """Return the mean change of code less phase over channels whose arc continues, shape (T,); 0 if there is none."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
     number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))

@@ -1,8 +1,9 @@
-"""Phase jumps on the line from the phase changes between two epochs, and numbers of arcs without a slip.
+"""Detection of phase jumps from the phase changes between two epochs on a known line, and numbering of phase arcs.
 
 Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every additional
-satellite is a check precise to a centimetre. Where the satellites disagree, the worst channels are rejected one by one
-until the others agree. The number of an arc, unique in a run, contains the letters of its channel and a count of arcs.
+satellite is a test with centimetre precision. Where the satellites are inconsistent, the channels with the largest
+residuals are rejected one by one until the remaining channels agree. The number of an arc, unique in a run, contains
+the letters of its channel and a count of arcs.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Return each channel's index in the previous epoch, shape (M,); -1, for an appended NaN, for new channels."""
+    """Return each channel's index in the previous epoch, shape (M,); -1 (index of an appended NaN) for new channels."""
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
@@ -79,7 +80,7 @@ def number_arcs(
 
 
 def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> Integers:
-    """Return the number of the last arc of each channel, shape (M,); `NO_ARC` for channels without one."""
+    """Return the number of the last arc of each channel, shape (M,); `NO_ARC` for channels without an arc."""
     count = {} if state is None else state.count
     codes = [channel_code(*key) for key in channel_keys(satellite, signal)]
     return np.array([(code << COUNT_BITS) + count[code] if code in count else NO_ARC for code in codes], dtype=np.int64)
@@ -103,7 +104,7 @@ class ContinuityLimits(Settings):
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
     sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
-    #: Largest number of channels rejected; if more would be rejected, no channel continues.
+    #: Largest number of channels rejected; if more would have to be rejected, all tested channels start new arcs.
     max_rejected: int = Field(default=8, ge=0)
     max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
 
@@ -121,9 +122,9 @@ class ContinuityState:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackJumps:
-    """Test result for the change of each phase into its epoch, T epochs by M channels."""
+    """Test results for the phase changes since the previous epoch, T epochs by M channels."""
 
-    jump: Masks  #: True where the phase change does not fit and a new arc begins, shape (T, M).
+    jump: Masks  #: True where the phase change is inconsistent and a new arc begins, shape (T, M).
     metric_m: Floats  #: Residual of the phase change in the fit of the kept channels; NaN if not tested; shape (T, M).
     judged: Masks  #: True where the phase change is tested, shape (T, M).
     #: Distance along the line since the previous epoch, from the phases, and its sigma; NaN where unknown; shape (T,).
@@ -150,7 +151,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Return phases whose change disagrees with the other phases and the line, and the distance moved.
+    """Return the phases whose change is inconsistent with the other phases and the line, and the distance moved.
 
     Parameters
     ----------
@@ -215,7 +216,7 @@ def track_jumps(
 def _reject_jumps(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Reject the worst channels one by one until the others agree; without redundancy all are kept.
+    """Reject channels with the largest residuals one by one until the others agree; without redundancy keep all.
 
     Returns a mask of kept channels, residuals of all channels, step along the line, its variance, and a mask of epochs
     whose kept channels agree.
@@ -242,7 +243,7 @@ def _reject_jumps(
 
 @dataclass(frozen=True)
 class _ContinuityFit:
-    """Residuals of all channels, also in sigmas (of the residual if kept, else of the prediction); step; variance."""
+    """Residuals of all channels in metres, and in sigmas (of the residual or, if rejected, of the prediction)."""
 
     residual: Floats
     size: Floats
@@ -259,7 +260,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
     residual = change - np.matmul(design, x[..., None])[..., 0]
     spread = np.einsum("tmi,tij,tmj->tm", design, inverse, design)
     own = sigma[:, None] ** 2
-    # A channel that no other channel checks has no residual variance: it cannot be tested.
+    # A channel that no other channel tests has no residual variance, and cannot be tested.
     checked = np.where(kept, own - spread, own + spread)
     size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
     return _ContinuityFit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
@@ -268,7 +269,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Return the channels that remain after rejecting the worst one by one, and the epochs where they agree."""
+    """Return the channels that remain after repeated rejection of the largest residual, and epochs where they agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

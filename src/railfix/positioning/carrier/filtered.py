@@ -1,4 +1,4 @@
-"""Positions along the line from code and phase, each epoch from its own and earlier observations only.
+"""Positions along the line from code and phase; the position of an epoch depends on this and earlier epochs only.
 
 The state between epochs is the normal matrix of the ambiguities of the active arcs; at multiples of
 `PhaseLimits.hop_s` process noise is added to the ambiguities. Where an arc begins, the previous arc of its channel is
@@ -60,7 +60,7 @@ class Memory:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseState:
-    """One memory per linearisation pass; none before the first epoch."""
+    """One memory per linearisation pass; empty before the first epoch."""
 
     memories: tuple[Memory, ...] = ()
 
@@ -75,7 +75,7 @@ def phase_positions(
     *,
     limits: PhaseLimits | None = None,
 ) -> tuple[PhasePositions, PhaseState]:
-    """Return the positions of a chunk of epochs, each from its own and earlier observations.
+    """Return the positions of a chunk of epochs, from the observations up to each epoch.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def phase_positions(
     -------
     PhasePositions
     PhaseState
-        Division into chunks does not change the result, to 1e-9 m.
+        Division into chunks changes the result by less than 1e-9 m.
     """
     limits = limits or PhaseLimits()
     memories = state.memories if state and state.memories else (Memory(),) * limits.passes
@@ -138,7 +138,7 @@ def _segment(
     memory: Memory,
     limits: PhaseLimits,
 ) -> tuple[PhasePositions, Floats, Memory]:
-    """Compute the positions of one segment and its final memory; `start` are initial positions, and a mask of them."""
+    """Compute the positions of one segment, and the memory after it; `start` has initial positions and their mask."""
     arc_m, started = start
     used = phases.weight > 0
     lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
@@ -154,7 +154,7 @@ def _segment(
     lin = shift_phases(lin, base)
     matrix, right = reduce(lin)
 
-    # A part ends where an arc begins, so that matrices have the same size however epochs are cut.
+    # A part ends where an arc begins, so that the size of matrices does not depend on the division into segments.
     parts = []
     for part in np.split(np.arange(len(time)), np.unique(begin[begin > 0])):
         new = np.isin(begin, part[:1])
@@ -184,8 +184,9 @@ def _ambiguities(
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
     """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
 
-    They are computed from the normal equations of each epoch and all earlier epochs. The ambiguities of all arcs and
-    the memory after the last epoch are also returned. With `held` the ambiguities have a zero mean (`inverse_of_arcs`).
+    The ambiguities are computed from the normal equations of each epoch and all earlier epochs. The ambiguities of all
+    arcs, and the memory after the last epoch, are also returned. With `held` the ambiguities have a zero mean
+    (`inverse_of_arcs`).
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # An extra row and column collects channels without a phase.
@@ -197,7 +198,7 @@ def _ambiguities(
     own[row, index, count + 1 :] = right
     own = np.delete(own[:, :count], count, axis=2)
     carried = np.concatenate([memory.matrix, memory.right], axis=1)
-    # cumsum from the carried sums: the same additions in the same order for any division into chunks.
+    # With cumsum, the additions and their order do not depend on the division into chunks.
     sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
     after = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
     level = np.zeros((len(arc_id), count + 1))
@@ -217,8 +218,8 @@ def _fix_epochs(
 ) -> tuple[Integers, Floats]:
     """Fix ambiguities in place, epoch by epoch; return the number of fixed differences and the risk, shape (T,).
 
-    `floats` are the first values of each channel's ambiguity (T, M), the corrections to them with their responses to
-    the map (T, M, 3), and the covariances (T, M, M).
+    `floats` are the first values of each channel's ambiguity (T, M), the corrections to these values with their
+    responses to the map (T, M, 3), and the covariances (T, M, M).
     """
     first, value, covariance = floats
     count, risk = np.zeros(len(value), dtype=np.int64), np.full(len(value), np.nan)
@@ -243,7 +244,7 @@ def _fix_epochs(
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """Return the memory with space for new arcs, sorted by number; older arcs of the same channels are eliminated."""
+    """Return the memory with rows for new arcs, sorted by number; older arcs of the same channels are eliminated."""
     if not len(ids):
         return memory
     memory = _without(memory, np.isin(decode_channel(memory.arc_id), decode_channel(ids)))
@@ -264,7 +265,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at the time step of `time`: absent arcs are eliminated, the others get process noise."""
+    """Return the memory at the time step of `time`, with absent arcs eliminated and process noise on the others."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)

@@ -7,9 +7,10 @@ Per epoch t and channel i, around a position on the line::
 
 where d is the distance along the section, m1 and m2 are the map errors across the track and in height, and b_g is the
 clock of the constellation. P4 sets b = b_g (`clocks="shared"`), which does not hold for telephones. With a separate
-phase clock the N are known up to a common constant. With ``L`` the normal matrix of an epoch's own unknowns and ``C``
-their coupling to the N, the epoch adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). The
-residual ionospheric error at the start of an arc is absorbed by N; afterwards N drifts by twice its change.
+phase clock, the N are determined up to a common constant. Let ``L`` be the normal matrix of an epoch's own unknowns,
+and ``C`` their coupling to the N. The epoch then adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur
+complement). N absorbs the residual ionospheric error at the start of an arc; afterwards N drifts by twice the change of
+this error.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from railfix.track.trajectory import Trajectory
 PhaseClocks = Literal["own", "shared"]
 
 PLACE: Final = 3  #: Number of own unknowns of an epoch before the clocks: along, across, up.
-_FREE_M: Final = 1e5  #: Sigma of an unknown without any information [m]: loose prior for conditioning.
+_FREE_M: Final = 1e5  #: Prior sigma of an unknown, a loose prior for conditioning [m].
 _LEAST_TIE_M: Final = 1e-2  #: Least sigma of a tie between clocks [m].
 
 
@@ -79,14 +80,14 @@ class Linearised:
     #: Design rows of codes and phases, shape (T, M, P).
     code_design: Floats
     phase_design: Floats
-    groups: int  #: Number of code clocks, before the phase clock if that is separate.
+    groups: int  #: Number of code clocks; a separate phase clock follows them.
     #: Weights of codes and phases, shape (T, M) [1/m^2].
     code_weight: Floats
     phase_weight: Floats
     #: Observed less computed, less `clock_m`; shape (T, M).
     code_m: Floats
     phase_m: Floats
-    #: First values of the epoch's clocks, subtracted from codes and phases; shape (T,).
+    #: Approximate clocks of the epoch, subtracted from codes and phases; shape (T,).
     clock_m: Floats
     phase_clock_m: Floats
     known: Floats  #: Prior information on map errors and inter-system biases, shape (T, P, P).
@@ -119,7 +120,7 @@ def linearise(
     phase = np.where(v > 0, phases.phase_m - distance - clock[:, None], 0.0)
     prior = np.array([trajectory.sigma_plan_m**-2.0, trajectory.sigma_height_m**-2.0])
     known = np.zeros((len(code), unknowns, unknowns))
-    # Loose prior: the matrix stays regular where an epoch does not determine an unknown, whose sigma is then large.
+    # With the loose prior, the matrix is regular even where an epoch does not determine an unknown.
     for free in (0, *range(PLACE, unknowns)):
         known[:, free, free] = _FREE_M**-2.0
     known[:, 1, 1], known[:, 2, 2] = prior
@@ -149,7 +150,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the values less the weighted mean of their epoch, 0 where the weight is 0, and that mean, shape (T,)."""
+    """Return the values less the weighted mean of their epoch (0 where the weight is 0), and the mean, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -170,7 +171,8 @@ def own_clock(lin: Linearised) -> bool:
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Subtract first values of the ambiguities (T, M) from the phases, and with a separate phase clock their mean rest.
+    """Subtract first values of the ambiguities (T, M), and the mean of the rest as a separate phase clock, from the
+    phases.
 
     The phases are added to the right-hand side only afterwards, because values of 1e7 m would cause rounding errors of
     millimetres.
@@ -187,11 +189,11 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
     """Compute the information of each epoch on its channels' ambiguities (Schur complement of its own unknowns).
 
     Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m] of the observations, and of map
-    errors of 1 m across and in height. A map error changes code and phase equally, by a column of their designs; with
-    its prior the right-hand side is ``prior_k C^T L^-1 e_k``.
+    errors of 1 m across and in height. A map error changes code and phase equally, by a column of the design; with the
+    prior of the map error, the right-hand side is ``prior_k C^T L^-1 e_k``.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
-    # Computed as a sum of squares of the residuals of the own unknowns: never negative, and errors of the inverse enter
+    # The sum of squares of the residuals of the own unknowns is never negative, and errors of the inverse enter
     # squared; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
@@ -227,8 +229,8 @@ def own_unknowns(
     """Solve for each epoch's own unknowns by back-substitution.
 
     `ambiguity_m`, shape (T, M, 3), are each channel's ambiguity and its responses to map errors of 1 m across and in
-    height. A map error that is constant over a run does not average out, so the sigma uses the larger of the response
-    of the epoch alone and the response including the ambiguities. `repeats`, shape (T,), are the numbers of epochs with
+    height. A map error that is constant over a run does not average out, so the sigma contains the larger of two
+    responses: of the epoch alone, and including the ambiguities. `repeats`, shape (T,), are the numbers of epochs with
     the same code errors, by which the ambiguities' variance is multiplied.
     """
     used = lin.phase_weight > 0
