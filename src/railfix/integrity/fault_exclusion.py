@@ -52,7 +52,7 @@ class RaimResult(NotebookTable):
 def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
-    """Return the statistic of the residuals and its threshold (P4) untested, with every outcome UNTESTABLE."""
+    """Return the statistic of the residuals and its threshold (P4) without a test; every outcome is UNTESTABLE."""
     return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
 
 
@@ -83,11 +83,12 @@ def exclude_faults(
 ) -> tuple[Ranges, LineFix, RaimResult]:
     """Exclude up to two faulty satellites per epoch and return the ranges, re-solved positions and test results.
 
-    The sum of squared residuals is tested against chi-square (P4, false alarm 1e-3), or against 100 m^2 (P1 table 6,
-    mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4)). A set is excluded if the
-    remaining ranges pass and the error of each range of the set exceeds the limit. A pair is not excluded if the robust
-    fit of the epoch keeps a range of the pair, because the remaining satellites may then be the faulty ones. Where a
-    fault remains unresolved, the position is computed from the ranges kept by the robust fit (`RaimResult.faulty`).
+    The sum of squared residuals is compared with a chi-square threshold (P4, false-alarm probability 1e-3), or with 100
+    m^2 (P1 table 6, mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4)). A satellite or
+    pair is excluded if the remaining ranges pass and if the errors of the excluded ranges exceed the limit. A pair is
+    not excluded if the robust fit of the epoch keeps a range of the pair, because the other satellites may then be the
+    faulty ones. Where a fault remains unresolved, the position is computed from the ranges kept by the robust fit
+    (`RaimResult.faulty`).
 
     Parameters
     ----------
@@ -145,7 +146,7 @@ def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices 
 
 
 def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
-    """Exclude the ranges rejected by the robust fit at epochs whose fault is unresolved or whose pair is contradicted.
+    """Exclude the ranges rejected by the robust fit, where the fault is unresolved or the fit keeps an excluded range.
 
     An epoch keeps all its ranges if fewer than `min_redundancy` redundant ranges would remain.
     """
@@ -171,7 +172,7 @@ def _second_attempt(
     limits: RaimLimits,
     fix_limits: FixLimits,
 ) -> Exclusion:
-    """Repeat the exclusion of unresolved epochs, linearised at the positions without the worst satellite.
+    """Repeat the exclusion at unresolved epochs, linearised at positions without the satellite of the largest residual.
 
     On a curve, a large fault moves the position to a part of the line with another direction, where the
     linear model is not valid for the true position.

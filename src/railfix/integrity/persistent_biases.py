@@ -30,7 +30,7 @@ _LEAST_FREEDOM: Final = 2
 class LastingErrorLimits(Settings):
     """Limits of the test for persistent range errors."""
 
-    #: Time constant of the mean residual. The default is a minute because reflections last less on a moving train.
+    #: Time constant of the mean residual. The default is a minute, because reflections are shorter on a moving train.
     memory_s: float = Field(default=60.0, gt=0)
     #: Clipping limit of a residual, in standard deviations of the weights or, if larger, of the receiver's noise.
     clipped: float = Field(default=2.0, gt=0)
@@ -52,7 +52,7 @@ class LastingErrorState:
     channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
     #: Sums for the noise scale of all ranges, faulty ranges included (`NoiseState`); shape (2,).
     noise: Floats = field(default_factory=lambda: np.zeros(2))
-    #: Mean residuals as fractions of `clipped`, shape (S, P); column p is computed without the p worst satellites.
+    #: Mean residuals as fractions of `clipped`, shape (S, P); column p is computed after the rejection of p satellites.
     sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -81,10 +81,11 @@ def reject_persistent_biases(
     states: Sequence[LastingErrorState],
     limits: BiasLimits,
 ) -> tuple[Ranges, PersistentBiases, list[LastingErrorState]]:
-    """Reject satellites with persistent code errors, and return the other ranges, their positions and the new states.
+    """Reject satellites with persistent code errors, and return the remaining ranges, positions and new states.
 
     An error of twice the noise passes the single-epoch test of P4, so the clipped residuals are averaged over time. The
-    worst satellite is left out first, then the worst of the remaining satellites by the residuals of the second fit.
+    satellite with the largest mean is rejected first. The positions are then computed again, and the next satellite is
+    rejected by the new residuals.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ def _is_remembered(state: LastingErrorState) -> Masks:
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
-    """Return the normalised residuals, clipped and divided by `clipped`, shape (T, K); 0 for unchecked ranges."""
+    """Return the normalised residuals, clipped and divided by `clipped`, shape (T, K); 0 with too little redundancy."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
     own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]

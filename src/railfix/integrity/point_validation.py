@@ -17,7 +17,7 @@ from railfix.positioning.range_arrays import Ranges
 class PointStatus(IntEnum):
     """Result of the validation of a conventional position."""
 
-    #: Both checks passed. Without a redundant range the residuals are not tested.
+    #: Residuals and dilution passed. Without a redundant range, the residuals are not tested.
     VALID = 0
     #: No position.
     NO_POSITION = 1
@@ -52,7 +52,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
     """Return the position dilution of precision (PDOP) with one clock per constellation, shape (T,).
 
-    PDOP is the square root of the trace of the position covariance for ranges of unit sigma (RTKLIB: `dops`); NaN where
-    the geometry is singular.
+    PDOP is the square root of the trace of the position covariance for ranges of unit sigma (RTKLIB: `dops`). It is NaN
+    where the geometry is singular.
     """
     return kernels.ranges.dilutions(ranges.arrays, kernel_array(ecef_m))

@@ -334,7 +334,7 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
 
 
 def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Floats:
-    """Return the weight of each shift of the nearest track: 1 far from all tracks, less between them, 0 on a track."""
+    """Return the weight of each shift of the nearest track: 1 far from tracks, less between tracks, 0 on one."""
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
     share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Suspicions of interference, the limits of their tests, and the signs in C/N0 and front-end gain."""
+"""Suspected causes of interference, limits of the tests, and statistics of C/N0 and front-end gain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from railfix.core.timescale import GPS_EPOCH, seconds
 
 
 class Suspicion(IntEnum):
-    """Likely cause of the signs of an epoch that concern all satellites, as decided by `suspicion`."""
+    """Most probable cause of the signs of interference at an epoch, as decided by `suspicion`."""
 
     NONE = 0
     JAMMING_SUSPECTED = 1
@@ -26,7 +26,7 @@ class Suspicion(IntEnum):
     TIME_TAGS = 3
     #: The 3-D positions have left the map, without a sign of spoofing or of a time-tag error.
     LEFT_MAP = 4
-    #: All positions of the last minute failed a check for an unknown cause.
+    #: All positions of the last minute failed a check; the cause is unknown.
     CONTRADICTED = 5
 
 
@@ -79,15 +79,16 @@ class InterferenceLimits(Settings):
     use: Literal["on", "off"] = "on"
     least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test over all satellites.
     fall_db: float = Field(default=5.0, gt=0)  #: Median fall of C/N0 below its recent peak.
-    #: Largest standard deviation of the falls; a jammer raises the noise of all channels alike, walls and roofs do not.
+    #: Largest standard deviation of the falls. A jammer raises the noise of all channels equally, walls and roofs do
+    #: not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
-    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time after which a satellite's C/N0 is compared.
+    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
     #: Fall of the front-end gain as a fraction of its recent peak. It reaches 14 % during a start without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
     #: Standard deviation of C/N0 over the satellites up to which it counts as equal; in open sky it is 1.2 dB or more.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Step of the codes relative to the Dopplers, less whole milliseconds. Phone clocks step by 30 m.
+    #: Minimum step of the codes relative to the Dopplers, less whole milliseconds. Phone clocks step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
     #: Minimum jumps of clock drift, 3-D velocity and 3-D position, and minimum distance from the line. A yard is some
     #: 100 m wide.
@@ -101,17 +102,18 @@ class InterferenceLimits(Settings):
     tag_sigmas: float = Field(default=6.0, gt=0)
     #: Time for which all positions must fail a check before positions are considered unreliable.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Limits of jumps and distances in standard deviations, and of the difference between two constellations.
+    #: Minimum jumps and distances, and minimum difference between two constellations, in standard deviations.
     jump_sigmas: float = Field(default=10.0, gt=0)
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Largest acceleration and speed of a train; a jump is the part of a change that they do not explain.
+    #: Largest acceleration and speed of a train. A jump is the part of a change that exceeds what these allow.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.
     #: Largest standard deviations of velocities and positions that are compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
     largest_sigma_m: float = Field(default=30.0, gt=0)
-    #: Holding times of a C/N0 or gain fall, equal C/N0 and a distance from the map, and of differing constellations.
+    #: Time for which a sign must persist: C/N0 or gain fall, equal C/N0, distance from the map; and differing
+    #: constellations.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)
     #: Length of the window over which satellite and wheel distances are compared, and its minimum.
@@ -132,7 +134,7 @@ class InterferenceLimits(Settings):
     wheel_change: float = Field(default=0.001, gt=0)
     #: Acceleration above which the wheel has slipped and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Time for which a suspicion remains after its last sign; a jump takes one epoch, but its cause persists.
+    #: Time for which a suspicion remains after its last sign. A jump is visible at one epoch, but its cause persists.
     jamming_release_s: float = Field(default=10.0, ge=0)
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
@@ -147,9 +149,10 @@ def cause_text(causes: Bits) -> Strings:
 def suspicion(causes: Bits) -> Codes:
     """Return the `Suspicion` of each epoch from its signs, same shape.
 
-    If several suspicions are possible, the one that explains most signs is returned. A common time-tag error comes
-    first because it moves positions and clocks as a spoofer would. Spoofing precedes leaving the map, which explains
-    neither jumps nor equal C/N0 nor differing constellations. Satellites with separate errors are excluded beforehand.
+    If several causes are possible, the cause that explains most signs is returned. A common time-tag error comes first,
+    because it displaces positions and clocks in the same way as a spoofer. Spoofing precedes leaving the map, because
+    leaving the map explains neither jumps nor equal C/N0 nor differing constellations. Satellites with individual
+    errors have been excluded before.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -166,7 +169,7 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class HeldState:
-    """State of C held conditions after a chunk."""
+    """State of C conditions with holding and release times, after a chunk."""
 
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
     #: Time for which each condition has been true, shape (C,).
@@ -178,7 +181,8 @@ class HeldState:
 def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Return masks of the conditions held for their holding time and of those within their release time, and the state.
+    """Return masks of conditions true for their holding time, and of conditions within their release time, and the
+    state.
 
     An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
     sufficient. Signs and masks have the shape (T, C), holding and release times the shape (C,) [s]. A condition with a
@@ -200,7 +204,7 @@ def hold_signs(
 
 _MINUTE_S: Final = 60.0
 _GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain peak per minute.
-_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is below every possible C/N0.
+_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is below every possible C/N0 [dB].
 _LONGEST_SILENCE_S: Final = 60.0  #: Longest absence of a satellite after which its earlier C/N0 is still used [s].
 
 
@@ -237,8 +241,8 @@ def power_signs(
 
     `cn0_dbhz` has the shape (T, K), with one signal per satellite at an epoch; `channel` names satellite and signal.
     `gain`, shape (T,), is in any unit that increases with the gain; NaN where unknown. The recent peak of a satellite
-    decays by `peak_decay_db_per_min`, so that a slow change of the sky is no sign, and a constant jammer is detected
-    for minutes.
+    decays by `peak_decay_db_per_min`, so that slow changes of elevation or obstruction are no sign, and a constant
+    jammer is detected for minutes.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

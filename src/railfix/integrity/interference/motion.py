@@ -1,4 +1,4 @@
-"""Signs of interference in clock, velocity and position: steps that exceed the limits of trains and oscillators."""
+"""Signs of interference in clock, velocity and position: steps that are impossible for a train or an oscillator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_tim
 
 #: Range step of a receiver clock step of 1 ms [m]; steps by whole milliseconds are not signs of interference.
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-#: Minimum redundancy for a noise estimate, because fewer redundant ranges or Dopplers can agree by chance.
+#: Minimum redundancy for a noise estimate; fewer redundant ranges or Dopplers can agree by chance.
 _LEAST_FREEDOM: Final = 3
 _LEAST_MPS: Final = 0.05  #: Minimum noise of Dopplers [m/s].
 _SIZE: Final = 4  #: Number of unknowns per constellation: position and clock.
@@ -70,7 +70,8 @@ class MotionSigns:
     """Motion statistics of T epochs; NaN where a comparison is not possible."""
 
     clock_jump_m: Floats  #: Median change of codes relative to Dopplers, less whole milliseconds; shape (T,).
-    #: Changes in excess of the limits of train and oscillator, in physical units and in standard deviations; (T,).
+    #: Part of each change that a train or an oscillator cannot cause, in physical units and in standard deviations;
+    #: (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
@@ -79,11 +80,11 @@ class MotionSigns:
     position_jump_sigmas: Floats
     #: Largest difference between the positions and clocks of any two constellations, in standard deviations; (T,).
     part_sigmas: Floats
-    #: Distance of the 3-D position from the line, NaN until a position has been on the line, shape (T,); and the excess
-    #: of the distance over `InterferenceLimits.position_jump_m` in standard deviations.
+    #: Distance of the 3-D position from the line, and its excess over `InterferenceLimits.position_jump_m` in standard
+    #: deviations, shape (T,) each; NaN until a position has been on the line.
     off_line_m: Floats
     off_line_sigmas: Floats
-    #: Median time-tag error over the last epochs, positive for late tags, and its ratio to its sigma; (T,).
+    #: Median time-tag error of the last epochs, positive for late tags, and its ratio to its sigma; (T,).
     tag_error_s: Floats
     tag_error_sigmas: Floats
 
@@ -114,7 +115,7 @@ def motion_signs(
 ) -> tuple[MotionSigns, MotionSignState]:
     """Return the clock, velocity and position statistics of T epochs, and the state for the next chunk.
 
-    `fitted` is the result of `fit_motion` for the same inputs; computed here by default.
+    `fitted` is the result of `fit_motion` for the same inputs, which is computed here by default.
     """
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
@@ -182,7 +183,7 @@ def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
 
 
 def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the excess changes of velocity and clock drift over the physical limits, in m/s and in sigmas, (T,)."""
+    """Return the changes of velocity and clock drift beyond the physical limits, in m/s and in sigmas, (T,)."""
     dt = seconds(now.time - before.time)
     near = np.where(dt <= limits.longest_gap_s, 1.0, np.nan)
     sigma = np.hypot(now.velocity_sigma_mps, before.velocity_sigma_mps)
@@ -195,9 +196,9 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return the distance from the extrapolated position, less a train's largest deviation, in metres and in sigmas.
+    """Return the distance from the extrapolated position, less the largest deviation of a train, in m and in sigmas.
 
-    The extrapolation uses the velocity at the previous position. Without that velocity, the train may have moved in any
+    The extrapolation uses the velocity at the previous position. Without a velocity, the train may have moved in any
     direction at its largest speed.
     """
     dt = seconds(now.time - before.time)

@@ -11,7 +11,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Prior weight of the unknowns, for conditioning with too few satellites.
+_RIDGE: Final = 1e-9  #: Loose prior weight of the unknowns, for conditioning.
 
 
 class MotionInputs(NamedTuple):
@@ -31,13 +31,13 @@ class MotionInputs(NamedTuple):
     corrected_code_m: Floats
     sigma_m: Floats
     used: Masks  #: Channels without a rejection reason, shape (T, K).
-    named: Masks  #: Channels rejected for a separate error only, shape (T, K).
+    named: Masks  #: Channels rejected only because of an error of the single satellite, shape (T, K).
     noise_scale: Floats  #: Ratio of the receiver's range standard deviation to `sigma_m`, shape (T,).
     #: Known offsets between the receiver clocks, and their standard deviations, shape (T, G).
     clock_offset_m: Floats
     clock_sigma_m: Floats
-    off_line_m: Floats  #: Distance of the 3-D position across from the line, shape (T,); NaN beyond an end.
-    #: True where codes are grossly wrong or flagged as wrong, or the position failed a check, shape (T,).
+    off_line_m: Floats  #: Lateral distance of the 3-D position from the line, shape (T,); NaN beyond an end.
+    #: True where codes have gross errors or are rejected as faulty, or the position failed a check, shape (T,).
     doubted: Masks
     antenna: Indices  #: Index of each epoch's antenna in `lines`, shape (T,).
     lines: tuple[SearchIndex, ...]  #: Line of each antenna.
@@ -50,7 +50,7 @@ class MotionInputs(NamedTuple):
         return MotionInputs(**own)
 
     def nearest_on_lines(self) -> tuple[Floats, Floats]:
-        """Return the line vertices nearest to `near_ecef_m`, (T, 3), and the axes across and up there, (T, 2, 3)."""
+        """Return the line vertices nearest to `near_ecef_m`, (T, 3), and the axes across and up at them, (T, 2, 3)."""
         point, axes = np.full(self.near_ecef_m.shape, np.nan), np.full((len(self.time), 2, 3), np.nan)
         for number, line in enumerate(self.lines):
             rows = np.flatnonzero((self.antenna == number) & np.isfinite(self.near_ecef_m[:, 0]))

@@ -1,8 +1,8 @@
-"""Test of the hypothesis of a common time-tag error, fitted together with position and receiver clocks.
+"""Test for a common time-tag error, which is fitted together with position and receiver clocks.
 
 With wrong time tags, satellite positions are computed for the wrong time; the design column of the error is thus the
 negative range rate. The alternative hypotheses are bad codes and a train off its map. A time-tag error is accepted only
-if it explains the residuals clearly better.
+if it explains the residuals clearly better than the alternatives.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _RATE_MPS: Final = 500.0
 _TAG_EPOCHS: Final = 10
 _TAG_LEAST: Final = 3
 _TAG_WINDOW: Final = np.timedelta64(60, "s")
-_STEPS: Final = 6  #: Largest number of steps of a fit; its convergence limits of error [s] and position [m] follow.
+_STEPS: Final = 6  #: Largest number of steps of a fit; next, its limits of convergence, of error [s] and position [m].
 _SETTLED_S: Final = 0.05
 _SETTLED_M: Final = 100.0
 _ROUNDS: Final = 2  #: Reweighted fits per step.
 _FITS_WELL: Final = 3.0  #: Multiple of the median up to which residuals have full weight.
-_SHOWN: Final = 3.0  #: Errors above this many standard deviations are tested against the alternative hypotheses.
+_SHOWN: Final = 3.0  #: Errors above this many standard deviations are compared with the alternative hypotheses.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's distance from its line, across and up.
 _LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree on an error.
-#: Residual limit for agreement, in standard deviations; residuals are clipped at this limit in the cost.
+#: Residuals up to this many standard deviations agree; the cost contains residuals clipped at this limit.
 _AGREES: Final = 5.0
 #: Minimum reduction of the cost. It exceeds the cost of one clipped residual because a time-tag error can absorb one
 #: bad code.
@@ -61,11 +61,11 @@ class _TagFit(NamedTuple):
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     """Return the common time-tag error, positive for late tags, and its standard deviation, shape (T,) [s].
 
-    Satellites flagged as wrong are fitted, too, since a time-tag error makes satellites appear wrong. Where the error
-    is significant, or a position is in doubt, the line is used as a constraint. The standard deviation is then infinite
-    unless redundant rows agree and the cost is clearly lower than without a time-tag error and without the flagged
-    satellites. The cost is the sum of the squared normalised residuals of all codes and of the line, clipped at
-    `_AGREES`. Error and standard deviation are NaN where they cannot be determined.
+    Satellites that were rejected as faulty are fitted, too, because a time-tag error makes satellites appear faulty.
+    Where the error is significant, or the position is doubtful, the line is used as a constraint. The standard
+    deviation is then infinite unless redundant rows agree, and the cost is clearly lower than without a time-tag error
+    and without the rejected satellites. The cost is the sum of the squared normalised residuals of all codes and of the
+    line, clipped at `_AGREES`. Error and standard deviation are NaN where they cannot be determined.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
@@ -83,9 +83,9 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
     """Return whether a time-tag error explains the residuals clearly better than bad codes, shape (T,)."""
     every = inputs.used | inputs.named
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
-    # without a redundant range, the unflagged ranges fit exactly and the flagged ranges count as wrong
+    # without a redundant range, the accepted ranges fit exactly, and the rejected ranges count as wrong
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise of this fit, limited to the receiver's noise, which would include a time-tag error
+    # noise of the fit with a time-tag error, but at most the receiver's noise, which may contain such an error
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -128,8 +128,7 @@ def _with_line(channels: Masks, line: bool) -> Masks:
 def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
     """Return solutions, standard deviations of the fourth unknown, and absolute residuals in standard deviations.
 
-    The `counted` rows are fitted, with lower weights for large residuals. For the remaining rows only residuals are
-    computed.
+    The `counted` rows are fitted, with lower weights for large residuals. For other rows, only residuals are computed.
     """
     now = full = np.where(counted, weight, 0.0)
     for _ in range(_ROUNDS):
@@ -153,10 +152,10 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 
 
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median time-tag error over the last epochs, its ratio to its standard deviation, and the new state.
+    """Return the median time-tag error of the last epochs, the ratio to its standard deviation, and the new state.
 
-    The standard deviation is the median of the epochs' standard deviations, or the spread of their errors if larger.
-    The results are NaN for fewer than `_TAG_LEAST` epochs.
+    The standard deviation is the larger of two values: the median of the epochs' standard deviations, and the robust
+    spread of their errors. The results are NaN for fewer than `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
     lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))

@@ -1,8 +1,8 @@
 """Comparison of satellite and wheel distances, which detects a slow pull of the positions along the track.
 
-Over a window, the two distances differ by the noise of two positions and by the wheel scale-factor error, which is
-estimated before the window. A pull that exists from the start of the run, or is within the uncertainty of the wheel
-diameter, is not detected.
+Over a window, the two distances differ by the noise of two positions, and by the wheel scale-factor error, which is
+estimated from the data before the window. A pull that exists from the start of the run, or is within the uncertainty of
+the wheel diameter, is not detected.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ class WheelSamples(RowArrays):
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
     distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start.
-    #: Largest distance since the start that the wheel may have rolled undetected, below its minimum speed.
+    #: Largest distance since the start that may be missing in `distance_m`, because the tachometer has no output at low
+    #: speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Number of the part; a part is a stretch without slip and without a gap in the wheel data.
+    #: Number of the part; a part is an interval without slip and without a gap in the wheel data.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
@@ -54,7 +55,7 @@ class WheelState:
     part: int = 0
     second: int = -1
     held: HeldState = field(default_factory=HeldState)
-    #: Fields of `WheelSigns` at the last sample, and whether the difference is excessive there.
+    #: Fields of `WheelSigns` at the last sample, and whether the difference exceeds its limits at this sample.
     difference_m: float = float("nan")
     bound_m: float = float("nan")
     beyond: bool = False
@@ -66,11 +67,11 @@ class WheelSigns:
 
     #: Satellite distance less scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
-    #: Bound of the position error for a pull that began within the window, shape (T,). It is the absolute difference
-    #: plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since then. It is also
-    #: given for windows shorter than `wheel_least_s`.
+    #: Bound of the position error for a pull that began within the window, shape (T,). The bound is the absolute
+    #: difference plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since then.
+    #: Windows shorter than `wheel_least_s` also have a bound.
     bound_m: Floats
-    #: True where the difference exceeds noise and diameter error, or has done so within the release time; shape (T,).
+    #: True where the difference exceeds noise and diameter error, or exceeded them within the release time; shape (T,).
     parted: Masks
 
 
@@ -142,7 +143,8 @@ def _wheel_distances(
 def _compare(
     samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
 ) -> tuple[Floats, Floats, Masks]:
-    """Return differences, bounds and the mask of excessive differences over the window before each sample from `first`.
+    """Return differences, bounds and the mask of differences over their limits, for the window before each sample from
+    `first`.
 
     The wheel scale factor is estimated from the part before each window and applied to the wheel distance.
     """

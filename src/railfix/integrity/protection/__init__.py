@@ -1,4 +1,4 @@
-"""Protection level along the track (P1 2.4): bound that the position error exceeds with at most the stated risk.
+"""Protection level along the track (P1 2.4): a bound that the position error exceeds with at most the stated risk.
 
 Levels are computed from a model of `railfix.integrity.raim`::
 

@@ -1,16 +1,17 @@
 """ARAIM: multiple-hypothesis solution separation with an integrity support message, along the track and in 3-D.
 
-The algorithm is that of the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0). For each fault mode k, the
-position is computed without the satellites of the mode, by `S_k = (G' W_k G)^-1 G' W_k` with the weights W of the
-integrity sigmas. For the component q of the position,
+The algorithm was published by the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0). For each fault mode
+k, the position is computed without the satellites of the mode, by `S_k = (G' W_k G)^-1 G' W_k` with the weights W of
+the integrity sigmas. For the component q of the position,
 
 - the variance is `sigma_k^2 = [(G' W_k G)^-1]_qq`, and the bias `b_k = sum_i |S_k,qi| b_i`;
 - the threshold is `T_k = K_fa sqrt(sum_i (S_k,qi - S_0,qi)^2 sigma_acc,i^2)` with the accuracy sigmas;
 - the level L satisfies
   `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
 
-A map is a further constraint (Wenz 2024) by two observations, the offsets across and up, with the sigmas of the map.
-The two observations are faulty together if the map is wrong. The component q is then the position along the track.
+A map is an additional constraint (Wenz 2024). It adds two observations, the offsets across and up, with the sigmas of
+the map. Both observations are faulty together if the map is wrong. With a map, the component q is the position along
+the track.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class AraimBudget(Settings):
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
-    #: Largest total probability of faults that are not modes. Modes of more faults, up to `most_faults`, are added
-    #: until this limit is met.
+    #: Largest total probability of faults that are not modes. Modes with more simultaneous faults, up to `most_faults`,
+    #: are added until this limit is met.
     unmonitored: float = Field(default=8e-8, gt=0, lt=1)
     most_faults: int = Field(default=2, ge=1, le=3)  #: Largest number of simultaneous faults in a mode.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0 omits this fault mode.
@@ -74,7 +75,7 @@ class AraimGeometry:
     sigma_acc_m: Floats
     bias_m: Floats  #: Largest nominal bias of each observation, shape (T, N).
     prior: Floats  #: Prior probability of a fault of a single observation, shape (N,).
-    together: Masks  #: Sets of observations that are faulty together, by constellation or for the map, shape (C, N).
+    together: Masks  #: Sets of observations that are faulty together (of a constellation, or of the map), shape (C, N).
     together_prior: Floats  #: Prior probability of a fault of each set, shape (C,).
 
     @property
@@ -87,7 +88,7 @@ class AraimGeometry:
 class AraimLevels:
     """Protection levels of T epochs for Q components of the position."""
 
-    #: Protection levels, shape (T, Q); infinite where unmonitored faults are likelier than the risk, NaN without a
+    #: Protection levels, shape (T, Q); infinite where unmonitored faults are more probable than the risk, NaN without a
     #: position.
     level_m: Floats
     #: Standard deviations of the position from all observations, for integrity and for accuracy, shape (T, Q).
@@ -146,7 +147,7 @@ def _block(
     probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
     out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
     kept = used[:, None, :] & ~out
-    # a mode that removes the same used observations as a smaller mode has the same position
+    # two modes that remove the same used observations have the same position
     weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
     gain, sigma = _gains(design, weight, components)
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
@@ -182,7 +183,7 @@ def _event_priors(geometry: AraimGeometry, used: Masks) -> Floats:
 
 
 def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
-    """Return the largest number of simultaneous events in a mode and a bound of the probability of more, shape (T,)."""
+    """Return the largest number of simultaneous events in a mode, and a bound of the probability of more events."""
     more = set_sums(prior, budget.most_faults + 1)[:, 2:]
     enough = more <= budget.unmonitored
     order = np.where(enough.any(axis=1), np.argmax(enough, axis=1) + 1, budget.most_faults)
@@ -207,7 +208,7 @@ def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Flo
 
 
 def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Floats:
-    """Find by bisection the levels (T, Q) at which the tails (T, F, Q) add up to the risk; infinite beyond 1e4 m."""
+    """Find by bisection the levels (T, Q) at which the tails (T, F, Q) add up to the risk; infinite above 1e4 m."""
     low, high = np.zeros(risk.shape), np.full(risk.shape, _LONGEST_M)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -279,7 +280,7 @@ class IntegritySupport(Settings):
         return ~((time < first) | (time > last))
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return a note if the message states no end of validity, or is invalid at some epochs."""
+        """Return a note if the message states no end of validity, or is not valid at some epochs."""
         if self.valid_until is None:
             return ("integrity support message: without valid_until it is not known whether it has expired",)
         if self.holds(time).all():
@@ -291,7 +292,7 @@ class IntegritySupport(Settings):
         )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
-        """Return the support of each channel from the names of its satellites ("G07"); NaN without support."""
+        """Return the support of each channel from the name of its satellite ("G07"); NaN without support."""
         of_each = [self.satellite.get(name) or self.constellation.get(name[0]) for name in satellites]
         ura, ure, bias, prior = (
             np.array([np.nan if each is None else getattr(each, name) for each in of_each], dtype=np.float64)
@@ -301,7 +302,7 @@ class IntegritySupport(Settings):
 
 
 def read_integrity_support(path: FilePath) -> IntegritySupport:
-    """Read an integrity support message from a TOML file; InputFileError if it is not such a message."""
+    """Read an integrity support message from a TOML file; raise InputFileError for other files."""
     values = read_toml(path, what="an integrity support message")
     if values.get("format") != FORMAT:
         raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")

@@ -1,8 +1,9 @@
-"""Positions on the line off the tangent that are possible under the fault hypotheses of a protection level.
+"""Possible positions on the line, away from its tangent, under the fault hypotheses of a protection level.
 
-A level bounds the error along the tangent. Where the line bends, passes itself or branches, leaving out a satellite can
-move the position to a point off the tangent. Under each hypothesis of the level, the sum of squared residuals is a
-quadratic form of the position. It is evaluated along the line unless a bound excludes positions off the tangent.
+A level bounds the error along the tangent. Where the line bends, or passes close to itself, the position without a
+satellite can be a point of the line away from the tangent. Under each hypothesis of the level, the sum of squared
+residuals is a quadratic form of the position. This form is evaluated along the line unless a bound excludes positions
+away from the tangent.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Forms(NamedTuple):
         return np.where(possible, np.fmin(radius, _FURTHEST_M), 0.0)
 
 
-_BOUND_SIZE: Final = 200_000  #: Number of epochs of a block times its squared number of channels.
+_BOUND_SIZE: Final = 200_000  #: Largest number of epochs of a block times its squared number of channels.
 
 
 def places_beyond_the_level(
@@ -67,10 +68,11 @@ def places_beyond_the_level(
 ) -> Masks:
     """Return the mask of epochs whose level does not cover a possible position on the line, shape (T,).
 
-    Under a hypothesis J, a position that fits worse than the best position by x variances is true with a probability of
-    at most ``Q(sqrt(x))``. This probability is computed for the best position beyond the level under each hypothesis
-    and multiplied by the prior of J. An epoch is marked where the sum exceeds the risk of a sample. Values of `scale`
-    below 1 count as 1. `sides`, shape (T, S, M), marks the low satellites of each side.
+    Under a hypothesis J, a position whose sum of squared residuals is larger than the minimum by x variances is the
+    true position with a probability of at most ``Q(sqrt(x))``. For each hypothesis, this probability is computed for
+    the best position beyond the level, and multiplied by the prior of J. An epoch is marked where the sum exceeds the
+    risk of a sample. Values of `scale` below 1 count as 1. `sides`, shape (T, S, M), marks the low satellites of each
+    side.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]
@@ -104,7 +106,7 @@ def places_beyond_the_level(
 
 
 def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Forms, risk: RiskBudget) -> Floats:
-    """Return a bound of the probability that the true position is beyond the level off the tangent, shape (T,)."""
+    """Return an upper bound of the probability that the true position is beyond the level and off the tangent, (T,)."""
     radius = forms.radius_m(risk.risk_per_sample)
     sections = _around(index, arc_m, level_m, radius.max(axis=1))
     return kernels.off_tangent.risk_beyond(forms.prior, forms.form, radius, *sections)
@@ -136,7 +138,7 @@ def _around(
     epoch, vertex = epoch[inside], vertex[inside]
     start = np.einsum("pij,pj->pi", axes[epoch], line.ecef_m[vertex] - place[epoch])
     tangent, length = np.einsum("pij,pj->pi", axes[epoch], line.tangent[vertex]), line.length_m[vertex]
-    # |start + s tangent| = level at both roots; the level covers the part between them.
+    # |start + s tangent| = level at both roots; the level covers the part of the section between the roots.
     middle = -np.einsum("pi,pi->p", start, tangent)
     square = middle**2 - np.einsum("pi,pi->p", start, start) + level_m[epoch] ** 2
     half = np.sqrt(np.maximum(square, 0.0))

@@ -40,8 +40,8 @@ MOST_TOGETHER: Final = 4  #: Largest number of faulty single satellites in a hyp
 def k_factor(risk: float) -> float:
     """Return K such that a one-dimensional error exceeds K sigma, on either side, with probability `risk`.
 
-    A risk of 1e-7 gives 5.33, 1e-8 gives 5.73. The Rayleigh factor of a horizontal position is larger. ValueError: the
-    risk is not in (0, 1].
+    A risk of 1e-7 gives 5.33, 1e-8 gives 5.73. The Rayleigh factor of a horizontal position is larger. A ValueError is
+    raised if the risk is not in (0, 1].
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
@@ -62,7 +62,7 @@ class RiskBudget(Settings):
     #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 per hour.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Number of independent samples in an hour, 3600 s divided by the correlation time of the errors. The default
-    #: assumes 10 s: multipath changes within seconds on a moving train, within tens of seconds on a standing train,
+    #: assumes 10 s: multipath changes within seconds on a moving train, within tens of seconds on a stationary train,
     #: and SBAS corrections change within minutes (DO-229D appendix J counts 10 samples per hour). A larger number is
     #: conservative. From 10 to 3600 samples, the fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
@@ -75,17 +75,18 @@ class RiskBudget(Settings):
     #: Fraction of the risk for faults that are not hypotheses. If the faults exceed this fraction, further faults
     #: become hypotheses, up to four simultaneous satellites and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite, and the same fraction for two.
+    #: Fraction of the risk for epochs with one excluded satellite, and for epochs with two excluded satellites.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability per epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability that the signal of a satellite is faulty, by constellation.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    #: Additional probability of a local fault (multipath, interference) of a satellite. It is an assumption until
-    #: measured on the line (P1 7).
+    #: Additional probability of a local fault (multipath, interference) of a satellite. The value is an assumption
+    #: until it is measured on the line (P1 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
-    #: Probability that the map is wrong by more than its stated error, for example by a parallel track, heights without
-    #: the geoid, or a different reference frame. It is an assumption. With 0, a wrong map is no hypothesis.
+    #: Probability that the map is wrong by more than its stated error, for example because of a parallel track, heights
+    #: without the geoid, or a different reference frame. The value is an assumption. With 0, a wrong map is no
+    #: hypothesis.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
     #: Probability that the low satellites of one side of the track are faulty together (`SUPPORTED_SIDE_PRIOR`). No
     #: data supports a smaller value, and every output of the levels reports a smaller setting. With 0, a faulty side is
@@ -134,7 +135,7 @@ class RiskBudget(Settings):
     def prior(self, systems: Sequence[str]) -> Floats:
         """Return the fault probability of each channel, the sum of satellite prior and local prior, shape (M,).
 
-        ValueError: a constellation has no satellite prior.
+        A ValueError is raised if a constellation has no satellite prior.
         """
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
@@ -145,8 +146,8 @@ class RiskBudget(Settings):
         """Return the risk of an epoch for the satellites that remain after exclusions, any shape.
 
         `beyond` is the probability of unchecked faults, which is subtracted first. Any e satellites could have been
-        excluded, so the part of the risk for e exclusions is divided by the number of sets of e among all satellites.
-        The result is 0 for more than `MOST_EXCLUDED` exclusions, and where `beyond` exceeds the risk.
+        excluded, so the part of the risk for e exclusions is divided by the number of sets of e satellites. The result
+        is 0 for more than `MOST_EXCLUDED` exclusions, and where `beyond` exceeds the risk.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -206,13 +207,13 @@ class Allocation:
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
     members: Masks  # (T, B, M) satellites affected by each set of shared faults
     shared_prior: Floats  # (T, B) probability of each set of shared faults, 0 where absent
-    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if it is no hypothesis
+    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if the set is no hypothesis
     beyond: Floats  # (T,) probability of the classes that are not hypotheses
     fault_free: Floats  # (T,) risk for no fault; `one`, `two` and `more` for one, two and three or more faults
     one: Floats
     two: Floats
     more: Floats  # 0 where three faults are not hypotheses
-    reserved: Floats  # (T,) probability of satellite pairs where they are within their allocation unchecked, else 0
+    reserved: Floats  # (T,) probability of satellite pairs, where pairs are not hypotheses, else 0
     k_false_alarm: Floats  # (T,) factor K of the thresholds
 
 
@@ -221,17 +222,17 @@ def allocate(
 ) -> Allocation:
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    Hypotheses are always: single satellites, alone and with a wrong map; pairs of satellites, where they are likelier
-    than their allocation; constellations, alone and with one satellite; sides; and every class that is likelier than
-    the risk for unchecked faults. `out`, shape (T,), is the number of excluded satellites; `sides`, shape (T, S, M),
-    are the sets of satellites that are faulty together.
+    The following classes are always hypotheses: single satellites, alone and with a wrong map; pairs of satellites,
+    where pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and every
+    class that is more probable than the risk for unchecked faults. `out`, shape (T,), is the number of excluded
+    satellites; `sides`, shape (T, S, M), are the sets of satellites that are faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
-    if len(used) <= FEW:  # in live operation, successive epochs mostly have the same satellites
+    if len(used) <= FEW:  # in live operation, consecutive epochs mostly have the same satellites
         given = (used.tobytes(), out.tobytes(), sides.tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    # Many epochs of a chunk have the same satellites; the allocation is computed once per set of satellites.
+    # Many epochs of a chunk have the same satellites, so the allocation is computed once per set of satellites.
     bits = np.packbits(np.concatenate([used, sides.reshape(len(used), -1)], axis=1), axis=1)
     keys = np.concatenate([bits, np.ascontiguousarray(out)[:, None].view(np.uint8)], axis=1)
     _, first, which = np.unique(keys.view(f"V{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
@@ -350,7 +351,7 @@ class _Classes:
     def rest(self, order: Indices) -> Floats:
         """Return the probability of faults that are not hypotheses, shape (T,).
 
-        A set of shared faults that is no hypothesis includes all its supersets.
+        The probability of a set of shared faults that is no hypothesis includes its supersets.
         """
         whole = (order < 0) & (self.each > 0.0)
         covered = whole.astype(np.float64) @ self.within.T > 0.0
@@ -361,8 +362,8 @@ class _Classes:
         """Choose the largest number of single satellites left out with each set of shared faults, shape (T, B).
 
         Faults with a total probability of `share` may remain unchecked. `likely`, length B, are the nominal priors of
-        the sets of shared faults, and `satellite` is the mean prior of a satellite. The likeliest classes are chosen
-        first.
+        the sets of shared faults, and `satellite` is the mean prior of a satellite. The most probable classes are
+        chosen first.
         """
         sizes = np.arange(MOST_TOGETHER + 1)
         feasible = scipy.special.comb(used[:, None], sizes) <= _MOST_SETS

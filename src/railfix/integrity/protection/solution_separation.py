@@ -1,7 +1,8 @@
 """Protection level along the track by solution separation over fault hypotheses.
 
-While ``|x_J - x| <= T_J``, the position x is within T_J of the position x_J, which is not affected by a fault of the
-subset J. At the level L, the tails of all hypotheses add up to the risk (EU-U.S. WG-C ARAIM, in one dimension):
+If ``|x_J - x| <= T_J``, the position x is within T_J of the position x_J, which a fault of the subset J does not
+affect. At the level L, the tail probabilities of all hypotheses add up to the risk (EU-U.S. WG-C ARAIM, in one
+dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
@@ -35,7 +36,7 @@ _OF_MORE: Final = 3  #: Index of the tails of three or more faults among the kin
 class Cause(IntEnum):
     """Hypothesis that uses most of the risk of an epoch at its level, or the reason for an infinite or missing level.
 
-    The faults are those of a satellite, of a constellation, of a side of the track (or both sides), or of the map.
+    A fault affects a satellite, a constellation, a side of the track (or both sides), or the map.
     """
 
     #: Fault-free noise of the position.
@@ -44,7 +45,7 @@ class Cause(IntEnum):
     ONE_FAULT = 1
     #: Two simultaneous faults.
     TWO_FAULTS = 2
-    #: Infinite level: undetectable satellite faults are likelier than their part of the risk.
+    #: Infinite level: undetectable satellite faults are more probable than their part of the risk.
     UNCHECKED = 3
     #: Infinite level: faults that are not hypotheses exceed the risk, or too many satellites are excluded.
     BUDGET = 4
@@ -54,13 +55,13 @@ class Cause(IntEnum):
     THREE_FAULTS = 6
     #: Infinite level: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
-    #: Infinite level as `UNCHECKED`, mostly by faults of a constellation, alone or with satellites.
+    #: Infinite level as for `UNCHECKED`, mostly because of faults of a constellation, alone or with satellites.
     UNCHECKED_CONSTELLATION = 8
-    #: Infinite level as `UNCHECKED`, mostly by faults of one or both sides of the track.
+    #: Infinite level as for `UNCHECKED`, mostly because of faults of one or both sides of the track.
     UNCHECKED_SIDE = 9
-    #: Infinite level as `UNCHECKED`, mostly by faults of the map.
+    #: Infinite level as for `UNCHECKED`, mostly because of faults of the map.
     UNCHECKED_MAP = 10
-    #: Infinite level as `UNCHECKED`, mostly by simultaneous faults of constellations, sides or the map.
+    #: Infinite level as for `UNCHECKED`, mostly because of simultaneous faults of constellations, sides or the map.
     UNCHECKED_TOGETHER = 11
 
 
@@ -68,8 +69,8 @@ class Cause(IntEnum):
 class ProtectionLevel(NotebookTable):
     """Protection levels along the track of T epochs; NaN without a position."""
 
-    #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. At most
-    #: the largest part, since the parts need not use their risk allocations fully.
+    #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. It is at
+    #: most the largest of the following parts, which need not use their risk allocations fully.
     level_m: Floats
     #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the hypotheses of a part are
     #: within its risk allocation unchecked.
@@ -83,11 +84,11 @@ class ProtectionLevel(NotebookTable):
     k_two_faults: Floats
     k_false_alarm: Floats  #: Factor K of the thresholds, shape (T,).
     separation: Floats  #: Largest ``|x_J - x|/T_J``, shape (T,); 0 where no satellite can be left out.
-    #: True where the separation is at most 1, shape (T,). Otherwise the level is invalid. False without a position.
+    #: True where the separation is at most 1, shape (T,); False without a position. The level is invalid where False.
     consistent: Masks
     #: Channel that determines `one_fault_m`, shape (T,); -1 if a constellation, a side or the map determines it.
     worst_one: Indices
-    worst_two: Indices  #: Pair of channels that determines `two_fault_m`, shape (T, 2); -1 if it is no such pair.
+    worst_two: Indices  #: Pair of channels that determines `two_fault_m`, shape (T, 2); -1 if no pair does.
     #: Letter of the constellation that determines `one_fault_m`, shape (T,); else empty.
     worst_constellation: Strings
     unchecked_risk: Floats  #: Probability of faults that are not hypotheses, subtracted from the risk, shape (T,).
@@ -135,7 +136,8 @@ def protection_level(
     overbound : RangeBounds, optional
         By default, the sigma of each range follows from its weight and the scale, and the bias is 0.
     sides : ndarray of bool, shape (T, S, M), optional
-        Sets of satellites that reflections can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
+        Sets of satellites that reflections can make faulty together. Each set is a hypothesis with the prior
+        `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or (), or ndarray of bool, shape (T, M)
         Number of satellites excluded by RAIM, or `RaimResult.excluded`; satellites rejected by the screens do not
         count.
@@ -257,7 +259,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     """Compute the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(model.used.sum(axis=1).max())
-    # the allocation of few epochs is cached, and so are the data derived from it
+    # the allocation of few epochs, and the data derived from it, are cached
     every = len(rows) == len(plan.beyond) <= FEW
     asked, share, letters, pairs = _names_of_few(plan, n) if every else _names(plan, rows, n)
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(model.arrays, of_block, asked)
@@ -363,10 +365,10 @@ class LevelStatus(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """Return the `LevelStatus` of each epoch from its level [m] and the alarm limit (P1 2.4), int8, same shape.
+    """Return the `LevelStatus` of each epoch from its level [m] and the alarm limit (P1 2.4), as int8, same shape.
 
     A level of NaN means that there is no position. The status of an inconsistent epoch with a position is ALARM
-    (`ProtectionLevel.consistent`). ValueError: the alarm limit is not positive.
+    (`ProtectionLevel.consistent`). A ValueError is raised if the alarm limit is not positive.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")

@@ -1,9 +1,9 @@
 """Reliability: minimal detectable biases, and the effect of undetected biases on the position.
 
-A fault of noncentrality lambda is missed by the test with the stated probability (P4). It corresponds to a bias of
-``sigma_i sqrt(lambda / r_ii)`` in the range of satellite i, because only the fraction r_ii of the squared bias enters
-the statistic. ``slope_i`` is the position change per unit of the statistic's square root. The protection level is the
-largest slope times ``sigma0 sqrt(lambda)`` (P4), plus K sigma for the noise of the position.
+The test misses a fault of noncentrality lambda with the stated probability (P4). This fault corresponds to a bias of
+``sigma_i sqrt(lambda / r_ii)`` in the range of satellite i, because the statistic contains only the fraction r_ii of
+the squared bias. ``slope_i`` is the position change per unit of the statistic's square root. The protection level is
+the largest slope times ``sigma0 sqrt(lambda)`` (P4), plus K sigma for the noise of the position.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Reliability:
     """Reliability of T epochs by M channels for the chi-square test."""
 
     noncentrality: Floats  #: Noncentrality lambda for the epoch's degrees of freedom, shape (T,); NaN if not testable.
-    #: Range error missed with the stated probability, shape (T, M); infinite for unchecked, NaN for unused channels.
+    #: Range error missed with the stated probability; infinite if no other channel tests it; NaN if unused; shape (T,
+    #: M).
     minimal_detectable_bias_m: Floats
     #: Position error per unit of the statistic's square root, shape (T, M); NaN for unused channels.
     slope_m: Floats
@@ -42,7 +43,7 @@ class Reliability:
     worst: Indices  #: Channel of the largest single slope, shape (T,); -1 if no channel has a slope.
     #: Standard deviation along the line, or in space along the longest axis of the horizontal ellipse, shape (T,).
     position_sigma_m: Floats
-    #: Position error due to a fault that is missed with the stated probability, slope sqrt(lambda), shape (T,).
+    #: Position error due to a fault missed with the stated probability, largest slope times sqrt(lambda), shape (T,).
     fault_level_m: Floats
     noise_level_m: Floats  #: Noise part of the level, K sigma, shape (T,).
     #: Sum of fault and noise level, shape (T,); infinite where a fault cannot be detected; NaN without a position.
@@ -102,8 +103,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
     """Return the noncentrality that the chi-square test misses with probability `missed_detection` (P4), same shape.
-
-    It is NaN below 1 degree of freedom.
+    The value is NaN below 1 degree of freedom.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -131,7 +131,7 @@ def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floats) -> Floats:
-    """Return the slopes for errors of single satellites, shape (T, M) [m]; infinite for unchecked channels."""
+    """Return the slopes for errors of single satellites, shape (T, M) [m]; infinite if no other channel tests it."""
     effect = np.sqrt((model.gain_m**2).sum(axis=2))
     checked = share > LEAST_REDUNDANCY
     unchecked = np.where(effect > _NO_EFFECT * sigma[:, None], np.inf, 0.0)
@@ -180,8 +180,8 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
     squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
-    # Errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If they do not move the position, the
-    # slope of the pair is not larger than the single slopes.
+    # Errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If these errors do not change the
+    # position, the slope of the pair is not larger than the single slopes.
     x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
     hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)
     blind = both & ~regular & (hidden > _NO_EFFECT * sigma[:, None] * np.hypot(x, y))

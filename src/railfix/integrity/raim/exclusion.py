@@ -1,8 +1,8 @@
 """Fault detection by the sum of squared residuals (P4: chi-square; P1 2.3(4): 100 m^2), and fault exclusion.
 
-Leaving out the satellites E is equivalent to estimating a bias for each satellite of E. The estimated biases are
-``b_E = S_EE^-1 nu_E``, the WSSE falls by ``nu_E^T b_E``, and the position moves by ``-Q B_E^T b_E``. Every satellite
-and every pair is thus tested without solving again.
+Leaving out the satellites E is equivalent to estimating a bias for each satellite of E. The estimated biases are ``b_E
+= S_EE^-1 nu_E``, the WSSE decreases by ``nu_E^T b_E``, and the position changes by ``-Q B_E^T b_E``. Every satellite
+and every pair can therefore be tested without a new solution.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ class RaimLimits(Settings):
     #: (chi-square, one degree of freedom). If another exclusion of as many satellites passes and fits worse by less
     #: than the separation, the epoch is inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: Distance of two positions below which their exclusions do not compete because the position hardly changes (for
-    #: example the two satellites of a separate clock). With 0, exclusions always compete.
+    #: If the positions after two exclusions are closer than this, the exclusions do not compete, because the choice
+    #: hardly changes the position (for example with the two satellites of a separate clock). With 0, exclusions always
+    #: compete.
     same_position_m: float = Field(default=0.0, ge=0)
     #: Two-sided probability of noise beyond K sigma in the protection level; 1 gives K = 0, which is P4's ``HSlope
     #: sigma0 sqrt(lambda)``.
@@ -102,8 +103,8 @@ def detect(
         Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
         Residuals, 0 or NaN for unused channels; used in fixed mode only. Residuals of a `LinearModel` include the map
-        error, residuals of a `Constrained` position do not. The two are equal only for an exact map, as in P1 (a sigma
-        of a millimetre).
+        error, residuals of a `Constrained` position do not. Both residuals are equal only for an exact map (a sigma of
+        a millimetre), as in P1.
     freedom : array_like of int, shape (T,)
         Number of ranges less unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space ``- 3`` instead.
     scale : array_like, shape (T,) or ()
@@ -126,7 +127,7 @@ def detect(
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
     """Return the threshold of the statistic for the given degrees of freedom, same shape; NaN below 1.
 
-    Example from P4: a false-alarm rate of 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
+    Example (P4): for a false-alarm rate of 0.001 and 3 degrees of freedom, T_CS = 16.27 and T_D = sqrt(T_CS) = 4.03.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -146,7 +147,7 @@ def _chi_square_table(false_alarm: float, size: int) -> Floats:
 
 
 _ROUNDING: Final = 1e-9  #: Relative difference within which two WSSE count as equal.
-#: Number of elements of a block's array of subsets, which about fits into the cache of a core.
+#: Number of elements of a block's array of subsets, which fits approximately into the cache of a core.
 _BLOCK_SIZE: Final = 40_000
 
 
@@ -173,11 +174,11 @@ class Exclusion:
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: True for excluded channels, only with the outcomes EXCLUDED_ONE and EXCLUDED_TWO; (T, M).
-    #: Channels of the passing subset with the smallest statistic, also if INSEPARABLE, shape (T, 2); -1 for none.
+    #: Channels of the passing subset with the smallest statistic, even if INSEPARABLE, shape (T, 2); -1 for none.
     best: Indices
     #: Channels of the closest competing exclusion, the next passing subset of as many channels, (T, 2); -1 for none.
     alternative: Indices
-    #: Error of the channels of `best` relative to the others, positive for a long range, shape (T, M); else NaN.
+    #: Error of the channels of `best` relative to the others, positive for a long range; NaN for others; shape (T, M).
     own_error_m: Floats
     #: Statistic without the channels of `best`, shape (T,); the original statistic where no subset passes.
     statistic_after: Floats
@@ -197,7 +198,7 @@ class _Trial:
     statistic: Floats  # (T, K) of the remaining channels
     wsse_drop: Floats  # (T, K)
     own: tuple[Floats, ...]  # (T, K) error of each member [sigma]
-    allowed: Masks  # (T, K) all members are used, checked by other channels, and have errors above the limit
+    allowed: Masks  # (T, K) all members are used, tested by other channels, and have errors above the limit
 
 
 def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Exclusion:
@@ -206,8 +207,8 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     A subset can be excluded if the remaining ranges pass with at least `min_redundancy` degrees of freedom, and if the
     error of each satellite of the subset exceeds the noise (chi-square mode) or the square root of the limit (fixed
     mode). Single satellites are preferred to pairs. Of several subsets, the subset with the smallest statistic is
-    excluded. The epoch is inseparable if another subset of the same size can be excluded, too, and fits worse only
-    within the noise (`separation_risk`). `scale`, shape (T,) or (), is the noise scale as for `detect`.
+    excluded. The epoch is inseparable if another subset of the same size could also be excluded, and its statistic is
+    larger only within the noise (`separation_risk`). `scale`, shape (T,) or (), is the noise scale as for `detect`.
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -361,7 +362,7 @@ def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
 
 
 def worst_channel(model: LinearModel) -> Indices:
-    """Return the channel whose removal lowers the WSSE most, shape (T,); 0 where all channels are unchecked."""
+    """Return the channel whose removal reduces the WSSE most, shape (T,); 0 where no channel is tested by others."""
     share = model.redundancy
     checked = model.used & (share > LEAST_REDUNDANCY)
     drop = np.where(checked, model.residual**2 / np.where(checked, share, 1.0), 0.0)

@@ -1,10 +1,10 @@
-"""Linear model for RAIM on the line and in space.
+"""Linear model of the ranges for RAIM, on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks are eliminated, and
-so is the map error across and up, which is an unknown with a prior. The result is the residual projector ``S = I - R K
-R^T - B Q B^T``, where R has 1/sigma in the column of the satellite's clock, K is the covariance of the clocks at a
-known position, B is the design with the clocks eliminated, and Q is the covariance of the position. The residuals are
-``nu = S y``, and ``WSSE = y^T S y`` is chi-square distributed with `LinearModel.freedom` degrees of freedom.
+P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks and the map error
+across and up, an unknown with a prior, are eliminated. The residual projector is ``S = I - R K R^T - B Q B^T``, where R
+has 1/sigma in the column of the satellite's clock, K is the covariance of the clocks at a known position, B is the
+design with the clocks eliminated, and Q is the covariance of the position. The residuals are ``nu = S y``, and ``WSSE =
+y^T S y`` is chi-square distributed with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class LinearModel:
 
     @property
     def step_m(self) -> Floats:
-        """Best-fitting position relative to the position of linearisation, shape (T, 3) [m]; near 0 at a solution."""
+        """Best-fitting position relative to the position of linearisation, shape (T, 3) [m]; about 0 at a solution."""
         return self._fitted[0]
 
     @property
@@ -107,7 +107,8 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused and for unchecked ranges.
+        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused ranges and for ranges that no other range
+        tests.
 
         A redundancy number is the fraction of a range error that appears in the residual of the same range.
         """
@@ -142,7 +143,7 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and projector of the used channels of each epoch, which come first; T epochs by n."""
+    """Residuals and projector of T epochs by n channels, with the used channels of each epoch first."""
 
     channel: Indices  #: Channel of the model at each index, shape (T, n).
     used: Masks  #: False beyond the used channels of an epoch, shape (T, n).
