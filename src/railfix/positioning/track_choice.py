@@ -309,8 +309,7 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Return the covariance of antenna positions, shape (3 A, 3 A), with common errors along the track and of the
-    map."""
+    """Return the covariance of antenna positions, (3 A, 3 A), with common along-track and map errors."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])

@@ -14,9 +14,9 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
-#: Klobuchar coefficients broadcast by GPS on 2004-01-01, at moderate solar activity, which RTKLIB also uses where none
-#: were received. Their vertical delay is 2.8 m RMS over time of day and latitude; on five other days from 2005 to 2024
-#: the delay differs from it by 0.7 to 1.7 m RMS.
+#: Klobuchar coefficients broadcast by GPS on 2004-01-01, at moderate solar activity, which RTKLIB also uses if no
+#: coefficients were received. The vertical delay of this model is 2.8 m RMS over time of day and latitude; the models
+#: of five other days from 2005 to 2024 differ from it by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
 #: Ratio of the radii of the Earth and of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
@@ -123,7 +123,7 @@ class Delays:
     #: Delays on the channel's carrier; 0 where a model is off, NaN where SBAS gives none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation in addition to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Standard deviation to be added to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
     reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 

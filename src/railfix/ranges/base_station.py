@@ -1,4 +1,4 @@
-"""Range errors measured by a base station at a known position, and their use as corrections of a train's ranges."""
+"""Range errors measured by a base station at a known position, which are used to correct a train's ranges."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from railfix.ranges.channels import Channels
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDelays, SourceSatellites
 
 Values = TypeVar("Values", Floats, Integers)
-#: An epoch of the station is also used for epochs of the train up to this time before it [s]: receiver clocks differ.
+#: An epoch of the station is also used for epochs of the train up to this time earlier, since receiver clocks differ
+#: [s].
 _SAME_S: Final = 0.05
-#: Largest age of the station's codes, and of its phases [s]. Without selective availability, code errors change by
-#: centimetres in 30 s, and phase errors by millimetres in a second.
+#: Largest ages of the station's codes and phases [s]. Without selective availability, code errors change by centimetres
+#: in 30 s, and phase errors by millimetres in a second.
 LONGEST_AGE_S: Final = 60.0
 _PHASE_AGE_S: Final = 1.1
 #: Sigma per kilometre between station and train, of differences in ionospheric, tropospheric and orbit errors [m].
@@ -32,7 +33,7 @@ LONGEST_KM: Final = 100.0  #: Largest distance at which the station is used [km]
 class BaseLimits(Settings):
     """Limits of the differences with a base station."""
 
-    #: Standard deviation of a difference in addition to the train's noise: the station's smoothed multipath.
+    #: Standard deviation of a difference in addition to the train's noise, due to the station's smoothed multipath.
     sigma_m: float = Field(default=0.3, gt=0)
     #: Random walk of phase differences, used in place of `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
@@ -49,7 +50,7 @@ class BaseErrors:
     signal: Strings
     #: Corrected code less range and receiver clock of its constellation; NaN where not observed; shape (B, S).
     code_m: Floats
-    phase_m: Floats  #: Corrected phase less range and one clock of all constellations, with ambiguity; shape (B, S).
+    phase_m: Floats  #: Corrected phase less range and a clock common to all channels, with ambiguity; shape (B, S).
     arc: Integers  #: Number of the arc of each phase, shape (B, S).
 
     def __len__(self) -> int:
@@ -75,7 +76,7 @@ class BaseErrors:
         return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
 
     def drop_before(self, time: np.datetime64) -> BaseErrors:
-        """Return the errors of epochs from `time` on, of channels with a code error at any of these epochs."""
+        """Return the errors from `time` on, for channels with a code error at any of these epochs."""
         rows = self.time >= time
         seen = np.isfinite(self.code_m[rows]).any(axis=0)
         return replace(
@@ -91,8 +92,8 @@ class BaseErrors:
     ) -> BaseDifferences:
         """Return the newest errors at the epochs of a train (T,), for its channels (K,), at approximate positions.
 
-        For a channel that the station does not observe, another signal of the same band is used: they differ by a
-        constant of the constellation. NaN (arc -1) without a recent error, or beyond `LONGEST_KM`.
+        For a channel that the station does not observe, another signal of the same band is used; the two signals differ
+        by a constant per constellation. The errors are NaN (arc -1) without a recent error, or beyond `LONGEST_KM`.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -129,7 +130,7 @@ def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str
 
 @dataclass(frozen=True, kw_only=True)
 class BaseStationSource:
-    """Correction source with the range errors that a base station at a known position measured with another source."""
+    """Correction source that adds the range errors measured by a base station to the corrections of another source."""
 
     other: CorrectionSource  #: Source of satellites and delays.
     errors: BaseErrors

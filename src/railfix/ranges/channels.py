@@ -1,4 +1,4 @@
-"""Usable channels of a log: constellations, and signals by preference; channels of a clock are adjacent."""
+"""Selection of the channels of a log, by constellation and by preference of signals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: A pseudorange lies between these [m]: nearest satellite less a receiver clock offset of 33 ms, GEO plus this offset.
+#: Limits of a plausible pseudorange [m]: nearest satellite less, and GEO plus, a receiver clock offset of 33 ms.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
@@ -46,8 +46,8 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 
 #: Signals with ten times the chip rate of L1 C/A, by constellation and band.
 _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
-#: Noise and multipath of these signals relative to L1 at the same C/N0: 0.4 on a phone (L5 to L1), 0.8 on an F9P (E5b
-#: to E1).
+#: Noise and multipath of these signals relative to L1 at the same C/N0; measured values are 0.4 on a phone (L5 to L1)
+#: and 0.8 on an F9P (E5b to E1).
 _FAST_NOISE: Final = 0.5
 
 
@@ -79,7 +79,7 @@ def channel_order(
 
 
 def first_available(satellite: Strings, available: Masks) -> Masks:
-    """Choose one channel per satellite and epoch: the first available one, in `channel_order`, shape (T, K)."""
+    """Return a mask (T, K) of the first available channel of each satellite at each epoch, in channel order."""
     starts = np.flatnonzero(np.append(True, satellite[1:] != satellite[:-1])) if len(satellite) else np.empty(0, int)
     if len(starts) == len(satellite):
         return available.copy()
@@ -104,18 +104,18 @@ class Channels:
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
     frequency_hz: Floats  #: Carrier frequency of the K channels, shape (K,).
     every_frequency_hz: Floats  #: Carrier frequency of all channels of the log, shape (M,).
-    left_out: Integers  #: Reason of the channels that settings leave out, 0 for the other channels; shape (M,).
+    left_out: Integers  #: Reason why settings leave out a channel, 0 for the other channels; shape (M,).
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
     #: Columns of the second signals of each channel's satellite, in order of preference, -1 for none; shape (K, P). P
     #: is 0 with one frequency.
     second: Indices
-    #: Second signal with the letter of the constellation, squared ratio of the first frequency to the second, and noise
+    #: Second signal with the letter of the constellation, squared ratio of the first to the second frequency, and noise
     #: of the second signal relative to L1 C/A; shape (K, P).
     second_signal: Strings
     second_ratio: Floats
     second_noise: Floats
     pair_names: tuple[str, ...]  #: Satellite and both signals of each pair, length K P.
-    pair_groups: Integers  #: Group of each pair, whose pairs have a common receiver delay; shape (K P,).
+    pair_groups: Integers  #: Group of each pair; the pairs of a group have a common receiver delay; shape (K P,).
 
     @cached_property
     def names(self) -> Strings:

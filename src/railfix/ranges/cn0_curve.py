@@ -1,9 +1,9 @@
 """Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
 
-It is fitted per constellation and signal; BeiDou and QZSS have satellites in two kinds of orbits, with separate curves.
-The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the median). Between bin
-centres the curve is interpolated by monotone cubics (PCHIP). Above the highest bin the last mean is used; below the
-lowest bin there is no curve. The file is TOML.
+A curve is fitted for each constellation and signal. BeiDou and QZSS have satellites in two kinds of orbits, with
+separate curves. The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the
+median). Between bin centres the curve is interpolated by monotone cubics (PCHIP). Above the highest bin the last mean
+is used; below the lowest bin there is no curve. The file is TOML.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class SourceFile(Settings):
 class Cn0CurveSource(Settings):
     """Log to which a curve was fitted."""
 
-    #: As in the header of the log.
+    #: Antenna, receiver and marker in the header of the log.
     antenna: str = ""
     receiver: str = ""
     marker: str = ""

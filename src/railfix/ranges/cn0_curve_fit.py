@@ -25,13 +25,13 @@ class CurveFit(Settings):
 
     bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
     least_samples: int = Field(default=30, ge=1)  #: A bin with fewer samples is left out.
-    least_bins: int = Field(default=4, ge=2)  #: A kind and signal with fewer bins gets no curve.
+    least_bins: int = Field(default=4, ge=2)  #: No curve is fitted for a kind and signal with fewer bins.
     #: Samples farther from their bin's median, in robust standard deviations, are left out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
 class Cn0Samples:
-    """C/N0 and elevation collected from parts of a log, by kind and signal, in single precision."""
+    """C/N0 and elevation collected from parts of a log, by kind of satellite and signal, in single precision."""
 
     def __init__(self) -> None:
         self._parts: dict[tuple[str, str], list[NDArray[np.float32]]] = defaultdict(list)
@@ -64,8 +64,8 @@ def fit_cn0_curve(
 ) -> Cn0Curve:
     """Fit the mean C/N0 over elevation, one curve per kind and signal with enough bins.
 
-    `samples` is a `Cn0Samples`, or parts with C/N0 (T, M), elevation (T, M), satellite and signal (M,), of an antenna
-    under open sky. Raises ValueError if no kind and signal has enough samples.
+    `samples`, of an antenna under open sky, is a `Cn0Samples`, or parts with C/N0 (T, M), elevation (T, M), satellite
+    and signal (M,). Raises ValueError if no kind and signal has enough samples.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):

@@ -1,4 +1,4 @@
-"""A C/N0 curve from an observation log of an antenna under open sky."""
+"""Fit of a C/N0 curve to an observation log of an antenna under open sky."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from railfix.io.logs import read_navigation, scan_observations
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
-_SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) requires about a day; a shorter log causes a note [s].
+_SHORT_S: Final = 12 * 3600.0  #: A shorter log causes a note; P1 2.3(1) requires about a day [s].
 _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
-#: Lowest elevation of that check [deg], and the fraction of rejected calibration samples that gives a note.
+#: Lowest elevation of the samples compared with this limit [deg]; a larger rejected fraction causes a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
 _BELOW_DEG: Final = -5.0
@@ -62,12 +62,12 @@ def cn0_curve_from_log(
     reader: Reader = "railfix",
     date: np.datetime64 | None = None,
 ) -> Cn0Calibration:
-    """Fit a curve to about a day of a receiver's log, whose antenna was under open sky.
+    """Fit a curve to a receiver log of about a day, recorded with an antenna under open sky.
 
     `position_ecef_m`, shape (3,), is the antenna position to a few kilometres, by default the position in the header.
-    Raises InputFileError if a file is missing or of another kind, or the log has no epochs or no C/N0; SettingsError if
-    neither the header nor the caller gives a position; MismatchError if tracked satellites are below the horizon of the
-    position, the navigation files have no orbit for the log, or there are too few samples for any curve.
+    Raises InputFileError if a file is missing or of another kind, or if the log has no epochs or no C/N0; SettingsError
+    if neither the header nor the caller gives a position; MismatchError if tracked satellites are below the horizon of
+    the position, the navigation files have no orbit for the log, or there are too few samples for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0

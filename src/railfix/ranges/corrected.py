@@ -29,7 +29,7 @@ class AntennaRanges(NotebookTable):
     """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
-    break_before: Masks  #: Epochs that must not be differenced with the previous one, shape (T,).
+    break_before: Masks  #: Epochs that must not be differenced with the previous epoch, shape (T,).
     #: Properties of each channel, shape (K,).
     satellite: Strings
     signal: Strings
@@ -46,7 +46,7 @@ class AntennaRanges(NotebookTable):
     #: Code corrected for satellite clock, group delay and atmosphere, and standard deviations; shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
-    reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
+    reason: Bits  #: `reasons.Reason` bits of the reasons found so far, 0 if usable; shape (T, K).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -61,9 +61,9 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     troposphere_m: Floats
     #: Standard deviation of satellite and atmospheric errors, from SBAS, otherwise from `NominalErrors`; shape (T, K).
     nominal_m: Floats
-    #: Standard deviation that `NominalErrors` assumes for the elevation alone; 0 with SBAS; shape (T, K).
+    #: Part of the standard deviation from `NominalErrors` that depends on elevation only; 0 with SBAS; shape (T, K).
     nominal_elevation_sigma_m: Floats
-    #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without one; shape (T, K).
+    #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
     #: Epochs with a gross error that cannot be identified, not used for noise and map estimates; shape (T,).
@@ -87,7 +87,7 @@ class SatelliteRanges(NamedTuple):
 
     source: SourceSatellites
     correction_m: Floats  #: Satellite clock less group delay, to be added to the codes; shape (T, K).
-    reason: Bits  #: `reasons.Reason` bits of codes, records and corrections; 0 = usable; shape (T, K).
+    reason: Bits  #: `reasons.Reason` bits of codes, records and corrections; 0 if usable; shape (T, K).
 
     @property
     def states(self) -> SatelliteStates:
@@ -100,7 +100,7 @@ def find_satellites(
 ) -> SatelliteRanges:
     """Return satellite positions and clocks at the times of transmission ``t - code / c - dt_sv`` (P1 2.2(2)).
 
-    The first plausible code of each satellite in the order of `channels` is used; every other code has a reason.
+    Of each satellite, the first plausible code in the order of `channels` is used; all other codes have a reason.
 
     Parameters
     ----------
@@ -111,7 +111,8 @@ def find_satellites(
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Largest distance of an epoch from the reference time of its record, if less than the validity of the record.
+        Largest difference between an epoch and the reference time of its record, if less than the validity of the
+        record.
     """
     code = observations.code_m[:, channels.columns]
     reason = _reasons_of_codes(channels.satellite, code)
@@ -128,7 +129,7 @@ def find_satellites(
     correction = states.clock_m - states.group_delay_m
     if found.fast_m is not None:
         correction = correction + found.fast_m
-    # a signal whose group delay is not broadcast has a satellite, but no correction
+    # without a broadcast group delay, the satellite is known but the code cannot be corrected
     reason = np.where((reason == 0) & ~np.isfinite(correction), int(Reason.NO_CORRECTION), reason)
     impossible = (reason == 0) & ~(is_orbit(states.position_ecef_m) & is_pseudorange(code + correction))
     return SatelliteRanges(found, correction, np.where(impossible, int(Reason.NO_EPHEMERIS), reason))
@@ -165,7 +166,7 @@ def corrected_ranges(
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used keep their values and have a reason; NaN where a correction is missing.
+        Codes that cannot be used have a reason; they are kept, or NaN where a correction is missing.
 
     Raises
     ------

@@ -36,7 +36,7 @@ __all__ = [
 
 
 class Conditions(Settings):
-    """Settings of a run on which the errors of its corrected pseudoranges depend."""
+    """Settings of a run that affect the errors of its corrected pseudoranges."""
 
     systems: tuple[str, ...]  #: Letters of the constellations.
     signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
@@ -153,13 +153,14 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each file.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Bounds of priors above this are from too few blocks for a finite protection level.
+LARGEST_PRIOR: Final = 0.05  #: A larger bound of a prior is from too few blocks for a finite protection level.
 
 
 class FaultRate(Settings):
     """Measured probability that a used range is faulty at a given time."""
 
-    #: A range is faulty beyond this multiple of its sigma in the protection level: 5, which noise exceeds with 6e-7.
+    #: A range is faulty if its error exceeds this multiple of its sigma in the protection level; noise exceeds the
+    #: default of 5 with a probability of 6e-7.
     beyond_sigma: float = Field(gt=0)
     #: Number of used ranges, and of faulty ranges.
     ranges: int = Field(ge=0)
@@ -177,8 +178,9 @@ class FaultRate(Settings):
     #: and of blocks in which two of these satellites were faulty.
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
-    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by these
-    #: blocks, for `side_prior` where it is small enough for a finite protection level. 1 without such blocks.
+    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, from these
+    #: blocks; 1 without such blocks. It is the value for `side_prior` if it is small enough for a finite protection
+    #: level.
     side_upper: float = Field(default=1.0, ge=0, le=1)
     #: Stretches with more frequent local faults than the line (`faulty_stretches`), chainages from and to.
     no_level_m: tuple[tuple[float, float], ...] = ()
@@ -198,8 +200,8 @@ class ErrorModel:
     #: difference is the effect of the screens.
     before: BinStatistics
     after: BinStatistics
-    #: "local": multipath and receiver noise alone (a reference station removed the other errors).
-    #: "satellite_and_atmosphere": satellite and atmospheric errors of the days recorded as well.
+    #: "local": only multipath and receiver noise, because a reference station removed the other errors.
+    #: "satellite_and_atmosphere": in addition, satellite and atmospheric errors of the recorded days.
     covers: Literal["local", "satellite_and_atmosphere"]
     #: Settings under which the model is valid; None if unknown, so that they are not compared with a run's settings.
     conditions: Conditions | None = None
@@ -212,7 +214,7 @@ class ErrorModel:
     ) -> tuple[Floats, Floats]:
         """Return the overbounding sigma and bias of observations, broadcast to one shape [m].
 
-        NaN where the direction is unknown or the model has no value.
+        Both are NaN where the direction is unknown or the model has no value.
         """
         index = self.bins.index(elevation_deg, relative_azimuth_deg, cn0_dbhz)
         inside, safe = index >= 0, np.maximum(index, 0)
@@ -228,7 +230,7 @@ _Count = Annotated[int, Field(ge=0)]
 
 
 class _Columns(Settings):
-    """`BinStatistics` as columns, one number per bin; NaN where a bin has none."""
+    """`BinStatistics` as columns, with one number per bin; NaN where a bin has no value."""
 
     count: tuple[_Count, ...]
     blocks: tuple[_Count, ...]

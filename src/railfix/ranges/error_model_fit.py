@@ -1,8 +1,8 @@
-"""Error model from samples: statistics of bins, pooled where samples are few; and the rate of local faults on a line.
+"""Fit of an error model to samples: statistics of bins, pooled where samples are few, and rate of local faults.
 
-A normal distribution shifted by +b bounds the upper half of the errors, one shifted by -b the lower half (CDF
-overbounding, B. DeCleene, ION GPS 2000). Sums of independent errors stay bounded as long as the distribution after the
-shift is symmetric and has one peak (the two-step method of J. Blanch, T. Walter, P. Enge, 2019,
+A normal distribution shifted by +b bounds the upper half of the errors, and a normal distribution shifted by -b bounds
+the lower half (CDF overbounding, B. DeCleene, ION GPS 2000). Sums of independent errors are then also bounded, if the
+distribution after the shift is symmetric and has one peak (the two-step method of J. Blanch, T. Walter, P. Enge, 2019,
 doi:10.1109/TAES.2018.2876583). Neither property can be proven from samples.
 """
 
@@ -20,14 +20,14 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
-TAIL_SCORE: Final = 1.0  #: Least standard score of a sample in the tail, which alone determines sigma.
+TAIL_SCORE: Final = 1.0  #: Least standard score of the samples in the tail, from which sigma is determined.
 
 
 def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
     """Return bias and sigma [m] of two normal distributions, shifted by +bias and -bias, that bound a sample (n,).
 
     The k-th of n samples from either end is the quantile of probability ``k / (n + 1)``. Sigma is the least value that
-    bounds both tails (beyond one standard score) about the median's distance from zero; the bias is then the least
+    bounds both tails (beyond one standard score) for a bias equal to the absolute median; the bias is then the least
     value that bounds the other samples. Beyond the largest sample the bound is an extrapolation by the normal
     distribution. Raises ValueError for fewer than three samples, or a sample that is not finite.
     """
@@ -36,7 +36,7 @@ def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
     ordered = np.sort(error_m)
     score = scipy.special.ndtri(np.arange(1, len(ordered) + 1) / (len(ordered) + 1.0))
     half = score >= 0.0
-    # Distances outward from zero: the upper half unchanged, the lower half mirrored.
+    # Distances outward from zero; the lower half is mirrored.
     score, sizes = score[half], (ordered[half], -ordered[::-1][half])
     center = abs(float(np.median(ordered)))
     tail = score >= min(TAIL_SCORE, float(score[-1]))
@@ -49,8 +49,8 @@ class ErrorModelFit(Settings):
     """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    #: Independent passes below which a bin uses the samples of a wider set of bins. With 30 passes the largest error is
-    #: about the quantile of 2 standard scores, so that the beginning of the tail is sampled.
+    #: Independent passes below which a bin uses the samples of a wider set of bins. With 30 passes, the largest error
+    #: is about the quantile of 2 standard scores, so that the samples include the beginning of the tail.
     least_blocks: int = option(
         "Passes of a satellite (30 s blocks) below which a bin has the values of a wider bin.", 30, metavar="N", ge=1
     )
@@ -77,9 +77,9 @@ class ErrorSamples:
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
     """Return the statistics of the bins from some of the samples, a mask of shape (n,).
 
-    A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of the first of these sets that has
-    enough: all azimuths of its elevation and C/N0, all azimuths and C/N0 of its elevation, all azimuths and elevations
-    of its C/N0, all samples.
+    A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of a wider set of bins, the first of the
+    following sets with enough blocks: all azimuths of its elevation and C/N0; all azimuths and C/N0 of its elevation;
+    all azimuths and elevations of its C/N0; all samples.
     """
     bins = fit.bins
     kept = which & np.isfinite(samples.error_m)
@@ -139,7 +139,7 @@ _SIDES: Final = {1: ("all round",), 2: ("ahead", "behind"), 4: ("ahead", "right"
 
 
 def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
-    """Yield rows by elevation, sector and C/N0: name, then count, bias, sigma, overbound before and after the screens.
+    """Yield rows by elevation, sector and C/N0: name; count, bias, sigma and overbound before and after the screens.
 
     Bias and sigma combine the statistics of the row's bins by their counts; the overbound is the range of their
     bounding sigmas.
@@ -170,7 +170,8 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-#: A range that passed the screens is faulty beyond this multiple of its sigma; confidence of the bounds of rates.
+#: A range that passed the screens is faulty if its error exceeds this multiple of its sigma. Confidence of upper bounds
+#: of rates.
 _BEYOND_SIGMA: Final = 5.0
 _CONFIDENCE: Final = 0.95
 #: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
@@ -182,7 +183,7 @@ _SATELLITES: Final = 1_000_000
 
 
 def fault_rate(samples: ErrorSamples) -> FaultRate:
-    """Measure the rate of local faults among the ranges that passed every screen, singly and by sides of the track."""
+    """Return the rate of local faults, of ranges and of sides of the track, among ranges that passed every screen."""
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     every, bad = np.unique(samples.block[used]), np.unique(samples.block[faulty])
@@ -213,7 +214,7 @@ def _upper(hits: int, trials: int) -> float:
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
-    """Count blocks of time in which some samples have at least two satellites on a side of the track, by side."""
+    """Count the blocks of time in which the samples `which` have two or more satellites on a side, for both sides."""
     right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
     one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
     _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
@@ -224,8 +225,8 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
     """Return stretches of the line, chainages from and to [m], with more frequent local faults than the whole line.
 
     A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of its fraction of faulty blocks exceeds
-    the upper limit of the whole line's; neighbouring stretches are joined. The prior of the line does not bound local
-    faults there, and the setting `Config.no_level_m` excludes protection levels there.
+    the upper limit of the fraction on the whole line; neighbouring stretches are joined. The prior of the line does not
+    bound local faults on these stretches, and the setting `Config.no_level_m` excludes protection levels on them.
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
@@ -248,7 +249,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Return the number of blocks of time with two or more faulty satellites over that of independent satellites."""
+    """Return the number of blocks of time with two or more faulty satellites, relative to independent satellites."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

@@ -23,8 +23,8 @@ class CodeNoise(Settings):
     """
 
     model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" omits the C/N0 factor.
-    #: Standard deviation at the zenith and the reference C/N0. Only ratios affect the position; the scale of a receiver
-    #: is estimated from the residuals (`pipeline.AntennaState`).
+    #: Standard deviation at the zenith and the reference C/N0. Only ratios of sigmas affect the position, because the
+    #: scale of a receiver is estimated from the residuals (`pipeline.AntennaState`).
     zenith_sigma_m: float = Field(default=1.0, gt=0)
     #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
@@ -44,8 +44,8 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 
-#: Accuracies of records (URA, SISA) up to this are covered by `satellite_sigma_m`: 2 to 4.85 m are usual. A worse
-#: accuracy is added to the sigma of the satellite's ranges.
+#: Accuracies stated in records (URA, SISA) up to this value are covered by `satellite_sigma_m`; 2 to 4.85 m are usual.
+#: A worse accuracy is added to the sigma of the satellite's ranges [m].
 _USUAL_ACCURACY_M: Final = 5.0
 
 
@@ -56,12 +56,13 @@ class NominalErrors(Settings):
     (A.4.4.10.4 and A.4.2.4).
     """
 
-    #: Orbit and clock error in the range. It is about half a metre for GPS and Galileo, whose service definitions state
-    #: 2 m as the 95 % bound.
+    #: Orbit and clock error in the range. This error is about half a metre for GPS and Galileo, whose service
+    #: definitions state 2 m as the 95 % bound.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Vertical delay error of the Klobuchar model. It is mostly common to all satellites, but treated as independent.
+    #: Vertical delay error of the Klobuchar model. The error is mostly common to all satellites, but treated as
+    #: independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
-    #: Additional vertical delay error with typical coefficients, also added to the sigma of the ranges.
+    #: Additional vertical delay error with typical coefficients, which is also added to the sigma of the ranges.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
     #: Vertical delay error of the standard atmosphere (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
@@ -74,5 +75,5 @@ class NominalErrors(Settings):
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
     def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
-        """Return broadcast accuracies that are worse than usual, any shape; 0 for usual and for unknown accuracies."""
+        """Return broadcast accuracies that are worse than usual [m], any shape; 0 for usual and unknown accuracies."""
         return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)

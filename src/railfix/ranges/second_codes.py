@@ -30,7 +30,7 @@ class SecondCodes:
     #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
     #: shape (T, K).
     delay_sigma_m: Floats
-    ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
+    ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
     pair: Integers  #: Index of satellite and signals in `Channels.pair_names`, shape (T, K).
     column: Integers  #: Column of the observations, -1 where missing; shape (T, K).
 
@@ -44,11 +44,11 @@ def second_codes(
     delays: Delays,
     noise: CodeNoise,
 ) -> SecondCodes | None:
-    """Return the second code of each satellite, corrected like the first code; None where no channel has a second code.
+    """Return the second code of each satellite, corrected like the first code; None if no channel has a second code.
 
-    It is the first signal in order of preference that is observed, healthy and has a group delay. Satellite position
-    and clock are the same as for the first code, and the group delay is from the same record; where the record lacks a
-    part of the group delay, another message of the satellite is used.
+    The second code is the first signal, in order of preference, that is observed, healthy and has a group delay.
+    Satellite position and clock are the same as for the first code, and the group delay is from the same record; where
+    the record lacks a part of the group delay, another message of the satellite is used.
     """
     second = channels.second
     if not second.size:

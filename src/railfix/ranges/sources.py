@@ -1,9 +1,9 @@
-"""Protocol of correction sources, and the source of broadcast records or precise orbits.
+"""Interface of correction sources, and the source that uses broadcast records or precise orbits.
 
 `base_station` and `sbas.sbas_sources` contain the sources with a base station and with SBAS.
 
-A source returns the satellites at the times of transmission, then the delays of their signals at an approximate
-position of the antenna.
+`satellites` of a source returns the satellites at the times of transmission; `delays` returns the delays of their
+signals at an approximate position of the antenna.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class SourceSatellites(NamedTuple):
     states: SatelliteStates  #: States at the times of transmission, with the source's corrections.
     fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
     reason: Bits  #: Rejection reasons of satellites that the source does not correct, shape (T, K).
-    fixes: object = None  #: Corrections of the satellites, input of `delays` of the same source.
+    fixes: object = None  #: Corrections of the satellites, which `delays` of the same source uses.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,8 @@ class SourceDelays(NamedTuple):
 
     delays: Delays  #: Delays that are subtracted from the codes.
     sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
-    #: Standard deviation of satellite and atmospheric errors, and its part assumed by elevation alone; shape (T, K).
+    #: Standard deviation of satellite and atmospheric errors, and its part that depends on elevation only; shape (T,
+    #: K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
@@ -63,7 +64,7 @@ class CorrectionSource(Protocol):
 
     @property
     def second(self) -> Literal["none", "optional", "required"]:
-        """Whether second-frequency codes are not used, can be corrected in the same way, or are required."""
+        """Whether second-frequency codes are not used, are used where available, or are required."""
 
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
@@ -79,8 +80,8 @@ def choose_ionosphere(
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
     """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
 
-    GPS coefficients are preferred to QZSS coefficients and these to `TYPICAL_KLOBUCHAR`; None if the ionosphere is
-    "off". BeiDou's coefficients are for a different model.
+    The order of preference is GPS coefficients, QZSS coefficients, `TYPICAL_KLOBUCHAR`; the coefficients are None if
+    `ionosphere` is "off". BeiDou's coefficients are not used, because they are for a different model.
     """
     if ionosphere == "off":
         return None, 0.0, ()
@@ -99,15 +100,15 @@ def choose_ionosphere(
 
 @dataclass(frozen=True, kw_only=True)
 class BroadcastSource:
-    """Source of broadcast records, or of precise orbits and clocks if the navigation data has them; delay models."""
+    """Source with broadcast records, or precise orbits and clocks if the navigation data has them, and delay models."""
 
     navigation: Navigation
     klobuchar: Floats | None  #: None leaves the ionosphere uncorrected; shape (8,).
-    #: Standard deviation of the vertical delay with coefficients that were not received.
+    #: Additional standard deviation of the vertical delay if the coefficients were not received.
     ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
     nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed satellite and atmospheric errors.
-    notes: tuple[str, ...] = ()  #: Requested data, and the data used instead.
+    notes: tuple[str, ...] = ()  #: Notes on data that replace requested data.
     second: Literal["none", "optional", "required"] = "optional"
 
     @classmethod
@@ -119,7 +120,7 @@ class BroadcastSource:
         troposphere: Literal["saastamoinen", "off"] = "saastamoinen",
         nominal: NominalErrors | None = None,
     ) -> BroadcastSource:
-        """Return the source with the ionospheric coefficients that are known (`choose_ionosphere`)."""
+        """Return the source with the best available ionospheric coefficients (`choose_ionosphere`)."""
         nominal = nominal or NominalErrors()
         coefficients, sigma, notes = choose_ionosphere(navigation, ionosphere, nominal)
         return cls(

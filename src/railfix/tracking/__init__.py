@@ -1,4 +1,4 @@
-"""Filter along the track over codes, Dopplers, carrier phases and sensors, with hypotheses over branches.
+"""Filter along the track from codes, Dopplers, carrier phases and sensors, with hypotheses on the branch.
 
 `track` takes epochs and the state after the previous epochs, and returns positions along the trajectory and the new
 state. All quantities are numpy arrays.

@@ -1,4 +1,4 @@
-"""Risk budget of the filter's protection level, and the fault sources that have a sub-filter.
+"""Risk budget of the filter's protection level, and kinds of the measurement sources that have a sub-filter.
 
 `railfix.kernels.tracking.subfilters` computes the sub-filters, `railfix.kernels.tracking.level` the level.
 """
@@ -22,7 +22,7 @@ from railfix.tracking.limits import TrackingLimits
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Time between a constellation fault and the alert to users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: A kind gets no sub-filters if faults of `MOST_SOURCES` such sources are less probable than this fraction of the risk.
+#: A kind has no sub-filters if faults of `MOST_SOURCES` such sources are less probable than this fraction of the risk.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
 #: Risk of the speed bound as a fraction of the risk of the position level.
@@ -42,7 +42,7 @@ class SourceKind(IntEnum):
     ALL_IN_VIEW = 7
 
 
-#: Kind of each further source: all Dopplers, all phases, all codes of the satellites ahead or behind, and the map. The
+#: Kinds of the other sources: all Dopplers, all phases, all codes of the satellites ahead or behind, and the map. The
 #: last sub-filter excludes no source.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
@@ -82,8 +82,8 @@ class Budget:
 def budget(limits: TrackingLimits) -> Budget:
     """Compute the risk budget of the level from the settings.
 
-    A fault is assumed to last for one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. It affects
-    the filter for `FORGOTTEN` further correlation times of codes, as long as its errors remain in the state.
+    A fault is assumed to last for one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. A fault
+    affects the filter for `FORGOTTEN` further correlation times of codes, while its errors remain in the state.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

@@ -1,4 +1,4 @@
-"""Preparation of epochs for the recursion: quantities that do not depend on positions, for a whole chunk at once."""
+"""Preparation of epochs for the recursion: quantities that do not depend on positions, for all epochs of a chunk."""
 
 from __future__ import annotations
 
@@ -62,8 +62,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     if np.isnat(state.time):
         gap[:1] = 0.0
     apart = gap > _APART_S
-    # The interval is at least a millisecond, also for equal times, because Dopplers and forces are weighted by the
-    # interval.
+    # The interval is at least a millisecond, even for equal times, because Dopplers and forces are weighted by it.
     interval = np.maximum(gap, _SHORTEST_S)
     interval[apart] = 1.0
     if np.isnat(state.time):
@@ -124,7 +123,7 @@ def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Flo
 
 
 def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
-    """Write velocities computed without the line; numba is imported here, so that runs without a filter omit it."""
+    """Write velocities computed without the line; numba is imported here, so that only runs with a filter load it."""
     from railfix.kernels.tracking.velocity import write_velocities
 
     latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))

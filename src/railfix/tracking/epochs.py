@@ -47,8 +47,8 @@ class GnssEpochs:
     #: drift and the tropospheric rate, which are some millimetres per second.
     rate_mps: Floats
     cn0_dbhz: Floats  #: Shape (T, K).
-    #: True where the train is known to be away from the line, shape (T,). The filter is reset there, and no measurement
-    #: is used.
+    #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
+    #: measurement is used.
     off_map: Masks
     #: Position computed without the line, accurate to some hundred metres, shape (T, 3). It is used for the velocity
     #: across the line, unless it is NaN or None.
@@ -93,7 +93,7 @@ class BaliseEpochs:
     """Balises read since the previous epoch, in two alternating columns; NaN where absent."""
 
     time: Datetimes  #: Time at which each balise was passed, shape (T, 2); any value where absent.
-    #: Arc length of the train along the trajectory at that time, and its standard deviation, shape (T, 2).
+    #: Arc length of the train along the trajectory at this time, and its standard deviation, shape (T, 2).
     place_m: Floats
     sigma_m: Floats
 
@@ -127,7 +127,7 @@ class SensorEpochs:
     wheel_sigma_m: Floats | None = None
     #: Whether the wheel distance is signed. If "unknown", the filter gives it the sign of the speed.
     wheel_sign: Literal["measured", "unknown"] = "measured"
-    #: Radar distance since the previous epoch. A distance is used because oscillations of the body cancel (P2 3.2).
+    #: Radar distance since the previous epoch. Oscillations of the body cancel in a distance (P2 3.2).
     radar_m: Floats | None = None
     radar_sigma_m: Floats | None = None
     #: Mean specific force toward increasing chainage since the previous epoch, including gravity on the gradient.

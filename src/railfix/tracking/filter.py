@@ -1,4 +1,4 @@
-"""Filter along the track: estimates positions along the trajectory from epochs and the previous state.
+"""Filter along the track, which estimates positions along the trajectory from epochs and the previous state.
 
 `railfix.kernels.tracking.layout` defines the arrays, `railfix.kernels.tracking.recursion` the recursion over epochs.
 """
@@ -83,7 +83,7 @@ class Recursion:
     def run(self, state: TrackState, first: int, found: Sought | None, trace: list[Step] | None) -> tuple[int, int]:
         """Process epochs from `first` on, and update the state.
 
-        Return the next epoch, and the reasons for a position search before this epoch (0 for none). Only the epoch
+        Returns the next epoch, and the reasons for a position search before the next epoch (0 for none). Only the epoch
         `first` is processed if its positions have been `found`, or if a `trace` is required.
         """
         count, width = state.mean.shape
@@ -108,7 +108,7 @@ class Recursion:
         return done, reasons
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
-        """Return a smoother record of an epoch, without hypotheses."""
+        """Return the record of an epoch for the smoother, without hypotheses."""
         return Step(dt=float(self.chunk.epoch["interval_s"][epoch]), satellite=state.satellite)
 
 
@@ -146,8 +146,8 @@ def track(
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
     levels : bool
-        Whether a bank of sub-filters computes a protection level at every epoch; `railfix.tracking.levels` uses a lower
-        rate.
+        Whether a bank of sub-filters computes a protection level at every epoch (`railfix.tracking.levels` does so at a
+        lower rate).
     trace : list of Step, optional
         List to which the record of each epoch is appended for the smoother (`railfix.tracking.smoother`).
 

@@ -1,8 +1,8 @@
 """Protection level of the filtered position at every epoch, from a second filter with sub-filters at a lower rate.
 
-The bank of `railfix.tracking.bank` costs as many filters as there are satellites, and codes of neighbouring epochs have
-nearly the same errors. The second filter therefore processes one epoch per `level_period_s`, a second by default. The
-equations that propagate its level to the epochs in between are in docs/filter-equations.md.
+The bank (`railfix.tracking.bank`) has at least one sub-filter per satellite, and codes of neighbouring epochs have
+nearly the same errors. The second filter therefore processes only one epoch per `level_period_s`, by default 1 s. The
+equations that propagate its level to the other epochs are in docs/filter-equations.md.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from railfix.tracking.state import TrackState
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])
 #: Separation in standard deviations up to which a sub-filter is consistent with noise, for positions without and with a
-#: level. The sub-filter that excludes a faulty satellite has a larger separation.
+#: level. A sub-filter that excludes a faulty satellite has a larger separation.
 _EXPLAINED: Final = (3.0, 4.0)
-#: Level above which a level counts as infinite [m], because it results from a sub-filter without measurements.
+#: Larger levels count as infinite [m], because they result from a sub-filter without measurements.
 LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
@@ -56,11 +56,11 @@ class AccumulatedIncrement:
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return indices and measurements of one epoch per period, and the remainder after the last selected epoch.
+    """Return indices and measurements of one epoch per period, and what is accumulated after the last selected epoch.
 
-    A carrier phase continues if it does so at all epochs in between. Distances between selected epochs are summed,
-    forces averaged, and balises assigned to the next selected epoch. Positions from features and ranges to ground units
-    are used at selected epochs only. `since` is the remainder of the previous chunk.
+    A carrier phase continues if it continues at all epochs between two selected epochs. Distances between selected
+    epochs are summed, forces averaged, and balises assigned to the next selected epoch. Positions from features and
+    ranges to ground units are used at selected epochs only. `since` is what the previous chunk has left over.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
@@ -186,7 +186,7 @@ def carried_levels(
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
     tau = seconds(tracked.time - times[number])  # NaN before the first
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
-    # Growth of the position error since then: V tau + a tau^2 / 2.
+    # Growth of the position error since that epoch: V tau + a tau^2 / 2.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
     known = np.isfinite(tracked.arc_m)
 
@@ -201,8 +201,7 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # In doubt, the most distant sub-filter may be the correct one; otherwise, only a sub-filter inconsistent with noise
-    # may be.
+    # If doubtful, the most distant sub-filter may be correct; otherwise, only a sub-filter inconsistent with noise.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
@@ -223,7 +222,7 @@ def _useful(level_m: Floats) -> Floats:
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Return the statuses of positions; without a finite level, a position is neither tracking nor coasting."""
+    """Return the statuses of positions, none of which is tracking or coasting without a finite level."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)

@@ -48,16 +48,16 @@ class TrackingLimits(Settings):
     degrees_of_freedom: float = Field(default=4.0, gt=2)
     #: Degrees of freedom for codes longer than expected. Reflections arrive late, and with one degree of freedom
     #: (Cauchy) their mean delay is unbounded. The value was chosen from 0.4, 1 and 4 (symmetric) on logs from Hong Kong
-    #: and California; logs from Berlin, and from Hong Kong two years earlier, were not used for the choice and improve
-    #: alike (docs/filter.md).
+    #: and California; logs from Berlin, and from Hong Kong two years earlier, were not used for the choice, and improve
+    #: equally (docs/filter.md).
     late_degrees_of_freedom: float = Field(default=1.0, gt=0)
-    #: White part of the code error as a fraction of the code's standard deviation, per second, not per epoch.
+    #: White part of the code error in one second, as a fraction of the code's standard deviation.
     code_white_share: float = Field(default=1.0, gt=0)
     #: Interval at which codes are used while phases or Dopplers propagate the position. Code errors last for a minute,
     #: so that codes at intermediate epochs add no information. With 0, the codes of every epoch are used.
     code_period_s: float = Field(default=1.0, ge=0)
-    #: Standard deviation of the displacement by orbit and ionospheric errors, which last for hours. They are about 1 m
-    #: per satellite, with a dilution of one; averaging over epochs does not reduce them.
+    #: Standard deviation of the displacement by orbit and ionospheric errors, which last for hours. The errors are
+    #: about 1 m per satellite, with a dilution of one; averaging over epochs does not reduce them.
     slow_code_m: float = Field(default=1.0, ge=1e-6)
     #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler; C/N0 at most 50 dB-Hz, 45 if not given.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
@@ -69,35 +69,35 @@ class TrackingLimits(Settings):
     map_misfit_sigmas: float = Field(default=3.0, gt=0)
     most_hypotheses: int = Field(default=24, ge=1)  #: Largest number of hypotheses; the most probable are kept.
     start_separation_m: float = Field(default=60.0, gt=0)  #: Distance within which positions of a search are merged.
-    #: Whether a bank of sub-filters computes a protection level. It costs as many filters as there are satellites.
+    #: Whether a bank of sub-filters, about one per satellite, computes a protection level.
     level: Literal["on", "off"] = "on"
     #: Interval of the epochs processed by the bank. Codes of neighbouring epochs have the same errors.
     level_period_s: float = Field(default=1.0, gt=0)
-    #: Largest acceleration between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes). It also
-    #: limits the next speed after an epoch whose speed was not accepted.
+    #: Largest acceleration between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes). The
+    #: value also limits the next speed after an epoch whose speed was not accepted.
     level_acceleration_mps2: float = Field(default=3.0, ge=0)
-    #: Probability per hour that the error exceeds the level without warning. 1e-7 is for the satellite part (P1 2.4).
+    #: Probability per hour that the error exceeds the level without warning. P1 2.4 has 1e-7 for satellites.
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Number of independent errors per hour. Code errors last about a minute.
     level_samples_per_hour: float = Field(default=60.0, gt=0)
-    #: Probability that a satellite is faulty in an independent error, by city multipath that exceeds its weight. Its
-    #: square is used for two satellites. This is an assumption.
+    #: Probability that a satellite is faulty in one independent sample, by city multipath beyond its assumed error; for
+    #: two satellites, its square is used. The value is an assumption.
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
-    #: Probability of a fault common to a constellation. 1e-4 is the value of the ARAIM milestone 3 report for Galileo.
+    #: Probability of a fault common to a constellation. The ARAIM milestone 3 report has 1e-4 for Galileo.
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
-    #: Probability that an on-board sensor is faulty in an independent error. This is an assumption.
+    #: Probability that an on-board sensor is faulty in one independent sample. The value is an assumption.
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
-    #: Probability that a balise is not at its listed position. This is an assumption. It must be small, because two
-    #: simultaneously wrong balises are not bounded.
+    #: Probability that a balise is not at its listed position. The value is an assumption. It must be small, because
+    #: the level does not cover two simultaneously wrong balises.
     level_balise_prior: float = Field(default=1e-6, ge=0, le=3e-6)
-    #: Probability that all Dopplers, or all phases, are wrong together. This is an assumption.
+    #: Probability that all Dopplers, or all phases, are wrong together. The value is an assumption.
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
     #: Probability that the codes of all satellites ahead, or of all satellites behind, are late together, as for the
-    #: low satellites of one side in single epochs. This is an assumption.
+    #: low satellites of one side in single epochs. The value is an assumption.
     level_side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Probability that the map is wrong by more than its sigma, and the sigma of a wrong map. These are assumptions.
+    #: Probability that the map is wrong by more than its sigma, and sigma of a wrong map. Both values are assumed.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
     #: Probability that a storm or the equatorial anomaly tilts the ionosphere over the sky by more than `slow_code_m`
-    #: (size of the tilt in `tracking.line.TILT_M`). This is an assumption.
+    #: (size of the tilt in `tracking.line.TILT_M`). The value is an assumption.
     level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)

@@ -1,4 +1,4 @@
-"""Trajectory as used by the filter: points, smooth tangents and axes at arc lengths, also beyond its ends."""
+"""Trajectory as used by the filter: points, smooth tangents and axes at arc lengths, even beyond its ends."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Line:
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
-        """Return the arc lengths shifted by whole laps of a closed line to be nearest to `to_m` [m]."""
+        """Return arc lengths, shifted by whole laps of a closed line so that they are nearest to `to_m` [m]."""
         if not self.closed:
             return arc_m
         back = self.round_m(to_m)

@@ -18,7 +18,7 @@ from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
 
-#: Minimum of the parameter `map_branch_m` in standard deviations of the map across.
+#: Minimum of the parameter `map_branch_m`, in standard deviations of the map across the line.
 _BRANCH_SIGMAS = 3.0
 
 

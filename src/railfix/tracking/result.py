@@ -31,7 +31,7 @@ class Tracked(NotebookTable):
     time: Datetimes  #: Shape (T,).
     status: Codes  #: `TrackStatus`, shape (T,).
     #: Arc length and standard deviation of the most probable hypothesis, shape (T,). The standard deviation includes
-    #: the straight distance to the other hypotheses, and in doubt the separation of a sub-filter.
+    #: the straight distance to the other hypotheses, and separations that noise does not explain.
     arc_m: Floats
     sigma_m: Floats
     #: Speed along the line, its standard deviation, and acceleration, shape (T,).
@@ -47,7 +47,7 @@ class Tracked(NotebookTable):
     wheel_scale: Floats
     force_offset_mps2: Floats
     radar_scale: Floats
-    map_scale: Floats  #: Factor on the map's length error, shape (T,); 1 if codes do not contradict the map length.
+    map_scale: Floats  #: Factor on the error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
     #: Protection levels of the error along the line, of the straight distance (including all branches and a laterally
     #: displaced map), and of the fault-free noise of a single branch, shape (T,); NaN where levels are off.
     level_m: Floats
@@ -57,7 +57,7 @@ class Tracked(NotebookTable):
     level_speed_mps: Floats
     #: Largest separation of a sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
-    #: Probability of faults not bounded by the level, those common to the only constellation, shape (T,).
+    #: Probability of faults that the level does not bound (common to the only constellation), shape (T,).
     unchecked_prior: Floats
     #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the level, but at least the scale bound times the
     #: distance since codes were used.
@@ -79,7 +79,7 @@ class Tracked(NotebookTable):
 
     @classmethod
     def from_records(cls, time: Datetimes, results: Results) -> Tracked:
-        """Return the records of the recursion as columns."""
+        """Return the results from the records of the recursion."""
         columns = {name: np.ascontiguousarray(results.epoch[name]) for name in EPOCH_RESULT.names or ()}
         columns |= {
             name: np.ascontiguousarray(np.moveaxis(results.channel[name], -1, 1)) for name in ("innovation", "weight")

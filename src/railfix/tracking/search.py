@@ -18,13 +18,13 @@ from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
 #: Largest spacing of the points at which the line is searched [m]. A Gaussian of `START_SIGMA_M` covers the positions
-#: in between, and the code variance includes the error of a position between two points.
+#: between two points, and the code variance includes the error of such a position.
 _SPACING_M: Final = 15.0
 #: Minimum redundancy of codes for a search. With a single redundant code, a wrong position can fit as well.
 REDUNDANT: Final = 2
-#: Difference from the largest log likelihood above which a position gets no hypothesis.
+#: A position becomes no hypothesis if its log likelihood is farther below the largest log likelihood.
 _WORSE: Final = 25.0
-#: Prior standard deviations of speed and clock drift [m/s]; no train is faster than twice the first.
+#: Prior standard deviations of speed and clock drift [m/s]; no train is faster than twice the former.
 _ANY_SPEED_MPS: Final = 50.0
 _ANY_DRIFT_MPS: Final = 1e3
 _FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement over the interval before the first epoch [m].
@@ -45,8 +45,8 @@ _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floats:
     """Return the arc lengths that are consistent with the codes of an epoch, the most likely first, shape (C,) [m].
 
-    They are maxima of the likelihood with Student's t errors, more than `start_separation_m` apart. The result is empty
-    with fewer than `REDUNDANT` redundant codes.
+    The positions are maxima of the likelihood with Student's t errors, more than `start_separation_m` apart. The result
+    is empty with fewer than `REDUNDANT` redundant codes.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, ix.CODE] != 0
@@ -106,7 +106,7 @@ def begin(
     variance[:, ix.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, ix.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, ix.MAP_UP] = line.sigma_height_m**2
-    # no prediction precedes the first epoch, so that the map displacement over the interval is almost unknown
+    # without a prediction before the first epoch, the map displacement over the interval is almost unknown
     variance[:, [ix.STEP_RIGHT, ix.STEP_UP, ix.MAP_LENGTH_ERROR]] = _FIRST_STEP_M**2
     variance[:, ix.SLOW_CODE] = limits.slow_code_m**2
     variance[:, ix.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
@@ -125,7 +125,7 @@ def begin(
     return mean, covariance
 
 
-#: Probability of other positions where the velocity contradicts a single certain position, since the map may be wrong.
+#: Probability of other positions where the velocity contradicts the only position, since the map may be wrong.
 _ELSEWHERE: Final = 0.01
 
 
@@ -168,7 +168,7 @@ def _join(state: TrackState, parts: list[_Part]) -> None:
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits, reasons: int) -> Sought:
-    """Search positions before the update of an epoch, and add hypotheses to the state, which is predicted to the epoch.
+    """Search positions before the update of an epoch, and add hypotheses to the state that is predicted to the epoch.
 
     `reasons` are bits of `kernels.tracking.index` (`LOST_TRACK`, `GAP`, `CONTRADICTED`); ignored without a hypothesis.
     """
@@ -213,7 +213,7 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
     _start_branches(state)
     hold = state.monitors.level_hold_s
     if lost and state.monitors.weak_code_s >= constants.LOST_CODE_S:
-        # Codes have contradicted the position propagated by motion, so the next position comes from codes alone.
+        # Codes have contradicted the position propagated by motion, so the next position is determined by codes alone.
         hold = max(hold, constants.STEP_HOLD_S)
     if weak:
         hold = max(hold, constants.LEVEL_START_S)
@@ -226,7 +226,7 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
 def _split_wide(
     state: TrackState, arc_m: Floats, wide: Masks, line: Line
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
-    """Return narrow hypotheses at positions within wide hypotheses, and the split of each hypothesis (None for old).
+    """Return narrow hypotheses at positions within wide hypotheses, and splits by hypothesis (None for old hypotheses).
 
     A narrow hypothesis is the wide hypothesis conditioned on a position with `START_SIGMA_M`. Its probability is
     proportional to the wide density at this position.
@@ -256,11 +256,11 @@ def _split_wide(
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
-    """Return hypotheses at positions away from a lost track; `weak` if its weights have been low for a long time."""
+    """Return hypotheses at positions away from a lost track; `weak` if weights have been low for a long time."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
-    # A hypothesis less probable than a new hypothesis has drifted from the position at which codes would start it.
+    # A hypothesis less probable than a new hypothesis has drifted away from the position that agrees with the codes.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)
@@ -275,9 +275,9 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
     """Add hypotheses slightly ahead of and behind separate hypotheses, and return the number of added hypotheses.
 
-    Where a line turns back within some tens of metres, Dopplers fit travel forward on one leg and backward on the other
-    equally well, and equations linearised before the bend are not valid beyond it. Each lap gets its own neighbouring
-    positions, as otherwise the neighbours of the most probable lap would reduce the probability of other laps.
+    Where a line turns back within some tens of metres, the Dopplers agree equally with travel forward on one leg and
+    backward on the other leg, and equations linearised before the bend are not valid beyond it. Every lap gets
+    neighbours, because neighbours of the most probable lap alone would reduce the probability of other laps.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

@@ -2,7 +2,7 @@
 
 The smoother has the adjoint form of G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
 doi:10.1080/00207177308932424. It uses the measurement weights of the filter, and at each epoch the hypothesis that led
-to the last hypothesis. Where a hypothesis begins, no later information reaches the epochs before.
+to the last hypothesis. Information of later epochs is not propagated backward beyond the beginning of a hypothesis.
 """
 
 from __future__ import annotations

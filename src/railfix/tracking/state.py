@@ -23,17 +23,17 @@ class Monitors:
     #: Times for which the mean weights of motion measurements and of codes have been low [s].
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
-    #: Logarithms of the factors by which Doppler and phase variances exceed the variances of the limits.
+    #: Logarithms of the ratios of Doppler and phase variances to the variances of `TrackingLimits`.
     log_doppler_scale: float = 0.0
     log_phase_scale: float = 0.0
-    #: Mean over the last epochs of the position shift implied by codes, in standard deviations, and its variance.
+    #: Mean position shift implied by the codes of the last epochs, in standard deviations, and its variance.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0
     #: Logarithm of the factor by which the variance of map lengths exceeds the assumed variance, at least 0.
     map_log_variance: float = 0.0
     #: Cumulative sum of velocity contradictions, along and across (`railfix.kernels.tracking.monitors`).
     contradiction: float = 0.0
-    #: One less the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
+    #: 1 - recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
     step_s: float = 0.0  #: Time for which all codes have implied a different position [s].
     #: Remaining times for which all levels are withheld, and for which the level along the line is withheld because
@@ -64,7 +64,7 @@ class Bank:
     without: tuple[str, ...]
     mean: Floats  #: Means of the unknowns, shape (B, N).
     covariance: Floats  #: Covariances of the unknowns, shape (B, N, N).
-    contradicted_s: Floats  #: Time for which a sub-filter has been contradicted by its own measurements, shape (B,).
+    contradicted_s: Floats  #: Time for which a sub-filter has been inconsistent with its own measurements, shape (B,).
 
 
 #: Record type of the state's scalars: the fields of `Monitors`, and the number of hypotheses.
@@ -107,7 +107,7 @@ class TrackState:
         return len(self.hypothesis)
 
     def reset(self) -> None:
-        """Reset hypotheses, sub-filters, clocks and adapted parameters; the level remains withheld."""
+        """Reset hypotheses, sub-filters, clocks and adapted parameters; hold times of levels are kept."""
         width = ix.SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.hypothesis = self.hypothesis[:0]
