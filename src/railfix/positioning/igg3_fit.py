@@ -62,8 +62,8 @@ def robust_fit(
 
     `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which they are linearised.
 
-    `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`). With it, the
-    number of position unknowns is one; without it, three.
+    `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`). The position
+    has one unknown with `information`, and three without.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0

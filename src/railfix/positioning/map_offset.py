@@ -31,7 +31,8 @@ _SUMS: Final = 9  #: Number of sums per window.
 class MapOffsetLimits(Settings):
     """Limits of the test of the map."""
 
-    #: Time constant of exponential forgetting. It has six independent samples, and detects local map errors.
+    #: Time constant of exponential forgetting. The default has six independent samples, and is short enough to detect
+    #: local map errors.
     window_s: float = Field(default=120.0, gt=0)
     correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
     least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision.

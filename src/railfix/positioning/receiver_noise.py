@@ -1,9 +1,9 @@
 """Receiver noise scale and single-epoch sigma.
 
 Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting. The robust scale is
-estimated from the ranges of each epoch that agree with each other. It is used in the RAIM test, and does not depend on
-the results of RAIM. The stated scale is estimated from the ranges that RAIM accepted, and is used in every sigma and
-protection level. Epochs that RAIM did not resolve, and epochs off the map, contribute to neither scale.
+estimated from the ranges of each epoch that agree with each other. This scale is used in the RAIM test, and does not
+depend on the results of RAIM. The stated scale is estimated from the ranges that RAIM accepted, and is used in every
+sigma and protection level. Epochs that RAIM did not resolve, and epochs off the map, contribute to neither scale.
 """
 
 from __future__ import annotations

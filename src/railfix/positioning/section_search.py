@@ -95,8 +95,8 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
     point : SinglePoint
-        3-D positions from the same ranges (`point_position`), NaN where missing. They shorten the search, and do not
-        change its result.
+        3-D positions from the same ranges (`point_position`), NaN where missing. These positions shorten the search,
+        but do not change the result.
     limits : SectionLimits, optional
         Limits of ambiguous sections (P1 3.2).
 

@@ -62,7 +62,7 @@ class Cn0Mean:
     kind: str  #: Key of `KINDS`.
     signal: str
     elevation_deg: Floats  #: Bin centres in ascending order, shape (B,).
-    #: Mean and robust standard deviation, shape (B,) [dB-Hz] [dB].
+    #: Mean [dB-Hz] and robust standard deviation [dB], shape (B,) each.
     mean_dbhz: Floats
     spread_db: Floats
     count: Integers  #: Number of samples per bin, shape (B,).
@@ -164,5 +164,5 @@ class Cn0Curve:
 
 
 def _plain(text: str) -> str:
-    """Return the type of an antenna or receiver with single blanks."""
+    """Return the name of an antenna or receiver with single spaces."""
     return " ".join(text.split())

@@ -179,7 +179,7 @@ class FaultRate(Settings):
     side_blocks: int = Field(default=0, ge=0)
     side_faulty_blocks: int = Field(default=0, ge=0)
     #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, from these
-    #: blocks; 1 without such blocks. It is the value for `side_prior` if it is small enough for a finite protection
+    #: blocks; 1 without such blocks. The value is used for `side_prior` if it is small enough for a finite protection
     #: level.
     side_upper: float = Field(default=1.0, ge=0, le=1)
     #: Stretches with more frequent local faults than the line (`faulty_stretches`), chainages from and to.
@@ -214,7 +214,7 @@ class ErrorModel:
     ) -> tuple[Floats, Floats]:
         """Return the overbounding sigma and bias of observations, broadcast to one shape [m].
 
-        Both are NaN where the direction is unknown or the model has no value.
+        Sigma and bias are NaN where the direction is unknown or the model has no value.
         """
         index = self.bins.index(elevation_deg, relative_azimuth_deg, cn0_dbhz)
         inside, safe = index >= 0, np.maximum(index, 0)

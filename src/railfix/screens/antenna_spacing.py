@@ -20,8 +20,8 @@ class AntennaSpacingLimits(Settings):
 
     #: Largest difference between the distance of the two positions and the antenna spacing; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Smallest rejected difference of filter positions or speeds, in standard deviations. It applies in addition to the
-    #: limits in m and m/s, because the filter may predict over gaps.
+    #: Smallest rejected difference of filter positions or speeds, in standard deviations. This limit applies in
+    #: addition to the limits in m and m/s, because the filter may predict over gaps.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
     #: Largest difference of the two antennas' filter speeds. Antennas on one vehicle differ in speed by a few cm/s at
     #: most, where the track curves or its cant changes. A smaller difference at single epochs moves no position by 1 m.

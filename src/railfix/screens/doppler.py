@@ -44,7 +44,8 @@ class DopplerLimits(Settings):
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
     #: Largest difference of pseudorange and Doppler changes up to `short_interval_s`; P1 table 6: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
-    #: Interval up to which the limit is constant. It is twice P1's 0.1 s, so that one lost epoch has no effect.
+    #: Interval up to which the limit is constant. The default is twice the 0.1 s of P1, so that one lost epoch has no
+    #: effect.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
     #: Time over which the receiver smooths its pseudoranges. With 1 s the limit is 2.9 m at an interval of 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)

@@ -43,15 +43,15 @@ class GnssEpochs:
     code_sigma_m: Floats
     phase_m: Floats  #: Carrier phase corrected for satellite clock and troposphere, shape (T, K).
     phase_joined: Masks  #: True where the phase continues from the previous epoch without a cycle slip, shape (T, K).
-    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). It may include the satellite clock
-    #: drift and the tropospheric rate, which are some millimetres per second.
+    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). The rate may include the satellite
+    #: clock drift and the tropospheric rate, some millimetres per second each.
     rate_mps: Floats
     cn0_dbhz: Floats  #: Shape (T, K).
     #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
     #: measurement is used.
     off_map: Masks
-    #: Position computed without the line, accurate to some hundred metres, shape (T, 3). It is used for the velocity
-    #: across the line, unless it is NaN or None.
+    #: Position computed without the line, accurate to some hundred metres, shape (T, 3). The velocity across the line
+    #: is computed at this position, and is not used where it is NaN or None.
     near_ecef_m: Floats | None = None
 
     def __len__(self) -> int:

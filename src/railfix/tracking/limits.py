@@ -62,7 +62,7 @@ class TrackingLimits(Settings):
     #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler; C/N0 at most 50 dB-Hz, 45 if not given.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
-    #: The same two parameters for the change of a carrier phase over an epoch.
+    #: Floor and zenith value of the same formula for the change of a carrier phase over an epoch.
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
     #: Mean innovation over half a minute, in sigmas, above which the map's length error is larger than assumed.
@@ -87,8 +87,8 @@ class TrackingLimits(Settings):
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
     #: Probability that an on-board sensor is faulty in one independent sample. The value is an assumption.
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
-    #: Probability that a balise is not at its listed position. The value is an assumption. It must be small, because
-    #: the level does not cover two simultaneously wrong balises.
+    #: Probability that a balise is not at its listed position. The value is an assumption. A small value is required,
+    #: because the level does not cover two simultaneously wrong balises.
     level_balise_prior: float = Field(default=1e-6, ge=0, le=3e-6)
     #: Probability that all Dopplers, or all phases, are wrong together. The value is an assumption.
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)

@@ -1,8 +1,9 @@
 """Smoothed positions, the filter estimates combined with all later measurements (docs/filter-equations.md).
 
 The smoother has the adjoint form of G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
-doi:10.1080/00207177308932424. It uses the measurement weights of the filter, and at each epoch the hypothesis that led
-to the last hypothesis. Information of later epochs is not propagated backward beyond the beginning of a hypothesis.
+doi:10.1080/00207177308932424. The smoother uses the measurement weights of the filter, and at each epoch the hypothesis
+that led to the last hypothesis. Information of later epochs is not propagated backward beyond the beginning of a
+hypothesis.
 """
 
 from __future__ import annotations

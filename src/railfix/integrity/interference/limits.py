@@ -73,7 +73,8 @@ CAUSES: Final = tuple(cause for cause in Sign if cause)  #: All signs but NONE, 
 class InterferenceLimits(Settings):
     """Limits of the signs of interference.
 
-    No sign occurs on the recordings. Their largest statistics are in ``tests/references/results/interference.txt``.
+    No sign occurs on the recordings. The largest statistics of the recordings are in
+    ``tests/references/results/interference.txt``.
     """
 
     use: Literal["on", "off"] = "on"
@@ -84,7 +85,8 @@ class InterferenceLimits(Settings):
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
     known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
-    #: Fall of the front-end gain as a fraction of its recent peak. It reaches 14 % during a start without interference.
+    #: Fall of the front-end gain as a fraction of its recent peak. During a start without interference, the fall
+    #: reaches 14 %.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
     #: Standard deviation of C/N0 over the satellites up to which it counts as equal; in open sky it is 1.2 dB or more.
     equal_db: float = Field(default=0.8, gt=0)
@@ -105,7 +107,7 @@ class InterferenceLimits(Settings):
     #: Minimum jumps and distances, and minimum difference between two constellations, in standard deviations.
     jump_sigmas: float = Field(default=10.0, gt=0)
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Largest acceleration and speed of a train. A jump is the part of a change that exceeds what these allow.
+    #: Largest acceleration and speed of a train. A jump is the part of a change that exceeds these limits.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.

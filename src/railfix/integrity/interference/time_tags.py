@@ -31,8 +31,8 @@ _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's distance from its
 _LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree on an error.
 #: Residuals up to this many standard deviations agree; the cost contains residuals clipped at this limit.
 _AGREES: Final = 5.0
-#: Minimum reduction of the cost. It exceeds the cost of one clipped residual because a time-tag error can absorb one
-#: bad code.
+#: Minimum reduction of the cost. The value exceeds the cost of one clipped residual, because a time-tag error can
+#: absorb one bad code.
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])

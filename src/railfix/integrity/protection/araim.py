@@ -9,9 +9,9 @@ the integrity sigmas. For the component q of the position,
 - the level L satisfies
   `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
 
-A map is an additional constraint (Wenz 2024). It adds two observations, the offsets across and up, with the sigmas of
-the map. Both observations are faulty together if the map is wrong. With a map, the component q is the position along
-the track.
+A map is an additional constraint (Wenz 2024). This constraint consists of two observations, the offsets across and up,
+with the sigmas of the map. Both observations are faulty together if the map is wrong. With a map, the component q is
+the position along the track.
 """
 
 from __future__ import annotations

@@ -69,8 +69,8 @@ class Cause(IntEnum):
 class ProtectionLevel(NotebookTable):
     """Protection levels along the track of T epochs; NaN without a position."""
 
-    #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. It is at
-    #: most the largest of the following parts, which need not use their risk allocations fully.
+    #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. The level
+    #: is at most the largest of the following parts, which need not use their risk allocations fully.
     level_m: Floats
     #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the hypotheses of a part are
     #: within its risk allocation unchecked.

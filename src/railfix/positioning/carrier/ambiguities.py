@@ -41,7 +41,7 @@ class PhaseLimits(Settings):
     #: variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes alone.
     #: The positions do not change. Use 0 for white noise, for example in simulations.
     correlation_s: float = Field(default=20.0, ge=0)
-    #: Number of linearisations. Each has a separate state, so that results do not depend on chunks.
+    #: Number of linearisations. Each linearisation has a separate state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
     #: Largest probability of a wrong integer at which ambiguities are fixed, with a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
@@ -128,8 +128,9 @@ def prepare_start(
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    With separate phase clocks, a constant common to all ambiguities is unobservable. It is determined by a zero mean of
-    the ambiguities for which `held`, shape (..., A), is 1 (else 0). This does not change differences of ambiguities.
+    With separate phase clocks, a constant common to all ambiguities is unobservable. This constant is determined by a
+    zero mean of the ambiguities for which `held`, shape (..., A), is 1 (else 0). This does not change differences of
+    ambiguities.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)

@@ -232,9 +232,9 @@ class SmoothingLimits(Settings):
     #: decays (DO-229D 2.1.4.1.5: 100 s, because of the drift of the ionospheric delay).
     window_s: float = Field(default=100.0, gt=0)
     #: With "own", the mean change of code less phase over all channels is a clock, which is subtracted before and added
-    #: after averaging. This is required for telephones, whose codes jump together by tens of metres: in a town, it
-    #: reduced the 95 % error along the line from 10.8 to 7.0 m, which was 50 m with "shared". Results of other
-    #: receivers were not worse with "own".
+    #: after averaging. Telephones require "own", because their codes jump together by tens of metres: in a town,
+    #: smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared" the error was 50 m.
+    #: Results of other receivers were not worse with "own".
     clocks: Literal["own", "shared"] = "own"
 
 
