@@ -98,8 +98,8 @@ def exclude_faults(
     fix : LineFix
         Positions computed from these ranges (`fix_on_line`).
     scale : array_like, shape (T,) or ()
-        Ratio of the receiver's range standard deviation to the sigmas of the weights (`noise_scale`); ValueError unless
-        positive or NaN.
+        Ratio of the receiver's range standard deviation to the sigmas of the weights (`noise_scale`); a value that is
+        neither positive nor NaN raises ValueError.
     agreeing : ndarray of bool, shape (T, M), optional
         Ranges kept by a robust fit on the line (`robust_fit`); computed here by default.
     model : LinearModel, optional

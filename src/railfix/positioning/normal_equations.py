@@ -1,9 +1,9 @@
 """Normal equations of ranges with the receiver clocks eliminated; the constrained position and the 3-D single point.
 
-Subtracting the weighted mean over a constellation's satellites from its residuals and design rows is equivalent to
-solving for its clock (the Schur complement of the clock block). Where the biases between the clocks are known with a
-sigma (`InterSystemBiases`), each mean less its bias is an observation of a common clock, which is eliminated in the
-same way.
+Subtracting the weighted mean over the satellites of a constellation from their residuals and design rows is equivalent
+to solving for the clock of the constellation (the Schur complement of the clock block). Where the biases between the
+clocks are known with a sigma (`InterSystemBiases`), each mean less its bias is an observation of a common clock, which
+is eliminated in the same way.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
 height errors are two unknowns with their covariance as prior, which is equivalent to an additional covariance

@@ -177,7 +177,7 @@ def weighted_ranges(
 
 
 def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
-    """Return values in double precision; ValueError for single precision, other types or a wrong number of axes."""
+    """Return values in double precision; raise ValueError for other types or a wrong number of axes."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 8):
         raise ValueError(

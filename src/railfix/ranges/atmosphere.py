@@ -23,7 +23,7 @@ _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
-    """Return the ratio of slant to vertical delay of a thin-shell ionosphere (DO-229D A.4.4.10.4); NaN to 0.1 deg."""
+    """Return the ratio of slant to vertical delay of a thin shell (DO-229D A.4.4.10.4); NaN up to 0.1 deg elevation."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 

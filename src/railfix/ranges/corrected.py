@@ -223,7 +223,7 @@ def is_orbit(sat_ecef_m: Floats) -> Masks:
 
 
 def _check_near(near_ecef_m: ArrayLike, epochs: int) -> Floats:
-    """Return approximate positions, shape (T, 3); ValueError if they have neither shape (3,) nor (T, 3)."""
+    """Return approximate positions, shape (T, 3); raise ValueError if the shape is neither (3,) nor (T, 3)."""
     near = np.asarray(near_ecef_m, dtype=np.float64)
     if near.shape not in ((3,), (epochs, 3)):
         raise ValueError(f"near_ecef_m has shape {near.shape}, expected (3,) or ({epochs}, 3)")

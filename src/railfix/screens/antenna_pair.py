@@ -49,9 +49,9 @@ SEPARATE_CLOCKS_M: Final = 100.0
 class AntennaPairLimits(Settings):
     """Limits of the antenna-pair screen."""
 
-    #: Largest deviation of the pseudorange difference from the expected difference; P1 table 6: 5.
+    #: Largest deviation of the pseudorange difference from the expected difference; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Errors of the satellite's direction relative to the car body; P1 2.3(3): 3 and 3.5.
+    #: Errors of the satellite's direction relative to the car body; 3 and 3.5 in P1 2.3(3).
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
     #: Whether the receivers share a clock ("common"), or the median of each constellation eliminates the clock

@@ -40,9 +40,9 @@ _LEAST_CHANGES: Final = 5  #: Minimum number of pseudorange changes for the nois
 class DopplerLimits(Settings):
     """Limits of the Doppler screen."""
 
-    #: Limit that is fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
+    #: Whether the limit is fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
-    #: Largest difference of pseudorange and Doppler changes up to `short_interval_s`; P1 table 6: 1.5.
+    #: Largest difference of pseudorange and Doppler changes up to `short_interval_s`; 1.5 in P1 table 6.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
     #: Interval up to which the limit is constant. The default is twice the 0.1 s of P1, so that one lost epoch has no
     #: effect.

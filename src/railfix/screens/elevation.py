@@ -1,4 +1,4 @@
-"""Elevation mask (P1 table 6: 20 degrees)."""
+"""Elevation mask (20 degrees in P1 table 6)."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class RiskBudget(Settings):
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
     #: Fraction of the risk for epochs with one excluded satellite, and for epochs with two excluded satellites.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
-    #: Probability per epoch that noise alone makes the separations inconsistent; P4: 1e-3.
+    #: Probability per epoch that noise alone makes the separations inconsistent; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability that the signal of a satellite is faulty, by constellation.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))

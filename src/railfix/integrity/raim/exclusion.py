@@ -29,7 +29,7 @@ class RaimLimits(Settings):
     """Limits of fault detection, fault exclusion and reliability."""
 
     mode: Literal["chi_square", "fixed"] = "chi_square"  #: Threshold from a false-alarm rate (P4), or fixed (P1).
-    #: Probability that noise alone is detected as a fault; P4: 0.001. The error of an excluded satellite must exceed
+    #: Probability that noise alone is detected as a fault; 0.001 in P4. The error of an excluded satellite must exceed
     #: the noise at this probability (chi-square mode).
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing a fault of the minimal detectable size. P4 gives no value.
@@ -37,7 +37,7 @@ class RaimLimits(Settings):
     #: Limit of mode "fixed" for the sum of squared residuals, and for the squared error of an excluded satellite; P1
     #: table 6 ("FDE 2 SAT, 100 m2").
     fixed_limit_m2: float = Field(default=100.0, gt=0)
-    #: Largest number of satellites excluded at an epoch: 0, 1 or 2 (P1 2.3(4): 2).
+    #: Largest number of satellites excluded at an epoch, 0 to 2; 2 in P1 2.3(4).
     max_excluded: int = Field(default=2, ge=0, le=2)
     min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
     #: Probability that noise makes the true exclusion fit worse than a competing exclusion by the separation
@@ -53,7 +53,7 @@ class RaimLimits(Settings):
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
     #: Alarm limit of the protection level. P4 accepts an error within a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0)
-    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults that the level covers; P4: 1.
+    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults that the level covers; 1 in P4.
 
     @model_validator(mode="after")
     def _rates_below_one(self) -> Self:

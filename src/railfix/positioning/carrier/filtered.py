@@ -274,7 +274,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     begin = GPS_EPOCH + np.timedelta64(int(now) * round(limits.hop_s * 1e9), "ns")
     memory = _without(memory, seconds(begin - memory.seen) > FORGET_S)
     variance = limits.drift_m**2 * float(now - before) * limits.hop_s
-    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda, also where Lambda is singular.
+    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda, which is valid even if Lambda is singular.
     both = np.concatenate([memory.matrix, memory.right], axis=1)
     both = np.linalg.solve(np.eye(len(both)) + variance * memory.matrix, both)
     matrix, right = both[:, : len(both)], both[:, len(both) :]
