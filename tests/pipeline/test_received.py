@@ -258,7 +258,7 @@ def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
     assert own.ionosphere_sigma_m == 3.0  # BeiDou's are for a model of its own
     japan = known_from_start(parse_config(sigma), navigation=replace(bare, klobuchar={"J": navigation.klobuchar["G"]}))
     assert japan.ionosphere_sigma_m == 0.0
-    assert japan.notes == ("ionosphere: klobuchar requested, coefficients broadcast by QZSS used",)
+    assert japan.notes == ("ionosphere: klobuchar requested; QZSS coefficients are used",)
     later = receive(without, parse_config(sigma), parts["front"].time[0], navigation=navigation)
     np.testing.assert_array_equal(later.klobuchar, navigation.klobuchar["G"])
     assert (later.ionosphere_sigma_m, later.notes) == (0.0, ())

@@ -97,7 +97,9 @@ def stanford(
     time = time.astype("datetime64[ns]")
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
     if not len(time) == len(error) == len(level):
-        raise ValueError(f"one time, error and level per epoch needed, got {len(time)}, {len(error)} and {len(level)}")
+        raise ValueError(
+            f"time, error_m and level_m must have one value per epoch, got {len(time)}, {len(error)} and {len(level)}"
+        )
     if (np.diff(time) <= np.timedelta64(0, "ns")).any():
         raise ValueError("times must ascend")
     if (level < 0).any():

@@ -64,7 +64,7 @@ class StandstillErrors(Settings):
     #: Error of each antenna's position on the train, along and across: spacing, sway, lean.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
     #: Map error across the track common to all tracks of a yard, including the shift of the antenna on canted track.
-    map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
+    map_sigma_m: float = option("Error of the map across the track, common to all its tracks.", 0.3, metavar="M", ge=0)
 
     #: If None, `ANTENNA_UP_M` is used with the standard deviation `ANTENNA_SIGMA_M`, which covers usual vehicle
     #: heights.
@@ -212,7 +212,7 @@ def track_posterior(
     places = np.concatenate([fix.east_north_m for fix in fixes])
     weights = np.array([1.0 if prior is None else prior.get(track.name, 0.0) for track in tracks])
     if not weights.sum() > 0.0:
-        raise ValueError("the prior names none of the tracks")
+        raise ValueError("prior gives no track a positive weight; its keys must be names of the tracks")
     weights = weights / weights.sum() * (1.0 - errors.unmapped_prior)
     nearest = int(np.argmin([_distance(track.points_m, fixes[0].east_north_m) for track in tracks]))
     half = _UNMAPPED_WIDTH_M / 2.0

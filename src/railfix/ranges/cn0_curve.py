@@ -74,7 +74,7 @@ class Cn0Mean:
                 raise ValueError(f"{name} must be finite, one number per bin")
             object.__setattr__(self, name, read_only(values))
         if len(self.elevation_deg) < 2 or not (np.diff(self.elevation_deg) > 0.0).all():
-            raise ValueError("elevation_deg must rise, over at least two bins")
+            raise ValueError("elevation_deg must have at least two values, in ascending order")
 
     @cached_property
     def _interpolate(self) -> PchipInterpolator:

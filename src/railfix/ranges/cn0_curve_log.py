@@ -119,11 +119,13 @@ def cn0_curve_from_log(
 def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str, ...]:
     notes = []
     if duration_s < _SHORT_S:
-        notes.append(f"the log is {duration_s / 3600.0:.1f} h long; about a day covers all elevations on every side")
+        notes.append(
+            f"the log is {duration_s / 3600.0:.1f} h long; about a day is required to cover all elevations and azimuths"
+        )
     fitted = {(mean.kind, mean.signal) for mean in curve.means}
     without = [f"{KINDS.get(kind, kind)} {signal}" for kind, signal in samples.keys() if (kind, signal) not in fitted]  # noqa: SIM118
     if without:
-        notes.append(f"too few samples over elevation, no curve: {', '.join(without)}")
+        notes.append(f"no curve, because of too few samples over elevation: {', '.join(without)}")
     for mean in curve.means:
         elevation, cn0 = samples.of(mean.kind, mean.signal)
         high = elevation >= _CHECKED_FROM_DEG
@@ -132,6 +134,6 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
             share = 100.0 * rejected / np.count_nonzero(high)
             notes.append(
                 f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of the open-sky samples lie "
-                f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; its satellites differ, or the sky is not open"
+                f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; these satellites differ in power, or the sky is obstructed"
             )
     return tuple(notes)

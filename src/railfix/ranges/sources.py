@@ -87,13 +87,12 @@ def choose_ionosphere(
         return None, 0.0, ()
     known = navigation.klobuchar
     if "G" in known or "J" in known:
-        notes = () if "G" in known else ("ionosphere: klobuchar requested, coefficients broadcast by QZSS used",)
+        notes = () if "G" in known else ("ionosphere: klobuchar requested; QZSS coefficients are used",)
         return known.get("G", known.get("J")), 0.0, notes
     sigma = nominal.typical_ionosphere_sigma_m
     note = (
-        "ionosphere: klobuchar requested, no coefficients of GPS or QZSS received: typical coefficients "
-        "used (GPS, "
-        f"2004-01-01), {sigma:g} m added to the sigma of the vertical delay"
+        "ionosphere: klobuchar requested, but no coefficients of GPS or QZSS were received; typical coefficients (GPS, "
+        f"2004-01-01) are used, with {sigma:g} m added to the sigma of the vertical delay"
     )
     return TYPICAL_KLOBUCHAR, sigma, (note,)
 

@@ -123,7 +123,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
         """Return a note if the curve is missing; the note states whether the floor is applied."""
         if setup.cn0_curve is not None or limits.floor_dbhz is None:
             return super().notes(limits, setup)
-        return (f"screen cn0: no curve over elevation (cn0_curve), only the floor of {limits.floor_dbhz:g} dB-Hz used",)
+        return (f"screen cn0 has no curve (cn0_curve), so only the floor of {limits.floor_dbhz:g} dB-Hz is used",)
 
     def judge(
         self, antenna: AntennaRanges, limits: Cn0Limits, setup: ScreenSetup, state: Any

@@ -116,7 +116,7 @@ def prepare_start(
     if phases.phase_m.shape != shape or phases.weight.shape != shape or phases.arc_id.shape != shape:
         raise ValueError(f"phases have shape {phases.phase_m.shape}, expected that of the ranges {shape}")
     if np.any((phases.weight > 0) & (phases.arc_id < 0)):
-        raise ValueError("a phase with weight has no arc (arc_id is negative)")
+        raise ValueError("a phase with a positive weight has no arc (its arc_id is negative)")
     at = np.isfinite(arc_m)
     if at.all():
         return ranges, phases, np.clip(arc_m, 0.0, trajectory.arc_m[-1])
