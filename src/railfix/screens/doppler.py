@@ -7,10 +7,10 @@ ms changes the range by 3.2 m.
 
 P1 uses epochs 0.1 s apart. Over longer intervals the limit grows with the uncorrelated part of the pseudorange noise,
 ``sqrt(1 - exp(-dt / correlation_s))``, and the change of acceleration, ``jerk dt^3 / 12``. The limit has three modes,
-and is never smaller than P1's limit: "fixed" is P1's limit; "receiver" is `factor` times the noise scale of the
-receiver, estimated from its pseudorange changes; "sigma" is `factor` times the standard deviation of each pseudorange
-change, with the Doppler noise ``sigma dt`` included. In urban recordings at 1 Hz the mode "sigma" detects a quarter of
-the faulty pseudoranges, and rejects the same fraction of fault-free pseudoranges.
+and is never smaller than P1's limit. In mode "fixed" it is P1's limit. In mode "receiver" it is `factor` times the
+noise scale of the receiver, estimated from its pseudorange changes. In mode "sigma" it is `factor` times the standard
+deviation of each pseudorange change, with the Doppler noise ``sigma dt`` included. In urban recordings at 1 Hz the mode
+"sigma" detects a quarter of the faulty pseudoranges, and rejects the same fraction of fault-free pseudoranges.
 """
 
 from __future__ import annotations

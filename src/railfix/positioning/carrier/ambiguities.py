@@ -1,9 +1,10 @@
 """Ambiguities of positions along the line from code and phase (P4 with the map's constraint), and integer fixing.
 
 The unknowns of the epochs (distance and clocks) are eliminated, so that the normal matrix has one row per phase arc.
-Integers are fixed where the risk of a wrong integer is bounded, by Bayes' rule: the density of the float ambiguities
-around each vector of integers is compared with all other vectors and with non-integer phases (multipath, half cycles),
-which have the prior probability `PhaseLimits.no_integer_prior` and a uniform density.
+Integers are fixed where the probability of a wrong integer is small enough. The probability follows from Bayes' rule:
+the density of the float ambiguities at a vector of integers is compared with the density at all other vectors, and with
+non-integer phases (multipath, half cycles), which have the prior probability `PhaseLimits.no_integer_prior` and a
+uniform density.
 """
 
 from __future__ import annotations

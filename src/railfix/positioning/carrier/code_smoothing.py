@@ -300,8 +300,8 @@ def smooth_codes(
     Returns
     -------
     ndarray, shape (T, M) [m]
-        Smoothed codes: the raw code where there is no phase, and at the first epoch of an arc; NaN where the code is
-        missing, unless the arc of its phase continues: then the smoothed code continues.
+        Smoothed codes; the raw code where there is no phase, and at the first epoch of an arc. Where the code is
+        missing, the smoothed code continues with the arc of the phase, and is NaN without an arc.
     SmoothingState
         Division into chunks does not change the result beyond rounding (1e-9 m).
     """
