@@ -250,7 +250,7 @@ def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
     without = known_from_start(parse_config(sigma), navigation=bare)
     np.testing.assert_array_equal(without.klobuchar, TYPICAL_KLOBUCHAR)
     assert without.ionosphere_sigma_m == 3.0
-    assert "no coefficients of GPS or QZSS received" in without.notes[0]
+    assert "no coefficients of GPS or QZSS were received" in without.notes[0]
     assert "3 m added" in without.notes[0]
     off = known_from_start(parse_config({"filter": "off", "ionosphere": "off"} | sigma), navigation=bare)
     assert (off.klobuchar, off.ionosphere_sigma_m, off.notes) == (None, 0.0, ())
