@@ -44,7 +44,7 @@ class LargeSigmaScreen(ObservationScreen[LargeSigmaLimits]):
     def judge(
         self, antenna: AntennaRanges, limits: LargeSigmaLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdict on a chunk; the screen has no memory."""
+        """Return the verdict on a chunk, and None as the state, because no earlier epochs are used."""
         screened = Screened(metric=antenna.sigma_m, reject=antenna.sigma_m > limits.limit_m, limit=limits.limit_m)
         return (Verdict(name=self.name, reason=REASON, screened=screened),), None
 

@@ -2,9 +2,9 @@
 Positions as the epochs arrive
 ==============================
 
-``EpochProcessor.process`` returns a state, which is passed to the next call. A log can therefore be cut anywhere, down
-to single epochs as a receiver sends them; the positions are those of the whole log. :doc:`Live positions </live>` are
-computed in this way from the streams of receivers.
+``EpochProcessor.process`` returns a state, which is passed to the next call. A log can therefore be divided at any
+epoch, down to single epochs as a receiver sends them; the positions are the same as for the whole log.
+:doc:`Live positions </live>` are computed in this way from the streams of receivers.
 """
 
 from time import perf_counter
@@ -46,7 +46,7 @@ difference_m = np.abs(np.array(chainage_m) - whole.fusion["front"].chainage_m)
 print(f"largest difference {np.nanmax(difference_m):.1e} m")
 
 # %%
-# Chainage and protection level as they were known at each epoch. The level falls while the filter gathers
+# The chart shows chainage and protection level as computed at each epoch. The level decreases with the number of
 # measurements.
 
 figure, (upper, lower) = pyplot.subplots(2, sharex=True, layout="constrained")

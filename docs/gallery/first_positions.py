@@ -58,8 +58,8 @@ front.select(columns)[300:305]
 # Compare with the ground truth
 # -----------------------------
 #
-# The filter is compared with positions of single epochs, and with conventional 3-D positions moved to the nearest
-# point of the line.
+# The errors of the filter are compared with the errors of single-epoch positions, and of conventional 3-D positions
+# moved to the nearest point of the line.
 
 truth = pl.read_csv(files["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
 truth = truth.select("time_gpst", "antenna", true_m="chainage_m")
@@ -95,4 +95,4 @@ chart = errors.select("time_gpst", "error_m", "conventional_error_m", "along_sig
 plots.plot_error_over_chainage(chart)
 
 # %%
-# ``railfix demo`` does the same and writes files. For data of your own see :doc:`how to </how-to>`.
+# ``railfix demo`` computes the same positions and writes files. For your own data, see :doc:`how to </how-to>`.

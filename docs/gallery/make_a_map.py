@@ -3,8 +3,8 @@ Make a track map from positions
 ===============================
 
 One run with accurate positions (RTK) is enough for a map. Here the ground truth of the demonstration, with noise of
-two centimetres, stands in for RTK positions. ``railfix map from-positions`` and ``railfix map check`` do the same
-with files.
+two centimetres, replaces RTK positions. ``railfix map from-positions`` and ``railfix map check`` do the same
+for files.
 """
 
 # %%
@@ -33,8 +33,8 @@ made = from_positions(
 made
 
 # %%
-# The train runs along the line and back, and stands at both ends. The map is made from the outward run, without the
-# positions at a stand. It is the path of the antenna, not the centreline of the track.
+# The train runs along the line and back, and stops at both ends. The map is made from the outward run, without the
+# positions at standstill. The map is the path of the antenna, not the centreline of the track.
 #
 # Check the map
 # -------------
@@ -43,7 +43,8 @@ for finding in railfix.check_track(made).findings:
     print(finding)
 
 # %%
-# These are the distances of its points from the antenna's path on the map that comes with the demonstration.
+# The numbers are the distances of the points of the new map from the antenna's path, as computed from the map of the
+# demonstration.
 
 vehicle = railfix.read_vehicle(files["vehicle"])
 shipped = railfix.antenna_trajectory(railfix.read_track(files["track"]), vehicle, "front")
@@ -54,7 +55,7 @@ print(f"median {np.median(offset_m):.3f} m, largest {np.max(offset_m):.3f} m")
 # Compute positions on the map
 # ----------------------------
 #
-# The map is the antenna's own path, so no vehicle file is needed.
+# The map is the path of the antenna, so no vehicle file is required.
 
 trajectory = railfix.Trajectory.from_antenna_path(made)
 navigation = railfix.read_navigation(files["nav"])

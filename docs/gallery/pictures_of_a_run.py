@@ -33,7 +33,7 @@ plots.plot_plan(positions, level_m=positions["protection_level_m"].to_numpy())
 
 
 # %%
-# Errors over time, of positions on the line and of conventional ones.
+# Errors of positions on the line and of conventional positions, over time.
 
 plots.plot_error_over_time(errors)
 

@@ -2,8 +2,8 @@
 Protection level with a faulty satellite
 ========================================
 
-A protection level bounds the error of a position at a stated risk, faults of satellites included. This example
-compares the levels of the demonstration with its errors, without a fault and with one.
+A protection level bounds the error of a position at a stated risk, including satellite faults. This example
+compares the levels of the demonstration with its errors, with and without a fault.
 """
 
 # %%
@@ -59,7 +59,7 @@ counts(errors)
 # With a fault
 # ------------
 #
-# For 20 seconds, 40 m are added to the pseudoranges of the satellite that is used most often then.
+# For 20 seconds, 40 m is added to the pseudoranges of the satellite that is used most often in this interval.
 
 stretch = slice(200, 400)
 used = (result.reason[stretch] == 0).sum(axis=0)
@@ -84,5 +84,6 @@ table.insert_column(0, pl.Series("fault", ["none", "40 m"]))
 railfix.Config().risk
 
 # %%
-# ``railfix error-model`` fits a model of the pseudorange errors of a line, which replaces the assumption. See
-# :doc:`protection level </protection-level>` and the :doc:`levels on recordings </level-results>`.
+# ``railfix error-model`` fits a model of the pseudorange errors of a line, with measured probabilities that replace
+# the assumed ones. See :doc:`protection level </protection-level>` and the
+# :doc:`levels on recordings </level-results>`.

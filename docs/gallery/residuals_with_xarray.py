@@ -17,7 +17,8 @@ data
 
 # %%
 # The residual is the corrected pseudorange less the range computed from the position on the line and the receiver
-# clock. Reflected signals arrive late, so the residuals of low satellites have a larger spread, mostly upward.
+# clock. Reflected signals arrive late, so the residuals of low satellites have a larger spread, and are mostly
+# positive.
 
 used = data.reason == 0
 figure, ax = pyplot.subplots(layout="constrained")

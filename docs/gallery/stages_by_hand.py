@@ -39,10 +39,10 @@ def positions_by_hand(log, navigation, line, systems):
 
 
 # %%
-# A screen of your own is one more line that sets codes to NaN. ``SbasSource``, ``DfmcSource`` or ``BaseStationSource``
-# can replace ``BroadcastSource``; precise orbits belong to the navigation data. ``fix_on_line`` calls ``find_section``
-# and ``position_on_line``. Inter-system biases are estimated over all epochs so far: pass ``state`` into the next
-# call, as with ``scipy.signal.lfilter``.
+# To add your own screen, insert a line that sets the rejected codes to NaN. ``SbasSource``, ``DfmcSource`` or
+# ``BaseStationSource`` can replace ``BroadcastSource``; precise orbits are part of the navigation data. ``fix_on_line``
+# calls ``find_section`` and ``position_on_line``. Inter-system biases are estimated over all epochs so far; for this,
+# pass ``state`` to the next call, as with ``zi`` of ``scipy.signal.lfilter``.
 #
 # Faults and protection level
 # ---------------------------
@@ -67,10 +67,11 @@ int(raim.excluded.any(axis=1).sum()), float(np.nanmedian(level.level_m))
 # ----------------------------
 #
 # The stages are compared with the pipeline for two and for four constellations, and for a navigation file without
-# ionospheric coefficients. In that case typical coefficients are used, with a standard deviation larger by 2 m.
+# ionospheric coefficients. Without coefficients, typical coefficients are used, and 2 m is added to the standard
+# deviation of the vertical delay.
 
-# A recording is compared as well if the environment variable ``RECORDING`` names its folder, with ``log.obs``,
-# ``log.nav`` and the antenna's path as ``path.csv``.
+# If the environment variable ``RECORDING`` names a folder with ``log.obs``, ``log.nav`` and the antenna's path as
+# ``path.csv``, this recording is also compared.
 
 silent = dataclasses.replace(navigation, klobuchar={})
 cases = {
@@ -96,5 +97,5 @@ for name, (own_log, own_navigation, own_line, systems) in cases.items():
 
 # %%
 # The pipeline adds the tests and estimates that require earlier epochs: the receiver's noise scale, the test for
-# persistent range errors, and the test of the map, whose result is part of its protection levels. The
+# persistent range errors, and the test of the map, whose result affects the protection levels. The
 # :doc:`filter </filter>` is ``railfix.tracking.track``.

@@ -24,7 +24,7 @@ files = write_run(scenario.replaced(sensors=sensors), folder / "simulated")
 sorted(files)
 
 # %%
-# Both runs read the same files; only the second one has the tachometer.
+# Both runs read the same files; only the second run uses the tachometer.
 
 inputs = railfix.RunInputs(
     front=(files["front"],), nav=(files["nav"],), track=(files["track"],), vehicle=files["vehicle"]
@@ -37,7 +37,7 @@ for name, run_inputs in (("satellites", inputs), ("with tachometer", inputs.repl
     runs[name] = pl.read_parquet(folder / name / "train.parquet").join(truth, on=["time_gpst", "antenna"])
 
 # %%
-# The tunnel is at 450 to 520 m. The band is the standard deviation that the filter states.
+# The tunnel is at 450 to 520 m. The band shows the standard deviation stated by the filter.
 
 figure, axes = pyplot.subplots(2, sharex=True, sharey=True, layout="constrained")
 for ax, (name, table) in zip(axes, runs.items(), strict=True):

@@ -40,31 +40,33 @@ plots.plot_screen_over_time(screens["elevation"].picture, screens["elevation"].t
 
 
 # %%
-# **Doppler.** The change of a pseudorange between epochs is compared with its Doppler, which multipath disturbs far
-# less than the pseudorange.
+# **Doppler.** The change of a pseudorange between epochs is compared with its Doppler, on which multipath has much
+# less effect than on the pseudorange.
 
 plots.plot_screen_over_time(screens["doppler"].picture, screens["doppler"].time)
 
 
 # %%
-# **Antenna pair.** The pseudoranges of two antennas on one roof differ by an amount that follows from their spacing. A
-# larger difference is multipath at one of the antennas.
+# **Antenna pair.** The pseudoranges of two antennas on one roof differ by an amount that follows from their spacing.
+# A different value indicates multipath at one of the antennas.
 
 plots.plot_screen_over_chainage(screens["antenna_pair"].picture, screens["antenna_pair"].chainage_m)
 
 
 # %%
 # By default these two screens do not reject (``verdict = "weigh"``): they increase the standard deviation of a
-# suspected observation by the measured error. This keeps the geometry where few satellites are left.
+# suspected observation by the measured error. The geometry therefore does not become weaker where few satellites are
+# left.
 #
-# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds its fault-free distribution.
+# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds a threshold of its fault-free
+# distribution.
 
 plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainage_m)
 
 
 # %%
-# **Antenna spacing.** The two positions must be as far apart along the line as the antennas are. The **C/N0** screen
-# needs the open-sky curve of antenna and receiver (``railfix cn0-curve``); it is not run here.
+# **Antenna spacing.** The distance of the two positions along the line must be equal to the spacing of the antennas.
+# The **C/N0** screen needs the open-sky curve of antenna and receiver (``railfix cn0-curve``); it is not run here.
 #
 # Rejected observations
 # ---------------------
@@ -81,8 +83,8 @@ plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainag
 # Effect on rate and errors
 # -------------------------
 #
-# ``ablate_files`` reads the log once, and positions it with all screens, with none, with each screen alone, and with
-# all screens except each.
+# ``ablate_files`` reads the log once, and computes positions with all screens, with no screen, with each single screen,
+# and with all screens but one.
 
 inputs = demo_inputs().replaced(truth=demo_truth())
 ablation = ablate_files(inputs, config, out=Path(tempfile.mkdtemp()) / "effects")
@@ -92,5 +94,5 @@ effects.filter(pl.col("antenna") == "front").select(columns)
 
 
 # %%
-# The columns ``coordinates_*`` have the errors of all positions, the columns ``ok_*`` those of positions that passed
-# every check.
+# The columns ``coordinates_*`` have the errors of all positions, the columns ``ok_*`` have the errors of positions
+# that passed every check.
