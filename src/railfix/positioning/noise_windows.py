@@ -43,8 +43,7 @@ class Windows(NamedTuple):
         return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, last)
 
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
-        """Return, for each epoch, the sum of `values` (T, K) over earlier epochs, each times ``exp(-difference of the
-        ages)``.
+        """Return sums of `values` (T, K) over all earlier epochs, each times ``exp(-difference of the ages)``.
 
         `start`, shape (A, K), are the running sums after the previous epochs; the running sums after the last epochs
         are also returned.

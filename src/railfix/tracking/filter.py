@@ -66,8 +66,8 @@ class Recursion:
         )  # fmt: skip
 
     def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
-        """Search positions for an epoch to which the hypotheses are predicted; return None, with the epoch finished, if
-        there is no hypothesis after the search.
+        """Search positions for an epoch to which the hypotheses are predicted; if no hypothesis exists after the
+        search, finish the epoch and return None.
         """
         if not state.hypotheses:
             state.code_bias = np.where(self.chunk.fresh[epoch], 0.0, state.code_bias)

@@ -171,8 +171,7 @@ def own_clock(lin: Linearised) -> bool:
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Subtract first values of the ambiguities (T, M), and the mean of the rest as a separate phase clock, from the
-    phases.
+    """Subtract first values of the ambiguities (T, M) from the phases, and a first value of a separate phase clock.
 
     The phases are added to the right-hand side only afterwards, because values of 1e7 m would cause rounding errors of
     millimetres.
