@@ -44,7 +44,7 @@ class Sign(IntFlag):
     RECEIVER_SPOOFING = 1 << 3
     #: All satellites have the same C/N0, as from one transmitter.
     EQUAL_CN0 = 1 << 4
-    #: The receiver clock steps against the Dopplers, or its drift steps.
+    #: The receiver clock steps relative to the Dopplers, or its drift steps.
     CLOCK_JUMP = 1 << 5
     #: The 3-D velocity changes faster than a train can.
     SPEED_JUMP = 1 << 6
@@ -114,8 +114,8 @@ class InterferenceLimits(Settings):
     #: Largest standard deviations of velocities and positions that are compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
     largest_sigma_m: float = Field(default=30.0, gt=0)
-    #: Time for which a sign must persist: C/N0 or gain fall, equal C/N0, distance from the map; and differing
-    #: constellations.
+    #: Times for which signs must persist: `hold_s` for C/N0 or gain fall, equal C/N0 and distance from the map,
+    #: `part_hold_s` for differing constellations.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)
     #: Length of the window over which satellite and wheel distances are compared, and its minimum.

@@ -72,8 +72,8 @@ class ProtectionLevel(NotebookTable):
     #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. The level
     #: is at most the largest of the following parts, which need not use their risk allocations fully.
     level_m: Floats
-    #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the hypotheses of a part are
-    #: within its risk allocation unchecked.
+    #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the total probability of the
+    #: hypotheses of a part is within its risk allocation.
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
