@@ -640,7 +640,7 @@ def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
     record = json.loads((run / "run.json").read_text())
     record["inputs"] = [{"input": "front", "path": str(log), "bytes": 0, "sha256": ""}]
     (run / "run.json").write_text(json.dumps(record))
-    with pytest.raises(InputFileError, match="holds no reference"):
+    with pytest.raises(InputFileError, match="has no reference"):
         evaluate_run(run)
     write_reference(log.parent / "reference.csv", reference(time, 10.0 * time))
     found = evaluate_run(run)
@@ -786,7 +786,7 @@ def test_levels_go_into_files_named_by_what_they_rest_on(tmp_path: Path):
     arguments = ["evaluate", str(run), "--reference", str(tmp_path / "truth.csv"), "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--alarm-limit", "5", "--alarm-limit", "30"])
     assert result.exit_code == 0, result.output
-    assert "Errors above their level (sbas): 5, of them 3 usable" in result.output
+    assert "Errors above the level (sbas): 5, of which 3 at a usable level" in result.output
     assert re.search(r"one_fault +unavailable +ambiguous +no +150 +\+9\.00 +2\.00", result.output)
     counts = pl.read_csv(out / "stanford_sbas.csv").filter(grouping="all")
     assert counts["alarm_limit_m"].to_list() == [5.0, 12.0, 30.0] * 2

@@ -51,7 +51,7 @@ def test_errors_of_the_runs_and_the_worst_epoch(tmp_path: Path) -> None:
     assert "--at '2024-03-05 01:02:30' --antenna front" in first["command to explain"]
     assert [chart.name for chart in found.charts] == ["campaign-plan", "campaign-error", "campaign-level"]
     assert any(layer.label == "error 10 m and more" and len(layer.x) == 1 for layer in found.charts[0].layers)
-    assert "the worst run is B, with 95 % within 2.00 m and a largest value of 70.00 m" in found.sentences
+    assert "the worst run is B, with a 95th percentile of 2.00 m and a largest value of 70.00 m" in found.sentences
     assert len(found.sentences) <= 5
 
     page = write_campaign_page(found, tmp_path / "campaign.html", title="three <runs>")

@@ -251,10 +251,10 @@ def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> Non
     )
     assert len(over) > 20
     assert (
-        f"Errors above their level (separation): {len(over):,}, of them {len(usable):,} usable; the 20 largest"
-        in document
+        f"Errors above the level (separation): {len(over):,}, of which {len(usable):,} at a usable level; the 20 "
+        "largest" in document
     )
-    listed = document.split("Errors above their level (separation)")[1].split("</table>")[0]
+    listed = document.split("Errors above the level (separation)")[1].split("</table>")[0]
     assert listed.count("<tr>") == 1 + 20
     worst = over.select(size=(pl.col("chainage_m") - pl.col("true_m")).abs()).max().item()
     assert f"{worst:.2f}</td>" in listed.split("<tr>")[2]

@@ -212,7 +212,7 @@ def test_tables_fit_a_window_of_1300_pixels(tmp_path: Path) -> None:
     with_limits = EvaluationOptions(block_s=20.0)
     evaluation = evaluate_runs([RunAndReference(run=out, reference=demo_truth())], options=with_limits)
     document = report_page(runs, evaluation)
-    assert "Limits of 95 % confidence, from blocks of 20 s" in document
+    assert "Confidence limits of 95 %, from blocks of 20 s" in document
     assert "100.00 to 100.00" in document
     page = tmp_path / "wide.html"
     page.write_text(document.replace("</body>", WIDE), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The command line: the program ``railfix`` and its commands.
+"""Command-line program ``railfix`` and its commands.
 
 The module of a command is imported only when the command is called, so that ``railfix --help`` starts quickly.
 """
@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 class _Program(LazyCommands):
-    """The commands of railfix."""
+    """Top-level command group with the one-line summary and the module of each command."""
 
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
@@ -104,14 +104,14 @@ def railfix(
     - 2: the command line was misused (unknown option, missing argument)
     - 3: an input file is missing, unreadable, or malformed
     - 4: a setting is misspelt, out of range, or contradicts another
-    - 5: the inputs are readable but do not match each other (another day, another location)
+    - 5: the inputs are readable but do not match each other, for example in day or location
     - 6: the track map was checked and has errors
-    - 7: there is no position: none in the results, or no usable position in the inputs
+    - 7: the results contain no position, or the inputs no usable position
     - 8: the output cannot be written
     - 9: two channels of a live session computed different outputs from the same input
 
-    A signal ends the program with exit code 128 plus the number of the signal: 143 for SIGTERM, 141 where the reader of
-    the output ended first (SIGPIPE).
+    A signal ends the program with exit code 128 plus the number of the signal: 143 for SIGTERM, and 141 for SIGPIPE,
+    when the program that reads the output ends first.
 
     An error is reported in one sentence on standard error, and no results are written. Existing files are replaced only
     with `--overwrite`; an input is never replaced.

@@ -102,14 +102,14 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print on standard error the number of finished runs and the remaining time; `kept` runs are of earlier calls."""
+    """Print the number of finished runs, of which earlier calls did `kept`, and the time left, on standard error."""
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} of earlier calls)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
     sys.stderr.flush()
 
 
-#: Signals that end a worker process: SIGINT by Ctrl-C, and SIGTERM, sent by the pool when another worker has ended.
+#: Signals that end a worker process: SIGINT (Ctrl-C), and SIGTERM, which the pool sends when another worker has ended.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -127,7 +127,7 @@ def _prepare_worker() -> None:
 
 
 def _end(number_of_signal: int, _frame: object) -> None:
-    """Raise SystemExit, and ignore further signals so that they do not interrupt it."""
+    """Ignore further signals that would interrupt the end of the process, and raise SystemExit."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number_of_signal)
@@ -137,7 +137,7 @@ def _end(number_of_signal: int, _frame: object) -> None:
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
     """Yield the executor, and the exception types that report a lost worker process.
 
-    Raise SettingsError where no scheduler answers at its address, or `distributed` is not installed.
+    Raise SettingsError if no scheduler answers at its address, or `distributed` is not installed.
     """
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
@@ -211,7 +211,7 @@ def benchmark(
 def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> None:
     """Run the cases of a folder, and print the table, the notes and the files.
 
-    Raise NoPositionError where every case has failed, and MismatchError where some cases have failed.
+    Raise NoPositionError if every case has failed, and MismatchError if some cases have failed.
     """
     with open_executor(workers, None) as (executor, lost):
         prepare_kernels()
@@ -251,7 +251,7 @@ def ablate(
     satellites used, and the median standard deviation along the line. With `--truth` it also shows the errors along the
     line (an error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs without
     satellites, and the 95th percentile of the ratio of error to stated sigma. `ablation.csv` in DIR has all figures,
-    those of the conventional position included; `ablation.json` has the versions, inputs and settings.
+    including the figures of the conventional position; `ablation.json` has the versions, inputs and settings.
 
     Example:
 

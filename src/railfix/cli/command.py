@@ -1,4 +1,4 @@
-"""Base classes of the commands: loading on demand, one sentence per error, and a documented exit code."""
+"""Base classes of the commands, which are loaded on demand and report an error in one sentence with an exit code."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from railfix.core.errors import InputFileError, OutputError, RailfixError, Railf
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: Exit code of a program that a signal ended, less the number of the signal, as in a shell.
+#: Number to which the number of a signal is added for the exit code of a program that the signal ended (POSIX shells).
 SIGNALLED: Final = 128
 #: Message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
@@ -36,7 +36,7 @@ class Command(TyperCommand):
     """Command that rejects repeated options and switches with a value, and reports all missing options together."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Check for repeated options and switches with a value, then parse the arguments."""
+        """Parse the arguments; repeated options, switches with a value and missing options are usage errors."""
         options = {name: param for param in self.params for name in getattr(param, "opts", ())}
         given: Counter[str] = Counter()
         words = iter(args[: args.index("--")] if "--" in args else args)
@@ -85,9 +85,7 @@ class Commands(TyperGroup):
         except RailfixError as error:
             _end(error)
         except MemoryError:
-            _end(
-                SettingsError("this needs more memory than is available; give a shorter time or fewer epochs per chunk")
-            )
+            _end(SettingsError("the command needs more memory than there is; give a shorter time or smaller chunks"))
         except RuntimeError as error:
             loop = _LOOP.match(str(error))
             if loop is None:
@@ -95,7 +93,7 @@ class Commands(TyperGroup):
             _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; link to the file"))
 
 
-#: Options of every typer program: rich formats the help, but not the tracebacks.
+#: Options of every typer program; rich formats the help but not the tracebacks.
 _TYPER: Final[dict[str, Any]] = {
     "add_completion": False, "pretty_exceptions_enable": False, "rich_markup_mode": "markdown"
 }  # fmt: skip
@@ -107,10 +105,10 @@ def command_group(name: str, *, cls: type[Commands] = Commands, **options: Any) 
 
 
 class LazyCommands(Commands):
-    """Group that imports the module of a command when the command is called; `summaries` are shown in its help."""
+    """Group that imports the module of a command only when the command is called; the help shows `summaries`."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Modules of the commands whose module has another name than the command.
+    #: Name of the module of each command whose module is not named after the command.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -118,13 +116,13 @@ class LazyCommands(Commands):
         return [*super().list_commands(ctx), *self.summaries]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a placeholder with the name and summary of a command, for the list of commands in the help."""
+        """Return a command; for a command in `summaries`, a placeholder with its name and summary, used by the help."""
         if cmd_name in self.summaries:
             return Command(cmd_name, help=self.summaries[cmd_name])
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name, the imported command and its arguments; an unknown name fails with the nearest name."""
+        """Return the name, the imported command and its arguments; the error for an unknown name suggests a command."""
         known = self.list_commands(ctx)
         word = args[0] if args else ""
         near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
@@ -135,7 +133,7 @@ class LazyCommands(Commands):
 
 
 def load_command(name: str, module_name: str | None = None) -> Any:
-    """Import and return a command from a module in `railfix.cli`, by default the module of the same name."""
+    """Import and return a command from a module of `railfix.cli`, by default the module named after the command."""
     word = name.replace("-", "_")
     module = import_module(f"railfix.cli.{module_name or word}")
     app = getattr(module, "app", None)
@@ -148,7 +146,7 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program and exit with its code; standard output closed by its reader is not reported as an error."""
+    """Run the program and exit with its code; a standard output closed by its reader is not reported as an error."""
     if number := getattr(signal, "SIGPIPE", None):
         signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -169,7 +167,7 @@ def run_program(app: typer.Typer) -> NoReturn:
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:
-    """Exit if the reader of standard output has closed it; otherwise return, as another pipe reports its own error."""
+    """Exit if the reader of standard output has closed it; otherwise return, and the write to the other pipe fails."""
     poll = select.poll()
     poll.register(1, 0)
     if any(event & select.POLLERR for _, event in poll.poll(0)):
@@ -184,7 +182,7 @@ def _end(error: RailfixError) -> NoReturn:
 
 
 def _check_surroundings() -> None:
-    """Raise InputFileError where the working directory does not exist, or an argument is not valid UTF-8."""
+    """Raise InputFileError if the working directory does not exist, or an argument is not valid UTF-8."""
     try:
         os.getcwd()  # noqa: PTH109
     except OSError:
@@ -198,7 +196,7 @@ def _check_surroundings() -> None:
 
 
 def _discard_output() -> None:
-    """Discard the rest of the standard output, so that no error occurs when the program ends."""
+    """Redirect standard output to the null device, so that flushing it at the end of the program raises no error."""
     with suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Output of the command line: progress bar, summary of a run, notes and files."""
+"""Output of the commands: progress bars, tables, verdicts, notes, and names of written files."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def print_json(values: Mapping[str, Any]) -> None:
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
     """Return the error statistics of the positions on the map per run and antenna, over all epochs of the run.
 
-    The largest 95th percentile is first; rows without errors are last.
+    Rows without errors come first, then the rows in descending order of the 95th percentile.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
@@ -60,14 +60,14 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Return at most `_MOST` sentences: accuracy per run and antenna, largest errors first, and the next command.
+    """Return at most `_MOST` lines: the accuracy per run and antenna, largest errors first, and the next command.
 
-    Each accuracy sentence also states whether the stated sigma fits the errors.
+    A line on accuracy also states whether the stated sigma fits the errors.
     """
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
-        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} with smaller errors, in the tables below"]
+        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} more with smaller errors, in the tables below"]
     paths, references = ({str(getattr(run, what)) for run in evaluation.runs} for what in ("path", "reference"))
     if len(paths) == len(references) == 1:
         run, reference = shlex.quote(paths.pop()), shlex.quote(references.pop())
@@ -78,8 +78,8 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
 def describe_errors(evaluation: Evaluation) -> str:
     """Return one sentence on the errors of a run's positions against its ground truth.
 
-    It has the errors of the filter's positions if the run has them, otherwise of the single epochs; the number of
-    errors above the protection level; and the errors of the conventional positions.
+    The sentence has the errors of the filter's positions, or of the single-epoch positions if the run has no filter;
+    the number of errors above the protection level; and the errors of the conventional positions.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("run") != "all", pl.col("antenna") == "all"
@@ -102,11 +102,11 @@ def describe_errors(evaluation: Evaluation) -> str:
 
 
 def _judge(row: Mapping[str, Any]) -> str:
-    """Return a sentence on the errors of one run and antenna, from a row of `list_antenna_errors`."""
+    """Return a sentence on the errors in a row of `list_antenna_errors`, which is of one run and antenna."""
     from railfix.evaluate.accuracy import WRONG_PLACE_M
 
     run, train, _ = str(row["run"]).partition(" (train)")
-    name = f"{run}, {row['antenna']}, {'filter along the track' if train else 'every single epoch'}"
+    name = f"{run}, {row['antenna']}, {'filter along the track' if train else 'single epochs'}"
     if not row["errors"]:
         return f"{name}: no position has a reference"
     text = (
@@ -115,7 +115,7 @@ def _judge(row: Mapping[str, Any]) -> str:
     )
     if row["max_at_chainage_m"] is not None:
         text += f" at chainage {row['max_at_chainage_m']:.0f} m"
-    text += f"; {row['wrong_places']:,} at a wrong position (over {WRONG_PLACE_M:g} m)"
+    text += f"; {row['wrong_places']:,} wrong positions (error over {WRONG_PLACE_M:g} m)"
     ratio = row["normalised_p95"]
     if ratio is not None:
         true = "fits" if ratio <= _OVERCONFIDENT else "is too small for"
@@ -124,7 +124,7 @@ def _judge(row: Mapping[str, Any]) -> str:
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels that have no compiled code on this machine yet."""
+    """Compile the kernels if this machine has no compiled code of them yet."""
     if not kernels.is_compiled():
         import_module("railfix.live.warm_up").prepare_kernels()
 
@@ -192,7 +192,7 @@ def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable
 
 
 def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
-    """Print a table of results under its caption; at most `most` rows, then the number of the rows left out."""
+    """Print the caption and the first `most` rows of a table, by default all, and the number of omitted rows."""
     if table.caption:
         console.print(table.caption)
     if not table.rows:
@@ -210,27 +210,27 @@ def show_table(console: Console, table: Table, *, most: int | None = None) -> No
 
 
 def show_verdict(console: Console, lines: Iterable[str]) -> None:
-    """Print the lines of a verdict, and a blank line."""
+    """Print the lines of a verdict, followed by a blank line."""
     for line in lines:
         console.print(line)
     console.print()
 
 
 def show_notes(console: Console, notes: Iterable[str]) -> None:
-    """Print notes, one per line."""
+    """Print each note in a line that begins with "note: "."""
     for note in notes:
         console.print(f"note: {note}")
 
 
 def show_files(console: Console, paths: Iterable[Path]) -> None:
-    """Print the files that were written."""
+    """Print the path of each written file in a line."""
     for path in paths:
         console.print(f"wrote {path}")
 
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """Yield the function that updates a progress bar on standard error; nothing is printed without a terminal.
+    """Yield the function that updates a progress bar on standard error, which is shown only on a terminal.
 
     The bar shows the number of epochs, the rate in epochs/s and the remaining time.
     """
@@ -287,7 +287,7 @@ def show_summary(summary: RunSummary, *, verbose: bool) -> None:
 
 
 def show_budget(console: Console, summary: RunSummary) -> None:
-    """Print the tables of the numbers of epochs by status and of pseudoranges by reason."""
+    """Print the tables of the number of epochs by status and of the number of pseudoranges by rejection reason."""
     for table in budget_tables(summary.record["antennas"], level_basis(summary.record)):
         show_table(console, table)
 

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Maximum numbers of printed rows by section, and of printed epochs with an error beyond the level; files have all.
+#: Maximum numbers of printed rows by section, and of printed epochs with an error above the protection level.
 _MOST_SECTIONS: Final = 20
 _MOST_BEYOND: Final = 5
 
@@ -96,9 +96,9 @@ def evaluate(
     r"""Compute the errors of runs along the line against references, and their statistics.
 
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
-    either direction of travel. Tables are made of the positions on the map, of the positions with status ok, and of
+    either direction of travel. The tables are of the positions on the map, of the positions with status ok, and of
     conventional positions (3-D single point, moved to the nearest point of the line), over the epochs of each kind of
-    position and over their common epochs. Errors are grouped by antenna, section, environment, speed, number of
+    position and over the common epochs. Errors are grouped by antenna, section, environment, speed, number of
     satellites used, presence of satellites, and status; with several runs also by configuration and line.
 
     `evaluation.json` in DIR has all figures, the options and the hashes of the inputs; `errors.parquet` has one row per
@@ -142,7 +142,7 @@ def evaluate(
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
     """Return each run with its reference, or None for `auto`, and its label.
 
-    Raise SettingsError where the number of references or labels does not match the number of runs.
+    Raise SettingsError if the number of references or labels does not match the number of runs.
     """
     references = reference * len(runs) if len(reference) == 1 else reference
     if len(references) != len(runs):

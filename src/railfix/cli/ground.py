@@ -39,7 +39,7 @@ def ground() -> None:
 
 
 class MonitorChoices(Settings):
-    """Logs of `railfix ground monitor` and the folder of its results."""
+    """Inputs and output folder of `railfix ground monitor`."""
 
     nav: tuple[Path, ...] = option(
         "RINEX navigation file; may be repeated. Streams may contain their own navigation records.",
@@ -52,7 +52,7 @@ class MonitorChoices(Settings):
         (),
         metavar="LAT,LON,HEIGHT",
     )
-    fixes: bool = option("The logs are positions of the receivers, computed elsewhere (RTK, PPP-RTK, CLAS).", False)
+    fixes: bool = option("The logs contain receiver positions computed elsewhere (RTK, PPP-RTK, CLAS).", False)
     live: bool = option("Evaluate streams as they arrive, once per second.", False)
     for_s: float | None = option("With --live: end after this time.", None, name="--for", metavar="S", ge=0)
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
@@ -113,7 +113,7 @@ def monitor(
 
 
 def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits, times: MonitorLimits) -> None:
-    """Monitor logs, or streams until they end or `for_s` is over; append rows to monitor.csv and print each order."""
+    """Monitor logs, or streams for at most `for_s`; write a row per epoch to monitor.csv, and print each order."""
     import asyncio
     import time
 
@@ -186,7 +186,7 @@ async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[Stat
 
 
 class KeyChoices(Settings):
-    """Trains for which keys are made, and validity of the certificates."""
+    """Numbers of the trains for which keys are made, and validity of the certificates."""
 
     train: tuple[int, ...] = option("Number of a train, from 1; may be repeated.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
@@ -239,9 +239,9 @@ class DemoChoices(Settings):
     """Options of the demonstration of the ground side."""
 
     seed: int = option("Seed of the random losses and noise.", 1, metavar="N", ge=0)
-    speed: float = option("Simulated time per real time.", 6.0, metavar="X", ge=1, le=50)
+    speed: float = option("Ratio of simulated time to real time.", 6.0, metavar="X", ge=1, le=50)
     port: int = option("Port of the page; 0 for any free port.", 0, metavar="PORT", ge=0, le=65535)
-    hold: float = option("Time for which the page is kept after the end.", 0.0, metavar="S", ge=0, le=3600)
+    hold: float = option("Time for which the page stays available after the end.", 0.0, metavar="S", ge=0, le=3600)
     coverage: Path | None = option(
         "Picture of the links: response rates along the line, and round-trip times over time and chainage.",
         None,
@@ -370,7 +370,7 @@ def centre(
 class TrainChoices(Settings):
     """Options of the on-board end of the links."""
 
-    keys: Path = option("Folder with authority.pem and the train's own two files.", metavar="DIR")
+    keys: Path = option("Folder with authority.pem and the train's key and certificate.", metavar="DIR")
     centre: tuple[str, ...] = option(
         "Address of the centre on bearer A, then its address on bearer B.", metavar="HOST:PORT"
     )

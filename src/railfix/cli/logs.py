@@ -89,8 +89,8 @@ def which_track(
 
     Each track of the map within 60 m is a hypothesis; a further hypothesis is a track missing from the map (`none`).
     The code errors of a satellite are nearly constant at rest, so longer observation helps less than independent
-    samples would. With a base station carrier phases are used, too. A track is decided when the probability of all
-    other hypotheses together is below `--risk`; all probabilities are printed in any case.
+    samples would. With a base station, carrier phases are also used. A track is decided when the total probability of
+    all other hypotheses is below `--risk`; the probabilities are printed in any case.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 

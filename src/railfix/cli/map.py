@@ -127,8 +127,8 @@ def features(
 
     A train that measures the same change can determine its position (`railfix.motion.features`). Changes are computed
     over 15 m, about the distance between two bogies. With `--run` the features are the changes that several runs
-    measured consistently. Each feature then has the number of runs that measured it, the standard deviation of their
-    positions (as in P2's table 1), and the distance from the feature of the map.
+    measured consistently. Each feature then has the number of runs that measured it, the standard deviation of the
+    measured positions (as in P2's table 1), and the distance from the feature of the map.
 
     Example:
 

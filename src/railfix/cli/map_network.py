@@ -29,9 +29,9 @@ from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 
-#: Options for reading a track that only a run uses.
+#: Names of the options for reading a track that only `railfix run` has.
 RUN_ALONE = ("reference", "cache")
-#: Options for reading a map in a command without a run.
+#: Options for reading a map in a command that processes no run.
 MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]
 
 
@@ -204,7 +204,7 @@ def _route_tracks(
 ) -> tuple[list[int], list[str]]:
     """Return the indices of the tracks of the requested route in order, and notes.
 
-    Raise SettingsError where a network of several tracks is given without --tracks, --via or --positions.
+    Raise SettingsError if a network of several tracks is given without --tracks, --via or --positions.
     """
     if choice.tracks:
         return net.shortest_route([net.find_index(name.strip()) for name in choice.tracks.split(",")]), []

@@ -19,7 +19,7 @@ from railfix.core.tables import Column, count, listing, number, percent, plain_t
 from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
-#: A stretch is served if the protection level is within the alarm limit at this fraction of its epochs or more.
+#: Minimum fraction of the epochs of a served stretch at which the protection level is within the alarm limit.
 _SERVED: Final = 0.95
 _COLUMNS: Final[Sequence[Column]] = (
     ("chainage m", "from_m", count),
@@ -41,14 +41,12 @@ def service(
     *,
     out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Table to write, one row per stretch.")] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
-    page: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Page to write, with charts that zoom.")
-    ] = None,
-    stretch: Annotated[float, typer.Option(metavar="M", help="Length of a stretch.")] = 100.0,
-    limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit of the level.")] = 20.0,
+    page: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Page to write, with zoomable charts.")] = None,
+    stretch: Annotated[float, typer.Option(metavar="M", help="Length of the stretches of the line.")] = 100.0,
+    limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit for the protection level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Report the satellite service of a line by chainage: satellites used, reflections, fraction of ok epochs, levels.
+    """Report by chainage the number of satellites, reflections, the fraction of ok epochs, and the protection levels.
 
     The distance of the 3-D position from the line indicates reflections, because this position is computed without the
     map. Several runs at different times of the day are more representative than one run.
@@ -102,7 +100,9 @@ class SurveyFiles(Settings):
     nav: tuple[Path, ...] = option(
         "Navigation file of the logs; may be repeated, for several days.", (), metavar="NAV", panel=INPUTS
     )
-    picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
+    picture: Path | None = option(
+        "Picture of the map, the runs and the standard deviations (.png or .svg).", None, metavar="FILE"
+    )
     name: str | None = option("Name of the track; by default the name of the file.", None, metavar="NAME")
 
 
@@ -163,7 +163,7 @@ def survey(
     ]
     if weak.mean() >= 0.005:
         verdict.append(
-            f"{100 * weak.mean():.0f} % of its points have more than twice the median standard deviation: more runs "
+            f"{100 * weak.mean():.0f} % of the points have more than twice the median standard deviation; more runs "
             "there, or a dual-frequency receiver, would reduce it"
         )
     show_verdict(console, verdict)

@@ -49,7 +49,7 @@ def overwriting(asked: bool) -> Overwrite:
 
 
 def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, inputs: Iterable[Path | None]) -> list[Path]:
-    """Return the requested files; raise the errors of `check_output_file` where a file must not be written."""
+    """Return the paths that are not None; raise the errors of `check_output_file` if a file must not be written."""
     asked = [(path, kind) for path, kind in outputs if path is not None]
     read = [path for path in inputs if path is not None]
     for path, kind in asked:
@@ -67,7 +67,7 @@ class Without:
 
 @dataclass(frozen=True, kw_only=True)
 class _Option:
-    """Option of a command: names of the fields that lead to its value in the model, and parameter of the command."""
+    """Option of a command, with the path of field names to its value in the model and the parameter of the command."""
 
     path: tuple[str, ...]
     parameter: inspect.Parameter
@@ -157,7 +157,10 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
 
 
 def _gps_time(text: str) -> datetime:
-    """Return the GPS time of a text; a time with a time zone is converted. BadParameter: the text is not a time."""
+    """Return the GPS time of a text; a time with a time zone is converted.
+
+    Raise BadParameter if the text is not a time.
+    """
     try:
         time = datetime.fromisoformat(text.strip().replace("/", "-"))
     except ValueError:
@@ -187,7 +190,7 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any]) -> Model:
     """Return the model with the values of the command line.
 
-    Raise SettingsError, with the name of the option, where a value is out of range.
+    Raise SettingsError if a value is invalid; the message names the option, if a single option is wrong.
     """
     values: dict[str, Any] = {}
     for chosen in options:
@@ -220,8 +223,8 @@ class Choices(Settings):
     """Settings of a run from the command line; later options override earlier options, in the order of the fields."""
 
     preset: str | None = option(
-        "Base preset, which other settings override. default; strict: fewer positions of higher integrity; p1: the "
-        "limits of the paper in which the screens are described, for geodetic receivers at 10 Hz.",
+        "Base preset, which other settings override: default, strict (fewer positions of higher integrity), or p1 "
+        "(limits of the paper that describes the screens, for geodetic receivers at 10 Hz).",
         None,
         metavar="NAME",
     )
@@ -229,7 +232,7 @@ class Choices(Settings):
         "Settings file; settings that are not in the file have their defaults.", None, metavar="TOML"
     )
     setting: tuple[str, ...] = option(
-        "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
+        "Setting that overrides the settings file, such as --set elevation.mask_deg=15; may be repeated.",
         (),
         name="--set",
         metavar="KEY=VALUE",
@@ -264,7 +267,7 @@ class Choices(Settings):
 def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
     """Return the settings in force, and the settings that were given explicitly.
 
-    Options of the command line override the settings file. Raise SettingsError where a setting is unknown, out of range
+    Options of the command line override the settings file. Raise SettingsError if a setting is unknown, out of range
     or given twice.
     """
     values: dict[str, Any] = {}
@@ -297,7 +300,7 @@ def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
 
 
 def _screens(option: str, text: str) -> list[str]:
-    """Return the names of screens in a text with commas; SettingsError where a name is unknown or repeated."""
+    """Return the screen names in a comma-separated text; raise SettingsError if a name is unknown or repeated."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in SCREEN_NAMES:
@@ -308,7 +311,7 @@ def _screens(option: str, text: str) -> list[str]:
 
 
 def check_set_once(settings: tuple[str, ...]) -> None:
-    """Raise SettingsError where one setting is given twice."""
+    """Raise SettingsError if two of the texts KEY=VALUE have the same key."""
     keys = [text.partition("=")[0].strip() for text in settings]
     if repeated := [key for key in keys if keys.count(key) > 1]:
         raise SettingsError(f"--set {repeated[0]} is given {keys.count(repeated[0])} times; give it once")
@@ -317,7 +320,7 @@ def check_set_once(settings: tuple[str, ...]) -> None:
 def set_value(values: dict[str, Any], text: str) -> None:
     """Insert one KEY=VALUE into nested settings; the value is parsed as TOML, or else kept as text.
 
-    Raise SettingsError where the text has no key or no equals sign, or a group of the key is a single setting.
+    Raise SettingsError if the text has no key or no equals sign, or if a group in the key is already a single setting.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():

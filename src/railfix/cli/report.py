@@ -22,14 +22,14 @@ from railfix.report.plots.screens import draw_run_screens
 from railfix.run.inputs import ColumnNames
 from railfix.run.output import OutputFolder
 
-#: Columns of the satellites of an explained epoch.
+#: Columns of the table of satellites of an explained epoch.
 _SATELLITES: Final[Sequence[Column]] = (
     ("satellite", "satellite", str), ("signal", "signal", str), ("elevation", "elevation_deg", partial(digits, 1)),
     ("C/N0", "cn0_dbhz", partial(digits, 1)), ("sigma m", "sigma_m", partial(digits, 2)),
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: larger arrays are allocated in separate pages [bytes].
+#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and size above which an array is allocated in separate pages [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
@@ -76,7 +76,7 @@ def report(
     Example: `railfix report results --reference truth.csv --out report.html`
 
     Exit codes are listed in `railfix --help`; the code is 4 where the number of references does not match the runs, 5
-    where a reference is of another time.
+    where a reference covers another time.
     """
     in_runs = [
         path
@@ -154,7 +154,7 @@ def plot_screens(
 
     One PNG file is written per screen and antenna, such as `front_doppler.png`, `rear_antenna_pair.png` and
     `front_raim.png`; none is written for screens that were off or inactive. Rejected observations have another colour;
-    the title has their fraction.
+    the title states their fraction.
 
     Example: `railfix plot-screens results --out results/screens`
 

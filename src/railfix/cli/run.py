@@ -115,7 +115,7 @@ def live(
 
     if inputs.channels == "2" or any(text.startswith("cbor@") for text in inputs.send):
         with needs_extra():
-            import cbor2  # noqa: F401  a missing one is reported before anything is opened
+            import cbor2  # noqa: F401  so that a missing package is reported before a connection is opened
 
     settings, _ = resolve_settings(choices)
     values: dict[str, Any] = {}

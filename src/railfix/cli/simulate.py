@@ -39,7 +39,7 @@ class SimulateOptions(Settings):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Settings that override the scenario's; SettingsError where a key is given twice."""
+        """Settings that override the scenario's; raise SettingsError if a key is given twice."""
         check_set_once(self.setting)
         changes: dict[str, Any] = {}
         for text in self.setting:
@@ -134,7 +134,10 @@ def _simulate(
 
 
 def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
-    """Return the indices of the runs to simulate, from 0, in rising order; SettingsError where a run does not exist."""
+    """Return the indices of the runs to simulate, from 0, in rising order.
+
+    Raise SettingsError if a run does not exist.
+    """
     if not only:
         return list(range(len(recipe.names)))
     if not recipe.names[0]:

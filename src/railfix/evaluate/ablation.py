@@ -70,7 +70,7 @@ class Effect:
     ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
     #: Errors of the conventional positions from the same ranges; None without a reference.
     conventional: Score | None = None
-    #: Errors at epochs without observations, as in tunnels; None without such epochs or without a reference.
+    #: Errors at epochs without observations, as in tunnels; None if there are no such epochs or no reference.
     outage: Score | None = None
     #: 95th percentile of |error| / standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
@@ -145,7 +145,7 @@ def ablate_files(
 ) -> Ablation:
     """Process the logs with every choice of screens and sources, and write ``ablation.csv`` and ``ablation.json``.
 
-    The errors are those of a run; MismatchError also where ground truth and log do not overlap in time.
+    Raise the errors of `railfix.run.run_files`, and MismatchError if ground truth and log do not overlap in time.
     """
     began = clock.perf_counter()
     options = options or RunOptions()
@@ -252,7 +252,10 @@ def _columns(
 
 
 def _effect(choice: str, config: Config, antenna: str, parts: Sequence[Mapping[str, Floats]]) -> Effect:
-    """Return the effect of one choice on one antenna; MismatchError where reference and log do not overlap in time."""
+    """Return the effect of one choice on one antenna.
+
+    Raise MismatchError if reference and log do not overlap in time.
+    """
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     counts = columns["counted"] > 0
     if not counts.any():

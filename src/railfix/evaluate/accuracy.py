@@ -27,10 +27,10 @@ OVER_M: Final = (5, 10, 20, 50)
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Availability and error statistics of a run; statistics are NaN without a position."""
+    """Availability and error statistics of a run; statistics in metres are NaN if there is no position."""
 
     epochs: int  #: Number of epochs with observations inside the time of the reference.
-    positions: int  #: Number of these epochs with an error, so with a position.
+    positions: int  #: Number of these epochs with a position, so that the error is known.
     rate: float  #: positions / epochs.
     mean_m: float  #: Mean of the signed error.
     std_m: float  #: Population standard deviation of the signed error.
@@ -43,7 +43,7 @@ class Score:
 def score(error_m: Floats, observed: Masks) -> Score:
     """Compute the statistics of signed errors, shape (T,) and NaN without a position, at the `observed` epochs.
 
-    Raise ValueError where no epoch is observed.
+    Raise ValueError if no epoch is observed.
     """
     if not observed.any():
         raise ValueError("no epoch with observations lies inside the time of the reference")
@@ -143,7 +143,7 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
     if not drawn.any():
         return found
     values, rank = np.unique(size, return_inverse=True)
-    # a tolerance, so that 0.95 of 20 errors is the nineteenth
+    # with the tolerance, the 95th percentile of 20 errors is the nineteenth error
     wanted = (share * errors[drawn] - 1e-9)[:, None]
     low, high, most = 0, len(values) - 1, _NODES
     while True:
@@ -167,7 +167,7 @@ POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Data type of the name columns while grouping, as they have many rows and few distinct names.
+#: Data type of the columns of names while grouping; these columns have many rows and few distinct names.
 WORDS: Final = pl.Categorical()
 #: Name of a row in which all groups are combined.
 ALL: Final = "all"
@@ -187,7 +187,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "antenna": "`front` or `rear`; `all` where both are combined",
     "position": "`constrained`: positions on the map; `constrained_ok`: positions on the map that passed every check; "
     "`conventional`: 3-D single points at the nearest point of the line",
-    "epochs_of": "`own`: every epoch of this kind; `common`: epochs with a constrained and a conventional position",
+    "epochs_of": "`own`: all positions of this kind; `common`: only positions at epochs with both a constrained and a "
+    "conventional position",
     "epochs": "number of epochs with a reference, including epochs missing in the log",
     "observed": "number of epochs with a reference and observations",
     "positions": "number of epochs with a reference and a position",
@@ -202,7 +203,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "lowest_m": "error furthest toward the start of the line",
     "highest_m": "error furthest toward the end of the line",
     "max_at_time": "GPS time of the largest error magnitude",
-    "max_at_chainage_m": "chainage of the reference at that time",
+    "max_at_chainage_m": "chainage of the reference at the time of the largest error magnitude",
     **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this magnitude"),
     "wrong_places": "number of errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",
@@ -260,7 +261,7 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
 
 
 def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
-    """Return the number of edges that a value has reached."""
+    """Return the expression for the number of edges that are at most equal to a value."""
     return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
 
 
@@ -293,8 +294,9 @@ def has_position(position: str) -> pl.Expr:
 def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     """Return epochs with the columns of one kind of position from which the statistics are computed.
 
-    ``has`` is true for epochs with a position; ``error``, ``size`` (error magnitude) and ``normalised`` (error / sigma)
-    are null where the reference is not accurate enough; ``sigma`` and ``distance`` are null for conventional positions.
+    ``has`` is true for epochs with a position. ``error``, ``size`` (error magnitude) and ``normalised`` (error / sigma)
+    are null without a position, and where the reference is not accurate enough. ``sigma`` and ``distance`` are null for
+    conventional positions.
     """
     conventional = position == "conventional"
     column = "conventional_error_m" if conventional else "error_m"

@@ -43,7 +43,7 @@ from railfix.track.trajectory import Trajectory
 #: Name of the row with RTKLIB's single-point positions, and the program that computes them (Debian package rtklib).
 RTKLIB_SINGLE: Final = "RTKLIB single point"
 RTKLIB_PROGRAM: Final = "rnx2rtkp"
-#: Largest time difference between a position and its epoch, as a fraction of the interval of the log.
+#: Largest time difference between a position and its epoch, as a fraction of the median interval of the epochs.
 _NEAR: Final = 0.4
 _LONGEST_S: Final = 600.0  #: Time after which RTKLIB is ended [s].
 #: Bits of the constellations in RTKLIB's option pos1-navsys.
@@ -53,8 +53,9 @@ _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     """Return the row of a log for each epoch, shape (T,); -1 for epochs without a row.
 
-    `time` are the epochs, `found` the times of the log. A row belongs to its nearest epoch if the time difference is
-    less than 0.4 of the median interval of the epochs; of several rows for an epoch the nearest is returned.
+    `time` are the epochs, `found` the times of the log. A row belongs to the nearest epoch if the time difference is
+    less than 0.4 of the median interval of the epochs; of several rows for an epoch the nearest is returned. With fewer
+    than two epochs, no epoch has a row.
     """
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
@@ -103,7 +104,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
     """Write another program's positions as the folder of a run; `run` is the folder of railfix's run on the same log.
 
-    Raise MismatchError where the run has no epochs of the antenna, or the log has no position at these epochs.
+    Raise MismatchError if the run has no epochs of the antenna, or the log has no position at these epochs.
     """
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
@@ -130,14 +131,15 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
-    """Write RTKLIB's single-point positions of the front antenna to `out`, with elevation mask and constellations of
-    `config`; return None, or the reason why there are none.
+    """Write RTKLIB's single-point positions of the front antenna to `out`; return None, or the reason for a failure.
+
+    The elevation mask and the constellations are those of `config`.
     """
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
-        return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
+        return f"RTKLIB is left out: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
     if any(find_kind(path) == "receiver" for path in inputs.front):
-        return "no row of RTKLIB: the log is not RINEX (railfix convert writes it as RINEX)"
+        return "RTKLIB is left out: the log is not RINEX (railfix convert writes it as RINEX)"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         files = [*_unpack(inputs.front, folder, "obs"), *_unpack(inputs.nav, folder, "nav")]
@@ -150,9 +152,9 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
         try:
             subprocess.run(command, check=True, capture_output=True, timeout=_LONGEST_S)
         except (subprocess.SubprocessError, OSError) as error:
-            return f"no row of RTKLIB: {RTKLIB_PROGRAM} failed ({type(error).__name__})"
+            return f"RTKLIB is left out: {RTKLIB_PROGRAM} failed ({type(error).__name__})"
     if not out.is_file() or all(line.startswith("%") for line in out.read_text().splitlines()):
-        return f"no row of RTKLIB: {RTKLIB_PROGRAM} found no position"
+        return f"RTKLIB is left out: {RTKLIB_PROGRAM} found no position"
     return None
 
 
@@ -182,7 +184,7 @@ _OF_STANFORD: Final = (
 BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     "case": "name of the folder of the case",
     "held_out": "whether the case is reserved: no test reads it and no setting was chosen with it",
-    "position": "positions that are evaluated; those of other programs are moved to the nearest point of the line",
+    "position": "positions that are evaluated; positions of other programs are moved to the nearest point of the line",
     "antenna": "`front` or `rear`; `all` where both are combined",
     **{name: FIGURE_COLUMNS[name] for name in _OF_FIGURES},
     "time_to_first_s": "time from the first epoch with observations to the first position",
@@ -224,7 +226,7 @@ def run_benchmark(
     """Run the cases of a folder with one configuration, evaluate them and the other programs, and write the tables.
 
     Return the table `BENCHMARK_COLUMNS`, in which a failed case has its reason in ``error``, and notes. Raise
-    InputFileError where a file has a wrong hash, MismatchError where settings were derived from a held-out case.
+    InputFileError if a file has a wrong hash, MismatchError if settings were derived from a held-out case.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)

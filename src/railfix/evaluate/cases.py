@@ -28,7 +28,7 @@ class OtherPositions(Settings):
 
     file: Path
     antenna: Antenna = "front"
-    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of a CSV file, where not the usual names.
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of a CSV file, if not the usual names.
 
 
 class RecordedScenario(Settings):
@@ -55,7 +55,7 @@ class CaseFile(Settings):
     fetch: str = Field(min_length=1)  #: Source of the data, such as a URL.
     held_out: bool  #: Whether the case is reserved for the benchmark: no test and no choice of settings uses it.
     files: RunInputs  #: Inputs of `railfix run`, with the ground truth as `truth`.
-    sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its path as written there.
+    sha256: dict[str, str]  #: SHA-256 of every file, by the path in `files` or `positions`.
     positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
     scenario: RecordedScenario = RecordedScenario()
     options: RunOptions = RunOptions()
@@ -78,7 +78,7 @@ class Case:
     truth: Path  #: Ground truth.
 
     def check_hashes(self) -> None:
-        """Raise InputFileError where a file is missing or its SHA-256 differs, SettingsError where none is stated."""
+        """Raise InputFileError if a file is missing or has another SHA-256, SettingsError if no SHA-256 is stated."""
         for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
@@ -95,7 +95,7 @@ class Case:
 def read_case(folder: Path) -> Case:
     """Read the case in a folder.
 
-    Raise InputFileError where ``case.toml`` cannot be read, SettingsError where it is not a valid case.
+    Raise InputFileError if ``case.toml`` cannot be read, SettingsError if it is not a valid case.
     """
     path = folder / CASE_FILE
     content = load_settings(CaseFile, path, what="a case of a benchmark")
@@ -114,9 +114,9 @@ def read_case(folder: Path) -> Case:
 
 
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the ``case.toml`` of a folder from `content`, which has no hashes: the SHA-256 of each file is added.
+    """Write ``case.toml`` into a folder from `content` without hashes; the SHA-256 of each file is added.
 
-    Raise SettingsError where the content is not a valid case.
+    Raise SettingsError if the content is not a valid case.
     """
     case = validate(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
     hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
@@ -126,7 +126,7 @@ def write_case(folder: Path, content: Mapping[str, Any]) -> None:
 def read_cases(folder: Path) -> list[Case]:
     """Read the cases in the subfolders of a folder, sorted by name, or the case in the folder itself.
 
-    Raise InputFileError where there is no case, and the errors of `read_case`.
+    Raise InputFileError if there is no case, and the errors of `read_case`.
     """
     if not folder.is_dir():
         raise InputFileError(folder, "there is no such folder; expected a folder whose subfolders have a case.toml")
@@ -139,7 +139,7 @@ def read_cases(folder: Path) -> list[Case]:
 
 
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
-    """Raise MismatchError where a C/N0 curve or an error model was fitted on a held-out case.
+    """Raise MismatchError if a C/N0 curve or an error model was fitted on a held-out case.
 
     These files record the SHA-256 of their inputs, which are compared with the SHA-256 of the cases.
     """
@@ -148,4 +148,6 @@ def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
         text = read_text(path)
         for case in cases:
             if case.content.held_out and any(digest.lower() in text for digest in case.content.sha256.values()):
-                raise MismatchError(f"{path}: was made from the held-out case {case.name}; make it from others")
+                raise MismatchError(
+                    f"{path}: was made from the held-out case {case.name}; make it from other recordings"
+                )

@@ -165,7 +165,7 @@ def antenna_epochs(
 ) -> AntennaEpochs:
     """Return the epochs of one antenna of a run with their errors.
 
-    Raise MismatchError where run and reference do not overlap in time, and the errors of `compute_errors`.
+    Raise MismatchError if run and reference do not overlap in time, and the errors of `compute_errors`.
     """
     mine = run.positions.filter(pl.col("antenna") == antenna)
     time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())

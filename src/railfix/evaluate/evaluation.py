@@ -134,8 +134,8 @@ def evaluate_runs(
     `sections` is a CSV file of the environment by chainage (``from_m,to_m,environment``), used where a reference does
     not state it. `files` replaces the track and the vehicle that ``run.json`` names.
 
-    Raise InputFileError where a file is missing or its content is not as expected; MismatchError where a run and its
-    reference do not overlap in time, or the errors cannot be computed as requested; SettingsError where no run is
+    Raise InputFileError if a file is missing or its content is not as expected; raise MismatchError if a run and its
+    reference do not overlap in time, or the errors cannot be computed as requested; raise SettingsError if no run is
     given, or a run twice.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
@@ -196,7 +196,7 @@ def _evaluate(
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
     notes = []
     if item.conventional is not None:
-        notes.append(f"the conventional positions are those of {item.conventional}")
+        notes.append(f"the conventional positions are taken from {item.conventional}")
         inputs.append(fingerprint("conventional", read_run(item.conventional, columns=NO_MORE).positions_path))
     references, path = _references(item, folder, read, options)
     if path is not None:
@@ -257,7 +257,7 @@ def _references(
 ) -> tuple[Mapping[str, AntennaReference], Path | None]:
     """Return the references of a run by antenna, and their file, or None for arrays.
 
-    The content of a file is kept in `read`. Raise MismatchError where an antenna has no reference, or the file is a
+    The content of a file is kept in `read`. Raise MismatchError if an antenna has no reference, or the file is a
     table of the run itself.
     """
     if isinstance(item.reference, Mapping):
@@ -286,11 +286,11 @@ def reference_beside(run: RunFolder) -> Path:
     paths = [folder / name for name in BESIDE_THE_LOG if (folder / name).is_file()]
     if not paths:
         raise InputFileError(
-            folder, f"holds no reference ({', '.join(BESIDE_THE_LOG)}) beside the log of {run.path}; name the file"
+            folder, f"has no reference ({', '.join(BESIDE_THE_LOG)}) next to the log of {run.path}; name the file"
         )
     if len(paths) > 1:
         names = " and ".join(path.name for path in paths)
-        raise InputFileError(folder, f"holds {names} beside the log of {run.path}; name the one to use")
+        raise InputFileError(folder, f"has {names} next to the log of {run.path}; name the file to use")
     return paths[0]
 
 
@@ -313,7 +313,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return the runs with short distinct names and configurations; a name ends with a table other than `positions`."""
+    """Return the runs with configurations and short distinct names, with the table unless that is `positions`."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]

@@ -98,7 +98,7 @@ class RunFolder(RunRecord):
     def level_kind(self) -> str | None:
         """Kind of the protection levels; `UNKNOWN_KIND` where not recorded, None without levels.
 
-        Raise InputFileError where positions and ``run.json`` state several kinds.
+        Raise InputFileError if positions and ``run.json`` state several kinds.
         """
         level = "protection_level_m"
         if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
@@ -122,7 +122,7 @@ class RunFolder(RunRecord):
 
     @property
     def alarm_limit_m(self) -> float | None:
-        """Alarm limit of the run [m], None where not recorded; InputFileError where it is not a positive number."""
+        """Alarm limit of the run [m], None where not recorded; raise InputFileError if it is not a positive number."""
         limit = self.protection.get("alarm_limit_m")
         if limit is None:
             return None
@@ -163,10 +163,10 @@ def read_run(
 ) -> RunFolder:
     """Read the record and one table of positions from a folder that `railfix run` wrote.
 
-    `columns` selects columns in addition to the required columns; by default all are read. With `conventional`, the
-    folder of another run on the same log, its conventional positions replace those of the run.
+    `columns` selects columns in addition to the required columns; by default all columns are read. `conventional` is
+    the folder of another run on the same log, whose conventional positions replace the run's own.
 
-    Raise InputFileError where a file is missing or the table is not as expected, MismatchError where `conventional` is
+    Raise InputFileError if a file is missing or the table is not as expected, MismatchError if `conventional` is
     a run on another log.
     """
     record = read_record(path).record
@@ -201,7 +201,7 @@ def read_table(
 ) -> tuple[Path, pl.DataFrame]:
     """Read one table of a run; return its file and its rows in order of time.
 
-    Raise InputFileError where the file or a `needed` column is missing, where there are no rows, or where an antenna
+    Raise InputFileError if the file or a `needed` column is missing, where there are no rows, or where an antenna
     has several rows at the same time.
     """
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
@@ -264,7 +264,7 @@ WINDOWS_S: Final = (15.0, 60.0)
 
 
 def _rising(edges: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the edges unchanged; ValueError where they do not increase strictly."""
+    """Return the edges unchanged; raise ValueError if they do not increase strictly."""
     if any(high <= low for low, high in pairwise(edges)):
         raise ValueError("rising numbers expected")
     return edges
@@ -279,7 +279,7 @@ class EvaluationInputs(Settings):
 
     reference: tuple[str, ...] = option(
         "Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one file for all runs, or one for each run in "
-        "order; `auto`: truth.csv or reference.csv in the folder of each run's log.",
+        "order; `auto` uses truth.csv or reference.csv in the folder of each run's log.",
         metavar="FILE",
         panel=INPUTS,
     )
@@ -291,7 +291,7 @@ class EvaluationInputs(Settings):
         panel=INPUTS,
     )
     conventional: Path | None = option(
-        "Another run on the same log, whose conventional positions replace those of the run. A run with "
+        "Another run on the same log, whose conventional positions replace the run's own. A run with "
         "`--screens elevation` gives unscreened positions, as in P1.",
         None,
         metavar="RUN",
@@ -333,7 +333,7 @@ class EvaluationOptions(Settings):
         "Longest gap over which the reference is interpolated.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
     )
     standing_mps: Positive = option(
-        "Speed below which the train counts as at standstill.", 0.3, name="--standing", metavar="M/S"
+        "Speed below which the train counts as stationary.", 0.3, name="--standing", metavar="M/S"
     )
     section_m: Positive = option("Length of the sections of the line.", 1000.0, name="--section-length", metavar="M")
     speed_edges_kmh: RisingEdges = option(
@@ -373,7 +373,7 @@ class Sections:
 def read_sections(path: Path) -> Sections:
     """Read the sections of a line from a CSV file with the columns ``from_m,to_m,environment``.
 
-    Raise InputFileError where a column is missing, or a section has no length, no environment, or overlaps another.
+    Raise InputFileError if a column is missing, or a section has no length, no environment, or overlaps another.
     """
     table = read_named_columns(path)
     for name in ("from_m", "to_m", "environment"):
@@ -393,7 +393,7 @@ def read_sections(path: Path) -> Sections:
     over = np.flatnonzero(first[order][1:] < last[order][:-1] - 1e-6)
     if len(over):
         row = int(order[over[0] + 1])
-        raise table.error(row, f"the section from {first[row]:g} m begins inside another section; make them disjoint")
+        raise table.error(row, f"the section from {first[row]:g} m overlaps another section; correct the limits")
     return Sections(
         path=path, from_m=first[order], to_m=last[order], environment=tuple(table.cells["environment"].gather(order))
     )

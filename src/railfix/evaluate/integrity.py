@@ -1,4 +1,4 @@
-"""Protection levels against errors: Stanford counts, availability, continuity, and errors above their level.
+"""Comparison of protection levels with errors: Stanford counts, availability, continuity, and errors above the level.
 
 Epochs are counted with two choices of levels. `usable`: a level is used where the status of the position is ok (of the
 filter: tracking or coasting) and the level raises no alarm; any other position is given an infinite level. `all`: every
@@ -62,13 +62,13 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "available": "epochs with a level within AL, whether or not the error is known",
     "availability": "available / epochs",
     "availability_of_observed": "fraction of the `observed` epochs with a level within AL",
-    "beyond": "errors above their level; equal at every AL",
+    "beyond": "errors above a finite level; the number is the same at every AL",
     "beyond_share": "beyond / judged",
-    "beyond_blocks": "time blocks (60 s) with an error above its level",
+    "beyond_blocks": "time blocks (60 s) with an error above a finite level",
     "windows_15_s": "windows of 15 s that begin at an available epoch",
     "kept_15_s": "windows of 15 s in which every epoch is available",
     "continuity_15_s": "kept_15_s / windows_15_s; not by environment",
-    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as above, for windows of 60 s"),
+    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as for 15 s, for windows of 60 s"),
 }
 
 #: Columns of the list of epochs beyond their level, with their unit and meaning; KIND is the kind of the level.
@@ -110,7 +110,7 @@ def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Stri
     """Return the levels that are compared with errors, shape (T,) [m].
 
     A level is infinite where it is missing or, with `levels_of` "usable", not usable; it is NaN without a position
-    (mask `has`). `status` is that of the position, `verdict` that of the level.
+    (mask `has`). `status` is the status of the position, `verdict` the status of the level.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
@@ -153,7 +153,7 @@ def positions_diagram(
 ) -> Stanford:
     """Return the Stanford diagram of one antenna's epochs (`POSITION_COLUMNS`) without a reference.
 
-    Without errors it has only availability and continuity.
+    Without errors the diagram has only availability and continuity.
     """
     level = effective_levels(
         floats(positions, "protection_level_m"),

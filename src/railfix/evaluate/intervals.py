@@ -1,4 +1,4 @@
-"""Statistics of a run apart from its errors: intervals, outages, branches, protection levels, service by chainage."""
+"""Tables of a run: positioning intervals, outages, branch probabilities, protection levels, service by chainage."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ INTERVAL_COLUMNS: Final[dict[str, str]] = {
         "mean, percentile or maximum of the distance travelled between consecutive positions",
     ),
     "interval_max_from": "time of the position before the largest interval, GPS time",
-    "interval_max_chainage_m": "chainage of the reference at that time; empty in a gap of the reference",
+    "interval_max_chainage_m": "chainage of the reference before the largest interval; empty in a gap of the reference",
     **dict.fromkeys(
         ("gap_p50_s", "gap_p95_s", "gap_max_s"), "percentile or maximum of the time between consecutive positions"
     ),
@@ -111,14 +111,14 @@ LEAST_S: Final = 2.0
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "begin_gpst": "first epoch without a used satellite, GPS time",
     "duration_s": "time from the last epoch with a used satellite to the last epoch without one",
-    "travelled_m": "distance travelled in this time, by the reference",
+    "travelled_m": "distance travelled in the stretch, from the reference",
     "environment": "environment in the middle of the stretch, from the reference or from the sections",
     "carried_by": "measurements that the filter used within the stretch",
     "epochs": "number of epochs of the stretch",
-    "positions": "number of these epochs with a position",
+    "positions": "number of epochs of the stretch with a position",
     **dict.fromkeys(("outage_p50_m", "outage_p95_m", "outage_max_m"), "percentile or maximum of the error magnitude"),
     "end_error_m": "error of the last position with an accurate reference",
-    "end_sigma_m": "stated standard deviation of this position",
+    "end_sigma_m": "stated standard deviation of the last position with an accurate reference",
     "largest_normalised": "largest magnitude of error / along_sigma_m",
 }
 _OUTAGE_COLUMNS: Final = (
@@ -179,7 +179,7 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
     "right_share": "fraction of the positions within 50 m of the reference",
     "wrong_places": "number of positions farther than 50 m from the reference",
     "blocks": "number of time blocks with an epoch of the class",
-    "wrong_blocks": "number of these blocks with a position farther than 50 m from the reference",
+    "wrong_blocks": "number of time blocks with a position of the class farther than 50 m from the reference",
 }
 
 
@@ -221,7 +221,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
     "level_p50_m": "median of the finite levels",
     "level_p95_m": "95th percentile of the finite levels",
     "errors": "number of positions with a finite level and an error",
-    "over_level": "number of errors above their level",
+    "over_level": "number of errors above the finite level",
     "over_level_share": "over_level / errors",
 }
 
@@ -289,9 +289,10 @@ COLUMNS: Final = (
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
     """Compute the satellite service (`COLUMNS`) by stretches of the line, over all antennas and runs.
 
-    The chainage of an epoch is that of the filter, else of the single-epoch position, else interpolated by rows.
-    The level is infinite where the filter is neither tracking nor coasting, null for runs without the filter. Raise
-    MismatchError where the runs are on different maps, or no epoch has a position.
+    `stretch_m` is the length of a stretch, `limit_m` the alarm limit [m]. The chainage of an epoch is taken from the
+    filter, else from the single-epoch position, else interpolated between the neighbouring epochs with a position. The
+    level is infinite where the filter is neither tracking nor coasting, and null for runs without the filter. Raise
+    MismatchError if the runs are on different maps, or no epoch has a position.
     """
     runs = [read_run(folder) for folder in folders]
     first = runs[0].track_facts
@@ -332,7 +333,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
 
 
 def _epochs(folder: Path, run: RunFolder, number: int) -> pl.DataFrame:
-    """Return the epochs of one run with chainages, status and level of the filter, null without the filter."""
+    """Return the epochs of one run with chainages, and with status and level of the filter, null without the filter."""
     single = run.positions.select(
         "time_gpst", "antenna", "chainage_m", pl.col("status").cast(pl.String),
         *(pl.col(name).cast(pl.Float64) for name in _POSITION_COLUMNS),

@@ -31,12 +31,9 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 class Bracket:
     """Neighbouring instants of a reference of R instants for each of T times."""
 
-    left: (
-        Indices  #: Index of the instant before each time; of the instant itself where the times are equal; shape (T,).
-    )
-    right: (
-        Indices  #: Index of the instant after each time; of the instant itself where the times are equal; shape (T,).
-    )
+    #: Indices of the instants before and after each time, or twice of the instant equal to the time; shape (T,).
+    left: Indices
+    right: Indices
     share: Floats  #: Fraction of the interval from left to right that has passed, 0 to 1, shape (T,).
     inside: Masks  #: False before the first, after the last, and in gaps of the reference; shape (T,).
 
@@ -55,7 +52,7 @@ class Bracket:
 def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
     """Return the neighbouring instants of a reference for each time; the reference times must increase.
 
-    Times between two instants that are more than `largest_gap_s` apart are not inside. Raise ValueError where the
+    Times between two instants that are more than `largest_gap_s` apart are not inside. Raise ValueError if the
     reference has fewer than two instants.
     """
     if len(reference_time) < 2:
@@ -81,8 +78,8 @@ def interpolate_reference(
 ) -> Floats:
     """Interpolate reference positions, shape (R, 3), linearly to other times, shape (T, 3) [m].
 
-    The reference times must increase. NaN outside the reference and in its gaps, which are intervals longer than
-    `largest_gap_s`.
+    The reference times must increase. The result is NaN outside the reference and in its gaps, which are intervals
+    longer than `largest_gap_s`.
     """
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
@@ -96,7 +93,7 @@ def along_track_error(
     map passes the reference more than once (laps, two carriageways of a road), the pass nearest to the position is
     used, because the ranges of one epoch cannot distinguish the passes. Where the line returns near itself (a
     crossing), the straight distance between the two points is used if it is shorter. On a line that passes every point
-    once these rules have no effect, except that the error in a curve is that of the chord.
+    once these rules have no effect, except that the error in a curve is the length of the chord.
 
     Parameters
     ----------
@@ -144,13 +141,13 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Largest median difference, for a shared map, between the distance of run and reference in chainage and in ECEF [m].
+#: Run and reference share a map if their distances in chainage and in ECEF differ by at most this at the median [m].
 SAME_MAP_M: Final = 1.0
 #: Largest distance of a position from the trajectory of its run [m].
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: An error is to another pass of the line if the distance along the line exceeds twice the error by more than this [m].
+#: Excess of the distance along the line over twice the error, above which the error is to another pass of the line [m].
 _ANOTHER_PASS_M: Final = 50.0
 #: Tolerance for rounded chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
@@ -205,8 +202,8 @@ def compute_errors(
     """Compute the errors of one antenna.
 
     With the method "auto" the errors are differences of chainage if run and reference share a map (`SAME_MAP_M`),
-    otherwise distances along the trajectory. Raise MismatchError where the reference is of another region, the method
-    "chainage" is impossible, or the track is not that of the run; InputFileError where a file is missing.
+    otherwise distances along the trajectory. Raise MismatchError if the reference is of another region, the method
+    "chainage" is impossible, or the track is not that of the run; raise InputFileError if a file is missing.
     """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
@@ -216,7 +213,7 @@ def compute_errors(
             if files.track or files.vehicle is not None:
                 find_trajectory(
                     run, antenna, answers.chainage_m, answers.ecef_m, files
-                )  # the given file is the run's file
+                )  # raises an error if a given file does not fit the run
             return PlaceErrors(
                 method="chainage",
                 error_m=short_distance_m(answers.chainage_m - answers.reference_chainage_m, turn),
@@ -252,7 +249,7 @@ def compute_errors(
 
 
 def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
-    """Raise MismatchError where the reference is farther than `ANOTHER_PLACE_M` from the positions."""
+    """Raise MismatchError if the reference is farther than `ANOTHER_PLACE_M` from the positions."""
     apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
     apart = apart[np.isfinite(apart)]
     if len(apart) and (median := float(np.median(apart))) > ANOTHER_PLACE_M:
@@ -314,7 +311,7 @@ def find_trajectory(
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
     """Return the trajectory on which an antenna's positions lie, the files that were read, and notes.
 
-    Raise InputFileError where a file is missing, MismatchError where a position lies off the trajectory by more than
+    Raise InputFileError if a file is missing, MismatchError if a position lies off the trajectory by more than
     `SAME_TRAJECTORY_M`.
     """
     tracks = list(files.track) or run.tracks
@@ -352,7 +349,7 @@ def find_trajectory(
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
     """Return the sets of options (CRS, height datum, geoid) with which the track is to be read, in order of preference.
 
-    Given options are the only set. Without them the track is read first without options, then with those in
+    Given options are the only set. Otherwise the track is read first without options, then with the options in
     ``run.json``.
     """
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
@@ -364,7 +361,7 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
 
 
 def read_run_track(run: RunFolder) -> Track:
-    """Read the track that the run used; InputFileError where ``run.json`` has no track or it cannot be read."""
+    """Read the track that the run used; raise InputFileError if ``run.json`` names no track or a file is missing."""
     if not run.tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
     *first, last = _readings(run, TrackFiles())

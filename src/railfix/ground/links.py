@@ -356,7 +356,8 @@ class CentreLinks:
     async def start(self) -> None:
         """Open the server of each bearer.
 
-        InputFileError: the list of revoked certificates cannot be read. OSError: an address is not available.
+        Raise InputFileError if the list of revoked certificates cannot be read. Raise OSError if an address is not
+        available.
         """
         self._revoked = read_revoked(self._keys)
         watch = asyncio.create_task(self._watch())

@@ -389,8 +389,8 @@ async def connection(
 ) -> AsyncIterator[LinkProtocol]:
     """Connect from a bearer's local address; a first packet must arrive within `timeout_s`.
 
-    The connection must then be established within three times `timeout_s`. ConnectionError, TimeoutError: the other end
-    rejects the certificate, has another name, or does not answer.
+    The connection must then be established within three times `timeout_s`. Raise ConnectionError or TimeoutError if the
+    other end rejects the certificate, has another name, or does not answer.
     """
     loop = asyncio.get_running_loop()
     transport, protocol = await loop.create_datagram_endpoint(

@@ -51,7 +51,7 @@ _BELONGS_TO = "stations and trains"
 
 
 def parse_address(text: object) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``; ValueError: the text has another form."""
+    """Return host and port of ``HOST:PORT``; raise ValueError if the text has another form."""
     if isinstance(text, tuple):  # already parsed, as settings that are replaced are checked again
         text = ":".join(map(str, text))
     host, _, port = str(text).rpartition(":")
@@ -152,8 +152,8 @@ class CentreFile(Settings):
     def with_stations(self, folder: Path) -> Self:
         """Return the settings with the stations of the network, whose files are relative to a folder.
 
-        InputFileError, MismatchError: a map file cannot be read, or the network is not a single line with passing
-        loops. SettingsError: a train is outside all stations.
+        Raise InputFileError or MismatchError if a map file cannot be read, or the network is not a single line with
+        passing loops. Raise SettingsError if a train is outside all stations.
         """
         if not self.network:
             return self
@@ -202,8 +202,8 @@ async def run_centre(
     `page` is the host and port of the page, where port 0 takes a free port; at other than loopback addresses the page
     is served by TLS with the centre's certificate. `password` permits orders, and `people` has personal passwords by
     name. `orders` is a separate address for orders, by default the page's address. `announce` is called with each
-    address once trains can connect. InputFileError: the file, a key or the database cannot be read. SettingsError: a
-    setting is wrong, or an address is not available.
+    address once trains can connect. Raise InputFileError if the file, a key or the database cannot be read. Raise
+    SettingsError if a setting is wrong, or an address is not available.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
@@ -371,7 +371,10 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
 
 
 def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
-    """Store the stations and trains of the file at the first start; InputFileError: they differ at a later start."""
+    """Store the stations and trains of the file at the first start.
+
+    Raise InputFileError if they differ at a later start.
+    """
     under = {f"station {s.name}": s.model_dump_json() for s in settings.stations}
     under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
@@ -399,7 +402,8 @@ def _is_loopback(host: str) -> bool:
 def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
     """Return the password in the first line of a file, and personal passwords in the other lines, ``NAME PASSWORD``.
 
-    InputFileError: the file cannot be read, is empty, has another form, or can be read by others than its owner.
+    Raise InputFileError if the file cannot be read, is empty, has another form, or can be read by others than its
+    owner.
     """
     try:
         shared = path.stat().st_mode & 0o077

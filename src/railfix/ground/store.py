@@ -58,7 +58,7 @@ class DatabaseError(OutputError):
 class Store:
     """Stored state of a centre in a database (``sqlite:///centre.db``, ``postgresql+psycopg://...``).
 
-    InputFileError: the database cannot be opened.
+    Raise InputFileError if the database cannot be opened.
     """
 
     def __init__(self, url: str, *, most_lines: int = MOST_LINES) -> None:
@@ -80,7 +80,7 @@ class Store:
     def take_charge(self) -> None:
         """Make this process the only writer, so that an earlier centre cannot commit any more.
 
-        InputFileError: another process on this machine uses the SQLite database.
+        Raise InputFileError if another process on this machine uses the SQLite database.
         """
         database = self._engine.url.database
         if self._engine.dialect.name == "sqlite" and database:
@@ -119,8 +119,8 @@ class Store:
     def save(self, *records: TrainRecord, documents: Mapping[str, str | None] | None = None) -> None:
         """Commit train reports, named texts (None removes a text) and the lines of the log.
 
-        InputFileError: another centre has taken charge of the database since `take_charge`. DatabaseError: the database
-        fails; nothing is stored in this case, and the lines of the log are kept.
+        Raise InputFileError if another centre has taken charge of the database since `take_charge`. Raise DatabaseError
+        if the database fails; nothing is stored in this case, and the lines of the log are kept.
         """
         notes = self._notes[:]  # another thread may add lines meanwhile
         try:

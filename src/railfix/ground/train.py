@@ -45,7 +45,7 @@ async def run_train(
     The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as written
     by `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
     (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, `is_complete` of this file
-    replaces the messages' value. InputFileError: a key is missing.
+    replaces the messages' value. Raise InputFileError if a key is missing.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()

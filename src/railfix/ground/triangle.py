@@ -352,8 +352,8 @@ class Monitor:
         """Process fixes at a clock time, by default each at its tag; return the verdicts and the orders to be sent.
 
         Fixes that are late after the previous fixes stop the trains, in a log as in a stream. The cause of an order is
-        the cause of the stop after all these fixes, which may have become more exact. SettingsError: the sides of the
-        triangle are too short for the limits.
+        the cause of the stop after all these fixes, which may have become more exact. Raise SettingsError if the sides
+        of the triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9
@@ -411,7 +411,10 @@ def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> N
 
 
 def judge_fixes(fixes: StationFixes, limits: TriangleLimits) -> TriangleResult:
-    """Compare fixes with the triangle of their points; SettingsError: its sides are too short for the limits."""
+    """Compare fixes with the triangle of their points.
+
+    Raise SettingsError if its sides are too short for the limits.
+    """
     try:
         return compare_triangle(fixes.points_m, fixes.fixes_m, limits=limits, cn0_fallen=fixes.cn0_fallen)
     except ValueError as error:

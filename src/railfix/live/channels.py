@@ -95,7 +95,7 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 class TwoChannels(LiveEngine):
     """`LiveEngine` whose calls are repeated by a second engine in another process.
 
-    ChannelsDisagreeError: the second process does not start.
+    Raise ChannelsDisagreeError if the second process does not start.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
@@ -121,7 +121,7 @@ class TwoChannels(LiveEngine):
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """Return the outputs of `LiveEngine.poll`, if both channels agree.
 
-        ChannelsDisagreeError: a message or a stage differs, or the second channel has ended.
+        Raise ChannelsDisagreeError if a message or a stage differs, or the second channel has ended.
         """
         self._calls.append(("poll", (), {"now_ns": now_ns, "sent_ns": sent_ns}))
         try:

@@ -111,7 +111,7 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """Run a session until its sources end, or until SIGINT or SIGTERM.
 
     Returns the lines of the summary, and whether SIGTERM ended the session. SIGHUP is logged and counted, and has no
-    other effect. RailfixError: a source, sink, file or setting is invalid, or two channels disagree.
+    other effect. Raise RailfixError if a source, sink, file or setting is invalid, or two channels disagree.
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)

@@ -112,7 +112,7 @@ class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
     A file of `LiveSettings.log_bytes` is renamed to ``path.1``, an older file to ``path.2``, and so on. The status line
-    is shown only where the standard error output is a terminal. OutputError: the file cannot be opened.
+    is shown only where the standard error output is a terminal. Raise OutputError if the file cannot be opened.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:
@@ -242,7 +242,7 @@ def _counter(name: str, label: str, values: Mapping[str, int]) -> list[str]:
 
 
 async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
-    """Serve ``/metrics`` over HTTP; SettingsError: the address is not HOST:PORT, or is not available."""
+    """Serve ``/metrics`` over HTTP; raise SettingsError if the address is not HOST:PORT, or is not available."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         raise SettingsError(f"--metrics {address!r}: expected HOST:PORT, for example 127.0.0.1:9100")

@@ -204,7 +204,7 @@ class LiveEngine:
         self._saved = saved if saved.done_ns else None
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
-        """Add an antenna's epoch, received at `now_ns` by the clock of `poll`; ValueError: no such antenna."""
+        """Add an antenna's epoch, received at `now_ns` by the clock of `poll`; raise ValueError if no such antenna."""
         if antenna not in self._waiting:
             raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)

@@ -279,7 +279,7 @@ class _Session:
     def send(self, sink: Sink, output: LiveOutput) -> None:
         """Pass an output to a sink; a sink that cannot be written ends.
 
-        OutputError: no sink is left.
+        Raise OutputError if no sink is left.
         """
         try:
             sink.send(output)

@@ -80,7 +80,7 @@ class Outlet(Generic[Item]):
     def close(self) -> None:
         """Wait some seconds for the remaining items; items that still wait are counted as dropped.
 
-        OutputError: as for `send`.
+        Raise OutputError as `send` does.
         """
         with suppress(queue.Full):  # a thread that does not end is abandoned below
             self._items.put(None, timeout=_CLOSE_S)
@@ -161,7 +161,7 @@ class UdpTarget:
 class MqttTarget:
     """MQTT target, which publishes with QoS 0 (at most once); a broken connection is opened again.
 
-    OutputError: the broker cannot be reached, or refuses the connection.
+    Raise OutputError if the broker cannot be reached, or refuses the connection.
     """
 
     def __init__(self, form: Form, url: str, *, waiting: int) -> None:
@@ -192,7 +192,7 @@ class MqttTarget:
     def send(self, output: LiveOutput) -> None:
         """Publish one message; nothing is published if the form yields no bytes.
 
-        OutputError: no connection, or the broker is too slow.
+        Raise OutputError if there is no connection, or the broker is too slow.
         """
         data = whole_message(self.form, output)
         if not data:
@@ -253,7 +253,7 @@ class TcpServerSink:
         self._readers: set[asyncio.StreamWriter] = set()
 
     async def start(self, host: str, port: int) -> None:
-        """Open the server; OSError: the address is not available."""
+        """Open the server; raise OSError if the address is not available."""
         self.server = await asyncio.start_server(self._connect, host, port)
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -298,8 +298,8 @@ async def open_sink(
 ) -> Sink:
     """Open the sink of a text ``FORM@TARGET``; `full` as for `Outlet`.
 
-    SettingsError: the text has no valid form or target. OutputError: the target cannot be opened, or is an existing
-    file and `overwrite` is "refuse".
+    Raise SettingsError if the text has no valid form or target. Raise OutputError if the target cannot be opened, or is
+    an existing file and `overwrite` is "refuse".
     """
     settings = settings or LiveSettings()
     name, at, target = text.partition("@")

@@ -62,7 +62,7 @@ class Lost:
 
 
 def check_source(source: str) -> None:
-    """Raise SettingsError where a source has none of the supported forms."""
+    """Raise SettingsError if a source has none of the supported forms."""
     parts = urlsplit(source)
     if parts.scheme in ("tcp", *_NTRIP):
         try:
@@ -94,8 +94,8 @@ async def read_source(
     """Yield bytes of a source as they arrive, and events of its connection.
 
     A connection that breaks is opened again, if `LiveSettings.reconnect` is "on". `place` returns the present GGA
-    sentence, which is sent to a caster every `LiveSettings.gga_s` unless it is empty. InputFileError: the source cannot
-    be opened, or its connection breaks and is not opened again.
+    sentence, which is sent to a caster every `LiveSettings.gga_s` unless it is empty. Raise InputFileError if the
+    source cannot be opened, or its connection breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
@@ -167,7 +167,7 @@ async def _tcp(
 ) -> AsyncIterator[bytes]:
     """Yield empty bytes once connected, then received bytes, while `send` writes to the other end.
 
-    InputFileError: the connection cannot be opened, breaks, or is silent for `silence_s`.
+    Raise InputFileError if the connection cannot be opened, breaks, or is silent for `silence_s`.
     """
     parts = urlsplit(source)
     try:
@@ -257,7 +257,7 @@ class _Answer:
     def request(self, sentence: bytes) -> bytes:
         """Return the request for the mount point, with a GGA sentence if it is not empty.
 
-        SettingsError: the source does not give a valid request.
+        Raise SettingsError if the source does not give a valid request.
         """
         parts = urlsplit(self._source)
         head = [
@@ -276,7 +276,7 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content in further bytes of the answer; InputFileError if the mount point has no stream."""
+        """Return the content in further bytes of the answer; raise InputFileError if the mount point has no stream."""
         if self._first is not None:
             self._first += data
             if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:
@@ -347,7 +347,10 @@ class _Answer:
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """Return a TLS context with the certificates of the system and of a PEM file; SettingsError: it has none."""
+    """Return a TLS context with the certificates of the system and of a PEM file.
+
+    Raise SettingsError if it has none.
+    """
     context = ssl.create_default_context()
     if certificates is not None:
         try:
@@ -375,8 +378,8 @@ def _baud(source: str) -> int:
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
     """Yield empty bytes once the serial line is open, then received bytes.
 
-    A thread reads, so that no bytes are lost while the program is busy. InputFileError: the line cannot be opened,
-    breaks, or is silent for `silence_s`.
+    A thread reads, so that no bytes are lost while the program is busy. Raise InputFileError if the line cannot be
+    opened, breaks, or is silent for `silence_s`.
     """
     with needs_extra(f"source {source!r}: a serial line"):
         import serial

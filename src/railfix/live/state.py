@@ -79,7 +79,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     """Read a state file; its state is used only if its entries agree with those of this session (`belongs_to`).
 
-    OutputError: the file is not a state file, and would be overwritten by the session.
+    Raise OutputError if the file is not a state file, and would be overwritten by the session.
     """
     try:
         data = path.read_bytes()

@@ -35,7 +35,10 @@ class StateFormatError(ValueError):
 
 
 def encode(value: Any) -> bytes:
-    """Return a state as the bytes of a NumPy archive; StateFormatError: the state contains an unsupported value."""
+    """Return a state as the bytes of a NumPy archive.
+
+    Raise StateFormatError if the state contains an unsupported value.
+    """
     arrays: list[np.ndarray[Any, Any]] = []
     tree = json.dumps(_encode(value, arrays))
     file = io.BytesIO()
@@ -44,7 +47,7 @@ def encode(value: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """Return the state that `encode` has encoded; StateFormatError: the bytes are not a state."""
+    """Return the state that `encode` has encoded; raise StateFormatError if the bytes are not a state."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return _decode(json.loads(stored["tree"].tobytes()), stored)
@@ -138,7 +141,10 @@ def _name(kind: Any) -> str:
 
 
 def _find(name: str, fits: Any) -> Any:
-    """Return a class of this package by its name; StateFormatError: there is none for which `fits` returns True."""
+    """Return a class of this package by its name.
+
+    Raise StateFormatError if there is none for which `fits` returns True.
+    """
     module, _, own = str(name).partition(":")
     if module.split(".")[0] == "railfix" and own.isidentifier():
         found = getattr(import_module(module), own, None)

@@ -211,7 +211,7 @@ class SensorLines:
     def take(self, data: bytes) -> Sensed:
         """Return the samples completed by a chunk of bytes with arbitrary boundaries.
 
-        InputFileError: the first line is not the header of this sensor's table.
+        Raise InputFileError if the first line is not the header of this sensor's table.
         """
         *lines, self.rest = (self.rest + data).split(b"\n")
         self.rest = self.rest[-_LINE_BYTES:]

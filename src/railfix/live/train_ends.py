@@ -51,7 +51,7 @@ class TrainFrame:
     def of(cls, trajectories: Mapping[str, Trajectory], settings: LiveSettings) -> Self:
         """Return the frame of a train from its vehicle file and the settings, which take precedence.
 
-        SettingsError: the front end is farther ahead of the reference point than the train is long.
+        Raise SettingsError if the front end is farther ahead of the reference point than the train is long.
         """
         first = next(iter(trajectories.values()))
         on_vehicle = first.body_chainage_m is not None

@@ -46,7 +46,7 @@ def prepare_kernels() -> bool:
     """Compile the kernels that have no cached machine code; return whether any were compiled.
 
     Epochs of the demonstration are processed in one call and one by one, so that kernels are compiled for the arrays of
-    both cases. A message is written to a terminal. InputFileError: the files of the demonstration are missing.
+    both cases. A message is written to a terminal. Raise InputFileError if the files of the demonstration are missing.
     """
     if kernels.is_compiled():
         return False

@@ -126,7 +126,7 @@ def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[st
 
 
 def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
-    """Return percentiles of the absolute value of each quantity, and the number of errors above their level."""
+    """Return percentiles of the magnitude of each quantity, and the number of errors above the protection level."""
     found: dict[str, float | int | None] = {}
     for name in _QUANTITIES:
         size = np.abs(floats(table, name)) if name in table.columns else np.empty(0)
@@ -139,7 +139,7 @@ def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
 
 
 def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the worst epoch of each antenna in each piece of the line, by the first known of `_QUANTITIES`."""
+    """Return the worst epoch of each antenna in each piece of the line, by the first of `_QUANTITIES` with values."""
     quantity = next(name for name in _QUANTITIES if name in table.columns and table[name].is_not_null().any())
     placed = table.filter(pl.col("chainage_m").is_not_null(), pl.col(quantity).is_not_null())
     length = float(np.ptp(placed["chainage_m"].to_numpy())) if len(placed) else 0.0
@@ -211,8 +211,10 @@ def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[s
         word = {"error_m": "error", "protection_level_m": "level", "along_sigma_m": "standard deviation"}[quantity]
         wide, largest = (number(worst[f"{quantity}_{end}"], unit=" m") for end in ("p95", "max"))
         half = number(done[f"{quantity}_p95"].median(), unit=" m")  # type: ignore[arg-type]
-        lines.append(f"the {word} of 95 % of the epochs is within {half} in half of the runs")
-        lines.append(f"the worst run is {worst['run']}, with 95 % within {wide} and a largest value of {largest}")
+        lines.append(f"the 95th percentile of the {word} is at most {half} in half of the runs")
+        lines.append(
+            f"the worst run is {worst['run']}, with a 95th percentile of {wide} and a largest value of {largest}"
+        )
     if quantity == "error_m":
         over = int(done["over_level"].sum())
         lines.append(

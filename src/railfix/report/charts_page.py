@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from railfix.track.network_read import NetworkQuality
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-#: Unsigned 16-bit number that encodes an unknown value.
+#: Unsigned 16-bit number that encodes an unknown C/N0.
 _UNKNOWN: Final = 65535
 _OF_CHART: Final = (
     "title", "x_label", "y_label", "x_scale", "y_scale", "y_linear", "x_range", "y_range", "equal",
@@ -44,7 +44,10 @@ _OF_CHART: Final = (
 
 
 def script_json(value: Any) -> str:
-    """Return plain values as JSON text that is safe in a script element; ValueError if they contain NaN or infinity."""
+    """Return plain values as JSON text that is safe in an HTML script element.
+
+    Raise ValueError if the values contain NaN or infinity.
+    """
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for mark, code in (("<", "\\u003c"), (">", "\\u003e"), ("\u2028", "\\u2028"), ("\u2029", "\\u2029")):
         text = text.replace(mark, code)
@@ -61,7 +64,7 @@ def pack_array(values: NDArray[Any], kind: str = "f") -> str:
 
 
 def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
-    """Return a chart as plain values; `epochs_from` is the origin of ``epoch_s`` of its points."""
+    """Return a chart as plain values for JSON; `epochs_from` is the origin of the times `Points.epoch_s`."""
     values: dict[str, Any] = {name: getattr(chart, name) for name in _OF_CHART}
     values |= {"axis": chart.common_axis, "layers": [_layer(layer) for layer in chart.layers]}
     if chart.start is not None:
@@ -89,7 +92,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 
 def _cells(layer: Cells) -> dict[str, Any]:
-    """Return the cells that are not empty as plain values; all cells must have the same size."""
+    """Return the edges of the grid, and index and count of each occupied cell; all cells must have the same size."""
     column, row = np.nonzero(layer.counts)
     return {
         "x0": float(layer.x_edges[0]),
@@ -135,7 +138,7 @@ _IGNORED: Final = ("Point", "MultiPoint")
 def read_background(path: Path) -> tuple[Floats, ...]:
     """Read the lines and outlines of a GeoJSON file, each as longitude and latitude of shape (P, 2) [deg].
 
-    InputFileError: the file is not GeoJSON, or has neither lines nor polygons.
+    Raise InputFileError if the file is not GeoJSON, or has neither lines nor polygons.
     """
     node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
@@ -234,7 +237,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class PagePart:
-    """Figures under a heading; `absent` has the reasons for missing figures."""
+    """Figures under a heading; `absent` has one sentence for each missing figure, with the reason."""
 
     title: str
     figures: Sequence[Figure]
@@ -286,7 +289,7 @@ def _resource(name: str) -> Markup:
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Charts under one heading; `absent` has reasons for missing charts, `start` is the origin of `Points.epoch_s`."""
+    """Charts under a heading; `absent` has reasons for missing charts, `start` is the origin of `Points.epoch_s`."""
 
     title: str
     charts: tuple[Chart | SkyEpochs, ...]
@@ -306,9 +309,9 @@ def figure(
 ) -> Figure:
     """Return the figure of a chart with its values for the script of the page.
 
-    `numbers` gives the number of the figure, `group` the origin of the epochs of its points. Clicks on points with
-    epochs are shown in the sky plot `sky`. `anchor` is a prefix for the name of a shared x axis; `linked` is as for
-    `Figure`.
+    `numbers` yields the number of the figure. `group` has the origin of the times of the points; a click on a point
+    with a time shows the satellites in the sky plot `sky`. `anchor` is a prefix for the name of a shared x axis.
+    `linked` is as for `Figure`.
     """
     values: dict[str, Any]
     if isinstance(chart, SkyEpochs):
@@ -335,7 +338,7 @@ def write_network_page(
 ) -> None:
     """Write the HTML page of a network with the findings of its check, and the matched positions of a run if given.
 
-    The positions are in the frame of the network. OutputError: the file cannot be written.
+    The positions must be in the reference frame of the network. Raise OutputError if the file cannot be written.
     """
     title = f"{quality.tracks:,} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches:,} switches"
     write_whole(

@@ -95,8 +95,9 @@ class Explanation:
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
     """Explain the epoch of one antenna that is nearest to the GPS time `at`, ``hh:mm:ss`` or with a date before it.
 
-    The default antenna is the first. A time without a date may be on any day of the run. InputFileError: the run wrote
-    no observations. SettingsError: the antenna or the time is invalid. MismatchError: no epoch is within a minute.
+    The default antenna is the first. A time without a date may be on any day of the run. Raise InputFileError if the
+    run wrote no observations. Raise SettingsError if the antenna or the time is invalid. Raise MismatchError if no
+    epoch is within a minute.
     """
     folder = read_run(run)
     if not (run / "observations.parquet").is_file():
@@ -135,7 +136,7 @@ def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanat
 
 
 def _nearest(times: Any, at: str) -> int:
-    """Return the index of the time nearest to the requested time; raises the errors of `explain_epoch`."""
+    """Return the index of the time nearest to the requested time; raise the errors of `explain_epoch`."""
     text = at.strip()
     days = np.unique(times.astype("datetime64[D]")) if ":" in text and "-" not in text else [None]
     try:
@@ -170,9 +171,9 @@ def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
 def _without_each(
     satellites: pl.DataFrame, single: Mapping[str, Any], axes: Floats, map_sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Return shift and sigma of the position along the line [m] if a satellite is omitted, for each row.
+    """Return the shift and the sigma of the position along the line [m] if a satellite is omitted, shape (rows,) each.
 
-    The values are NaN for unused satellites, and where the others do not determine the position.
+    The values are NaN for unused satellites, and where the other satellites do not determine the position.
     """
     used = (satellites["reason_text"] == "used").to_numpy() & satellites["residual_m"].is_not_null().to_numpy()
     elevation, azimuth = (np.radians(satellites[name].to_numpy()) for name in ("elevation_deg", "azimuth_deg"))
@@ -194,7 +195,7 @@ def _without_each(
 def _solve(
     design: Floats, sigma_m: Floats, residual_m: Floats, clocks: Strings, map_sigma_m: tuple[float, float]
 ) -> tuple[float, float] | None:
-    """Return the least-squares step along the line and its sigma [m]; None if the ranges do not determine it."""
+    """Return the least-squares step along the line and its sigma [m]; None if the ranges do not determine the step."""
     groups = np.unique(clocks)
     if len(residual_m) < len(groups) + 1:
         return None
@@ -224,7 +225,7 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
         own, whole = single["own_sigma_m"], single["along_sigma_m"]
         lines.append(
             f"sigma: {own:.2f} m from the codes of this epoch alone, with an observed noise of "
-            f"{single['noise_scale']:.2f} times the assumed one; "
+            f"{single['noise_scale']:.2f} times the assumed noise; "
             f"{whole:.2f} m with satellite, atmospheric and map errors and other possible positions"
         )
     if "protection_level_m" in single:
@@ -279,7 +280,10 @@ def _level_of_single(single: Mapping[str, Any]) -> str:
 
 
 def write_explanation(explanation: Explanation, path: Path) -> Path:
-    """Write an explanation as one HTML page with a sky plot; return its path. OutputError: it cannot be written."""
+    """Write an explanation as one HTML page with a sky plot; return its path.
+
+    Raise OutputError if the page cannot be written.
+    """
     sky = []
     for row in explanation.satellites.drop_nulls(("elevation_deg", "azimuth_deg")).iter_rows(named=True):
         radius, azimuth = max(90.0 - row["elevation_deg"], 0.0), np.radians(row["azimuth_deg"])

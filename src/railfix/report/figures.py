@@ -1,4 +1,4 @@
-"""Charts and tables of protection levels of a run in the order of the page, and reasons for missing charts."""
+"""Charts of a run in the order of the page, reasons for missing charts, and tables of the protection levels."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Return a text of priors with the constellations to which each value applies."""
+    """Return the distinct values of priors by constellation as text, with the constellations of each value."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}
@@ -289,7 +289,7 @@ def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
 
 
 def _tunnels(errors: pl.DataFrame | None) -> list[tuple[float, float]]:
-    """Return the first and last chainage [m] of each stretch in which the environment of the reference is a tunnel."""
+    """Return the first and last chainage [m] of each tunnel, a stretch of two or more epochs in this environment."""
     if errors is None:
         return []
     known = errors.filter(pl.col("chainage_m").is_not_null()).sort("chainage_m")

@@ -101,7 +101,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
 
 
 def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
-    """Return the key figures of the verdict on an antenna by name; empty if the record lacks the antenna."""
+    """Return an antenna's key figures in the verdict on the run, by name; empty if the record lacks the antenna."""
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None:
         return {}
@@ -112,7 +112,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
-    """Return a remark on errors above the protection level at usable positions, or, without levels, on error/sigma."""
+    """Return the number of errors above usable protection levels, or the normalised error if there are no levels."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         f"{'of the filter: ' if kind == 'train' else ''}{len(found):,}"

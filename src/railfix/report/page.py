@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Kind of position and table of the evaluation whose errors are in the table of all runs, by name in the heading.
+#: Kind of position and table of positions whose errors are shown in the table of all runs, by name in its header.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -204,7 +204,7 @@ def write_report(
     """Write the report on runs as an HTML page and return its path; a failed write leaves an existing file unchanged.
 
     `references`, `conventional` and the raised errors are as for `railfix.report.read_runs`. `background` is a GeoJSON
-    file with lines that are drawn below the plan. OutputError: the page cannot be written.
+    file with lines that are drawn below the plan. Raise OutputError if the page cannot be written.
     """
     folders, others, unscreened = (
         [Path(name) for name in path_names(names)] if names else [] for names in (runs, references, conventional)
@@ -224,7 +224,7 @@ def write_page(
 ) -> Path:
     """Write the report on runs that have been read (`read_runs`) as an HTML page, and return its path.
 
-    `background` is as for `report_page`. OutputError: the page cannot be written.
+    `background` is as for `report_page`. Raise OutputError if the page cannot be written.
     """
     write_whole(out, report_page(runs, evaluation, background=background, title=title), what="report")
     return out

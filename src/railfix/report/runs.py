@@ -112,11 +112,12 @@ def read_runs(
 
     `references` has no reference, one for all runs, or one for each run in order. `conventional` is empty, or has for
     each run in order another run on the same log, whose conventional positions are shown; a run with only the elevation
-    and C/N0 screens gives the unscreened positions of P1. The table of epochs of the evaluation is empty, because the
-    runs contain the columns of the report.
+    and C/N0 screens gives the unscreened positions of P1. The evaluation is returned with an empty table of epochs,
+    because the returned runs have the columns of the report.
 
-    InputFileError, MismatchError: a file is missing or malformed, or a reference does not match the run.
-    SettingsError: there is no run, the number of references or conventional runs is wrong, or a run is given twice.
+    Raise InputFileError or MismatchError if a file is missing or malformed, or a reference does not match the run.
+    Raise SettingsError if there is no run, the number of references or conventional runs is wrong, or a run is given
+    twice.
     """
     if not paths:
         raise SettingsError("no run to report on; name the folders that railfix run wrote")

@@ -97,8 +97,9 @@ class CampaignProgress(Protocol):
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     """Read a campaign file, and find the files of each run, whose results folders are below `out`.
 
-    InputFileError: no log matches the pattern `front`. SettingsError: a setting is misspelt, `front` has no field, a
-    pattern is ambiguous or has a field that `front` lacks, or a run has several files where one is expected.
+    Raise InputFileError if no log matches the pattern `front`. Raise SettingsError if a setting is misspelt, `front`
+    has no field, a pattern is ambiguous or has a field that `front` lacks, or a run has several files where one is
+    expected.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
     folder, out = path.absolute().parent, out.absolute()
@@ -177,7 +178,7 @@ def position_runs(
 ) -> pl.DataFrame:
     """Position runs whose results folders are below ``out / "runs"``; parameters and result as for `run_campaign`.
 
-    OutputError: `out` is not empty and not the folder of a campaign.
+    Raise OutputError if `out` is not empty and not the folder of a campaign.
     """
     if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
         raise OutputError(f"{out}: the folder is not empty and not the folder of a campaign; give another folder")

@@ -46,8 +46,8 @@ def convert_logs(
     """Write the logs of one receiver as RINEX files, and return lines on the written files and the skipped items.
 
     `out` receives the observations, `nav_out` the ephemerides; None omits the file. `rinex` selects version 3.04 or
-    4.02. InputFileError: a log cannot be read, or contains no data for a file. OutputError: both files are the same, or
-    a file exists already, is an input, or cannot be written.
+    4.02. Raise InputFileError if a log cannot be read, or contains no data for a file. Raise OutputError if both files
+    are the same, or a file exists already, is an input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
         raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")
@@ -120,7 +120,7 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
     Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix), ``/ANTENNA/row`` (all columns) and, for the
     filter only, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time stamps are UTC. Absent numbers are NaN, and
     absent texts are empty. `description`, on the kind of positions and the frame of the coordinates, is added to the
-    file. NoPositionError: no row has coordinates. SettingsError: mcap-ros2-support is not installed.
+    file. Raise NoPositionError if no row has coordinates. Raise SettingsError if mcap-ros2-support is not installed.
     """
     with needs_extra():
         from mcap_ros2.writer import Writer

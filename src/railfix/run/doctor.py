@@ -82,8 +82,8 @@ class Diagnosis:
 def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
     """Examine each file, and compare the files with each other.
 
-    `date` is a time within half a week of logs that do not state the week. InputFileError: a file is missing, a folder,
-    or given twice.
+    `date` is a time within half a week of logs that do not state the week. Raise InputFileError if a file is missing, a
+    folder, or given twice.
     """
     for path in paths:
         if path.is_dir():

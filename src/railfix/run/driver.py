@@ -85,7 +85,7 @@ def run_files(
     """Position the logs of one run along its line and write the results into the folder `out`.
 
     `config` has all settings; `asked` has the explicitly given settings, which are recorded in ``run.json``.
-    RailfixError: see `railfix.core.errors`; `out` is then left as it was. Notes are issued as `RailfixWarning`.
+    Raise RailfixError if see `railfix.core.errors`; `out` is then left as it was. Notes are issued as `RailfixWarning`.
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
@@ -148,7 +148,7 @@ def run_files(
 
 
 def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
-    """Return the verdict on a run; NoPositionError if it has no usable position."""
+    """Return the verdict on a run; raise NoPositionError if it has no usable position."""
     verdict = judge_run(record)
     if not any(antenna.is_usable for antenna in verdict.antennas):
         of_map = [note for note in notes if ": the map " in note]

@@ -198,7 +198,7 @@ class RunInputs(InputFiles):
     def _with_own_sbas(self, config: Config) -> Config:
         """Return settings in which ``sbas = "stream"`` is replaced by the receiver logs, which contain SBAS messages.
 
-        SettingsError: all logs are RINEX files.
+        Raise SettingsError if all logs are RINEX files.
         """
         if config.sbas != "stream":
             return config
@@ -388,7 +388,7 @@ class ColumnNames(Settings):
 
     @property
     def names(self) -> dict[str, str]:
-        """Name of the column in the file by quantity; SettingsError if a text is not NAME=COLUMN."""
+        """Name of the column in the file by quantity; raise SettingsError if a text is not NAME=COLUMN."""
         return column_names(self.column)
 
 

@@ -58,7 +58,7 @@ def locate_files(
 ) -> LocateSummary:
     """Compute the 3-D positions of a log and write them as an RTKLIB solution file with quality 5 (single).
 
-    NoPositionError: no epoch has a position. OutputError: the file cannot be written.
+    Raise NoPositionError if no epoch has a position. Raise OutputError if the file cannot be written.
     """
     inputs.check_files()
     reading = reading or LogReading()
@@ -223,8 +223,8 @@ def survey_files(
 ) -> Surveyed:
     """Survey a line from files of positions and logs of observations.
 
-    InputFileError: a file is missing, given twice, or of another kind, or a log lacks navigation files. MismatchError:
-    the runs lie far apart, or have no line in common.
+    Raise InputFileError if a file is missing, given twice, or of another kind, or a log lacks navigation files. Raise
+    MismatchError if the runs lie far apart, or have no line in common.
     """
     for path in (*paths, *nav):
         if not path.is_file():
@@ -300,8 +300,8 @@ _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
 def read_measured(folder: Path) -> pl.DataFrame:
     """Read the properties of the line that a run has measured, in order of chainage.
 
-    If the run has two antennas, the rows of the first are returned. InputFileError: the folder has no results of the
-    filter, or the run had no tachometer and inertial unit.
+    If the run has two antennas, the rows of the first are returned. Raise InputFileError if the folder has no results
+    of the filter, or the run had no tachometer and inertial unit.
     """
     path = folder / "train.parquet"
     with reading_table(path, "has no measured line ({}); give a folder of railfix run"):

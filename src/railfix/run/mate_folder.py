@@ -18,7 +18,7 @@ _INPUTS: Final = {
 def find_inputs(folder: Path) -> dict[str, Any]:
     """Return the paths of the tables in a folder, by the field of `railfix.run.inputs.RunInputs` that each provides.
 
-    InputFileError: there is no such folder, or it has no table S_GNSS_SAT, or none of the track.
+    Raise InputFileError if there is no such folder, or it has no table S_GNSS_SAT, or none of the track.
     """
     if not folder.is_dir():
         raise InputFileError(folder, "--mate expects a folder with tables of EGNSS MATE")

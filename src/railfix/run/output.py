@@ -53,7 +53,7 @@ class Staging:
 
 
 def make_staging(folder: Path) -> Staging:
-    """Create a staging folder inside a folder, locked by this process; OSError if `folder` cannot be written."""
+    """Create a staging folder inside a folder, locked by this process; raise OSError if `folder` cannot be written."""
     while True:
         name = folder / f"{_PREFIX}{secrets.token_hex(4)}"
         path, staging = name.with_name(name.name + _LOCK), None
@@ -78,7 +78,7 @@ def make_staging(folder: Path) -> Staging:
 def clean_up(folder: Path) -> None:
     """Remove the staging folders of killed processes; move the files of a complete staging folder to `folder` first.
 
-    OutputError: another process is writing to the folder.
+    Raise OutputError if another process is writing to the folder.
     """
     for path in [p for p in folder.iterdir() if p.name.startswith(_PREFIX)]:
         if path.name.endswith(_LOCK):
@@ -88,7 +88,7 @@ def clean_up(folder: Path) -> None:
 
 
 def _release(lock: Path) -> None:
-    """Remove the lock file of a killed process and its staging folder; OutputError if the process is running."""
+    """Remove the lock file of a killed process and its staging folder; raise OutputError if the process is running."""
     try:
         file = lock.open("r+", encoding="ascii", errors="replace")
     except FileNotFoundError:
@@ -230,8 +230,8 @@ class OutputFolder:
     it was created. Remains of a killed process are removed by the next `OutputFolder` at the same path. With "replace",
     existing files of the same names are replaced by `commit`; `inputs` are never overwritten.
 
-    OutputError: the folder cannot be created or written, is not empty (with "refuse"), is being written by another
-    process, or a file would overwrite an input.
+    Raise OutputError if the folder cannot be created or written, is not empty (with "refuse"), is being written by
+    another process, or a file would overwrite an input.
     """
 
     def __init__(self, path: Path, *, overwrite: Overwrite = "refuse", inputs: Sequence[Path] = ()) -> None:
@@ -295,7 +295,7 @@ class OutputFolder:
     def stage(self, name: str) -> Path:
         """Return the temporary path at which a result is to be written; `commit` moves it to the output folder.
 
-        OutputError: the file would overwrite an input, or a folder of that name exists.
+        Raise OutputError if the file would overwrite an input, or a folder of that name exists.
         """
         target = self.path / name
         check_not_input(target, self._inputs)

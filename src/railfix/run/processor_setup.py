@@ -57,9 +57,9 @@ def make_processor(
 
     `trajectories` has the trajectory of each antenna. `track` is required for positioning by features of the line.
     `units` are the surveyed ground units of two-way ranges, `balises` the positions of the balises. `base_ecef_m` is
-    the position of a base station [m]; with "stream" it is taken from the headers of the station's observations.
-    InputFileError: a file named by the settings is missing or malformed. SettingsError: SBAS is combined with precise
-    orbits, or there is no SBAS message of the requested GEO satellite.
+    the position of a base station [m]; with "stream" it is taken from the headers of the station's observations. Raise
+    InputFileError if a file named by the settings is missing or malformed. Raise SettingsError if SBAS is combined with
+    precise orbits, or there is no SBAS message of the requested GEO satellite.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
@@ -90,7 +90,7 @@ _SAME_INSTANT = np.timedelta64(50, "ms")
 def parse_position(text: str, option: str) -> Floats:
     """Parse a position LAT,LON,HEIGHT [deg, deg, m] and return it in ECEF, shape (3,) [m].
 
-    SettingsError: the text is not such a position; `option` names the option in the message.
+    Raise SettingsError if the text is not such a position; `option` names the option in the message.
     """
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
@@ -104,7 +104,7 @@ def parse_position(text: str, option: str) -> Floats:
 class BaseLog:
     """Log of a base station, whose position is `place` (LAT,LON,HEIGHT) or the position in the header of the log.
 
-    InputFileError: the log has no epoch, or neither `place` nor the header gives the position.
+    Raise InputFileError if the log has no epoch, or neither `place` nor the header gives the position.
     """
 
     def __init__(self, log: Log, place: str | None) -> None:

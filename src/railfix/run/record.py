@@ -186,7 +186,7 @@ class RunRecord:
     record: Mapping[str, Any]  #: Content of ``run.json``.
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return a table of the record; InputFileError if it is missing or not a table."""
+        """Return a table of the record; raise InputFileError if it is missing or not a table."""
         table = self.record.get(name)
         if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
@@ -196,7 +196,7 @@ class RunRecord:
     def config(self) -> Config:
         """Settings that were used, with the present paths of their files, without the settings `WITHOUT_EFFECT`.
 
-        InputFileError: the record lacks the settings, or they are not settings of this version.
+        Raise InputFileError if the record lacks the settings, or they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
         for group, name in WITHOUT_EFFECT:
@@ -209,7 +209,7 @@ class RunRecord:
 
     @cached_property
     def inputs(self) -> RunInputs:
-        """Input files with their present paths; InputFileError if they do not fit this version."""
+        """Input files with their present paths; raise InputFileError if they do not fit this version."""
         kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
         several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
         values = {
@@ -219,7 +219,7 @@ class RunRecord:
 
     @cached_property
     def options(self) -> RunOptions:
-        """Options that were used; InputFileError if they do not fit this version."""
+        """Options that were used; raise InputFileError if they do not fit this version."""
         return self._this_version(lambda: validate(RunOptions, self.part("options"), source="options"))
 
     def _this_version(self, read: Callable[[], Model]) -> Model:
@@ -245,7 +245,7 @@ class RunRecord:
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:
-        """Recorded input files with kind, path and SHA-256; InputFileError if the record has no such list."""
+        """Recorded input files with kind, path and SHA-256; raise InputFileError if the record has no such list."""
         entries = self.record.get("inputs", [])
         complete = isinstance(entries, list) and all(
             isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
@@ -258,7 +258,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run from a results folder; InputFileError if ``run.json`` is missing or malformed."""
+    """Read the record of a run from a results folder; raise InputFileError if ``run.json`` is missing or malformed."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; give that folder")
@@ -269,7 +269,10 @@ def read_record(folder: Path) -> RunRecord:
 
 
 def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFrame:
-    """Read all or the selected columns of a table that a run wrote; InputFileError if it is not a Parquet file."""
+    """Read all or the selected columns of a table that a run wrote.
+
+    Raise InputFileError if it is not a Parquet file.
+    """
     with reading_table(path):
         if columns is None:
             return pl.read_parquet(path)

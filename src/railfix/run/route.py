@@ -332,7 +332,10 @@ class LogPositions:
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions with quality 5 (single), or 4 (DGPS) with a base station; NoPositionError if there is none."""
+        """Positions with quality 5 (single), or 4 (DGPS) with a base station.
+
+        Raise NoPositionError if there is none.
+        """
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         base, state, located = self.open_base(), BaseState(), []
         station = None if base is None else BaseStation(self.config, base.ecef_m)
@@ -354,7 +357,10 @@ class LogPositions:
         )  # fmt: skip
 
     def route(self, network: Network) -> RouteOfLog:
-        """Find the route of the log through a network; MismatchError if there is no route or no navigation record."""
+        """Find the route of the log through a network.
+
+        Raise MismatchError if there is no route or no navigation record.
+        """
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         of_antenna = plan_log(self.positions, antenna_up_m=self.antenna_up_m)

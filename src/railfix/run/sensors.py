@@ -32,7 +32,7 @@ def read_sensors(
 ) -> SensorSamples:
     """Read the tables of on-board sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
 
-    InputFileError: a file is not a table of the sensor, or its times are not in order.
+    Raise InputFileError if a file is not a table of the sensor, or its times are not in order.
     """
     paths = {
         "tachometer": tachometer, "inertial": inertial, "radar": radar, "ranging": ranging, "balises": balises
@@ -62,8 +62,9 @@ def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
     """Read the surveyed ground units of two-way ranges; None without ranges.
 
-    `ranging` is the table of the ranges or their stream. InputFileError: `units` is not a table of ground units.
-    MismatchError: it lacks the unit of a range. SettingsError: only one of `units` and `ranging` is given.
+    `ranging` is the table of the ranges or their stream. Raise InputFileError if `units` is not a table of ground
+    units. Raise MismatchError if it lacks the unit of a range. Raise SettingsError if only one of `units` and `ranging`
+    is given.
     """
     if ranging is None and units is not None:
         raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
@@ -80,7 +81,7 @@ def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path
 def read_units(path: Path) -> GroundUnits:
     """Read a table ``unit,x_m,y_m,z_m`` with surveyed ECEF positions of ground units, in the frame of the line.
 
-    InputFileError: the file is not such a table, or has a unit twice.
+    Raise InputFileError if the file is not such a table, or has a unit twice.
     """
     table = read_sensor_table(path, "ranging_units")
     names = table["unit"]
@@ -95,7 +96,7 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
     In a row with the name of a track, the chainage is measured from the beginning of that track. Balises on tracks that
     are not part of the line, or beyond the ends of the line, are omitted.
 
-    InputFileError: the file is not such a table, has a name twice, or has no balise on the line.
+    Raise InputFileError if the file is not such a table, has a name twice, or has no balise on the line.
     """
     table = read_sensor_table(path, "list of balises")
     names = get_column(table, "balise")
@@ -135,9 +136,9 @@ def load_balises(
 ) -> ListedBalises | None:
     """Read the lists of balises (`places`) and of virtual balises (`virtual`); None if neither is given.
 
-    `readings` is the table or the stream of balise readings. InputFileError: see `read_listed_balises`. SettingsError:
-    readings are given without a list or a list without readings, or virtual balises without protection levels of the
-    filter.
+    `readings` is the table or the stream of balise readings. Raise InputFileError if see `read_listed_balises`. Raise
+    SettingsError if readings are given without a list or a list without readings, or virtual balises without protection
+    levels of the filter.
     """
     if virtual is not None and (config.filter == "off" or config.tracking.level == "off"):
         raise SettingsError(

@@ -122,7 +122,7 @@ def open_line(
     With a time `at`, the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
     otherwise the coordinates remain in the frame of the map. A single file whose tracks do not join to one route is a
     network, in which the route is found from `log`. If `heights` is `OF_LOG`, the positions of `log` are the heights of
-    a map without heights. RailfixError: see `railfix.core.errors`.
+    a map without heights. Raise RailfixError if see `railfix.core.errors`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -232,7 +232,7 @@ class Log:
     skipped: Counter[str] = field(default_factory=Counter)  #: Numbers of skipped items by kind.
 
     def parts(self) -> Generator[Observations]:
-        """Yield the pieces of the log in order of time; raises the errors of `railfix.io.logs.scan_observations`."""
+        """Yield the pieces of the log in order of time; raise the errors of `railfix.io.logs.scan_observations`."""
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,

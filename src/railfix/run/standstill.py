@@ -80,9 +80,9 @@ def standstill_codes(
     """Return code residuals, and with a base station also phases, of an antenna at rest with respect to an origin.
 
     The default origin is the median position of the antenna. `base` has the observations of a base station and its
-    position, ECEF, shape (3,) [m]. NoPositionError: the log has fewer than two positions. MismatchError: the antenna
-    moves, no satellite is observed over the whole log, or the log has no epoch or signal in common with the base
-    station.
+    position, ECEF, shape (3,) [m]. Raise NoPositionError if the log has fewer than two positions. Raise MismatchError
+    if the antenna moves, no satellite is observed over the whole log, or the log has no epoch or signal in common with
+    the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = ranges_without_map(obs, received, config, book)
@@ -142,7 +142,10 @@ def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
 
 
 def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Indices]:
-    """Return the indices of the epochs of two logs with the same time tags, rounded to 0.1 s; MismatchError if none."""
+    """Return the indices of the epochs of two logs with the same time tags, rounded to 0.1 s.
+
+    Raise MismatchError if there are none.
+    """
     step = np.timedelta64(100, "ms")
     stamps = [np.round((t - obs.time[0]) / step).astype(np.int64) for t in (obs.time, other.time)]
     _, mine, its = np.intersect1d(*stamps, return_indices=True)
@@ -152,7 +155,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
 
 
 def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[Indices, Indices]:
-    """Return the indices of the channels that two receivers have in common; MismatchError if there are none."""
+    """Return the indices of the channels that two receivers have in common; raise MismatchError if there are none."""
     names = [s.corrected.channels.names.tolist() for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
     if not shared:

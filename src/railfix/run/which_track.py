@@ -53,7 +53,7 @@ TrackPrior = tuple[dict[str, float], float]
 def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path) -> None:
     """Write the probabilities of all tracks as JSON, for the prior at the next start-up (`prior_of_last_place`).
 
-    OutputError: the file cannot be written.
+    Raise OutputError if the file cannot be written.
     """
     shares = dict(zip(posterior.names, posterior.probability.tolist(), strict=True))
     write_whole(path, json.dumps({"time_gpst": str(time), "probability": shares}, indent=2) + "\n")
@@ -65,7 +65,8 @@ def prior_of_last_place(
     """Return the prior of tracks from the file of `write_last_place` and the distance moved since then [m].
 
     `missed_move` is the probability that the train was moved to any track without being noticed; `unmapped` is the
-    prior of an unmapped track in that case. InputFileError: the file has no probabilities of tracks of this network.
+    prior of an unmapped track in that case. Raise InputFileError if the file has no probabilities of tracks of this
+    network.
     """
     record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")
@@ -102,7 +103,7 @@ def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     """Parse the interlocking's track weights ``NAME=WEIGHT,...``; unnamed tracks are absent from the result.
 
-    SettingsError: the text has another form, names a track that is not in the map, or has weights of 0 only.
+    Raise SettingsError if the text has another form, names a track that is not in the map, or has weights of 0 only.
     """
     weights = {}
     for pair in text.split(","):
@@ -127,7 +128,7 @@ _MOST_TRACKS: Final = 64
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Return the tracks of a network near a position, with points relative to it; MismatchError if none is near.
+    """Return the tracks of a network near a position, with points relative to it; raise MismatchError if none is near.
 
     `origin_ecef_m` is in the frame of the network. Tracks within 60 m of the position are returned, with their points
     within 400 m.
@@ -188,7 +189,7 @@ def decide_track(
 
     `tracks`, `arms_m`, `errors` and `prior` are as for `track_posterior`; the positions of all `antennas` refer to the
     same origin. The first evaluation is after `least_s` [s], and the interval of evaluations is `every_s` [s]. A log
-    shorter than `least_s` is evaluated once, without a decision. MismatchError: there is no position.
+    shorter than `least_s` is evaluated once, without a decision. Raise MismatchError if there is no position.
     """
     start = max(codes.time[0] for codes in antennas)
     length = float((min(codes.time[-1] for codes in antennas) - start) / np.timedelta64(1, "s"))
@@ -275,7 +276,7 @@ class WhichTrackOptions(Settings):
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
     """Decide on which track a train at rest is, from its logs and a map.
 
-    RailfixError: see `railfix.core.errors`.
+    Raise RailfixError if see `railfix.core.errors`.
     """
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):

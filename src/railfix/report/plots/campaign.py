@@ -32,7 +32,7 @@ from railfix.report.plots.line import ECEF, ERROR_CLASSES, LEVEL_CLASSES, LocalF
 if TYPE_CHECKING:
     import polars as pl
 
-#: Name, limits of the classes [m] and colour of bars of each quantity, by its column.
+#: Name, limits of the classes [m] and colour of the bars of each quantity, by column name.
 _QUANTITIES = {
     "error_m": ("error", ERROR_CLASSES, CONSTRAINED),
     "protection_level_m": ("level", LEVEL_CLASSES, FILTERED),
@@ -43,7 +43,7 @@ _QUANTITIES = {
 def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
     """Return a plan of the positions (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by classes of a quantity.
 
-    `quantity` is a column of ``_QUANTITIES``; larger values are drawn over smaller ones.
+    `quantity` is a column of ``_QUANTITIES``; larger values are drawn over smaller values.
     """
     named, edges, _ = _QUANTITIES[quantity]
     placed = points(places, *ECEF)
@@ -140,7 +140,7 @@ def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
 
 
 def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str, limit_m: float) -> None:
-    """Write the charts of `service_charts` as one picture (PNG or SVG); OutputError if it cannot be written."""
+    """Write the charts of `service_charts` as one picture (PNG or SVG); raise OutputError if it cannot be written."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 10), layout="constrained")

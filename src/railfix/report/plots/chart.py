@@ -110,7 +110,7 @@ class Cells(_Layer):
 
     def __post_init__(self) -> None:
         if self.counts.shape != (len(self.x_edges) - 1, len(self.y_edges) - 1):
-            raise ValueError(f"{self.label}: counts have shape {self.counts.shape}, not that of the cells")
+            raise ValueError(f"{self.label}: counts of shape {self.counts.shape} do not fit the edges")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ def points(table: pl.DataFrame, *names: str) -> Floats:
 
 
 def find_start(table: pl.DataFrame) -> np.datetime64:
-    """Return the earliest time of a table; ValueError if the table is empty."""
+    """Return the earliest time of a table; raise ValueError if the table is empty."""
     if not len(table):
         raise ValueError("the table has no rows")
     return np.datetime64(table["time_gpst"].to_numpy().min(), "ns")
@@ -249,7 +249,7 @@ _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     """Return the ascending indices of the smallest and largest `y` in each of `points` / 2 equal pieces of the x range.
 
-    Points with NaN are omitted; if there are at most `points` others, all of them are returned.
+    Points with NaN are omitted; if there are at most `points` other points, all of these are returned.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
@@ -271,8 +271,8 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
     """Return the indices of at most `points` points, of which no two are in the same square cell.
 
-    The width of the cells is increased from `cell` until this is reached; if there are at most `points` points, all are
-    returned. Points with NaN are omitted.
+    The width of the cells is increased from `cell` until at most `points` points are left; if there are no more points
+    at first, all are returned. Points with NaN are omitted.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
@@ -288,7 +288,7 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     """Return the indices of at most `points` points that represent a series.
 
-    A fifth of them are `extremes`; a golden-ratio sequence selects the others evenly. Points with NaN are omitted.
+    A fifth of these are `extremes`; a golden-ratio sequence selects the others evenly. Points with NaN are omitted.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:

@@ -44,7 +44,7 @@ _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
 def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
     """Return a function that draws the chart returned by `chart_of`, with its parameters and the parameter `ax`.
 
-    SettingsError: a table is not a polars table, or lacks a column.
+    Raise SettingsError if a table is not a polars table, or lacks a column.
     """
     own = signature(chart_of)
     of_table = next(iter(own.parameters.values())).annotation == "pl.DataFrame"
@@ -88,7 +88,7 @@ def draw_figure(chart: Chart) -> Figure:
 def save_figure(figure: Figure, path: str | PathLike[str]) -> Path:
     """Write a figure as SVG if the name ends in ``.svg``, otherwise as PNG, and return the path.
 
-    OutputError: the file cannot be written.
+    Raise OutputError if the file cannot be written.
     """
     with stage_file(path, what="picture") as staged:
         figure.savefig(staged, format="svg" if str(path).endswith(".svg") else "png", dpi=110)
@@ -122,7 +122,7 @@ def new_axes(size: tuple[float, float], **axes: Any) -> Axes:
 def draw_sky(sky: SkyEpochs, time: np.datetime64, *, ax: Axes | None = None) -> Axes:
     """Draw the satellites at the epoch nearest to a GPS time into polar axes, and return the axes.
 
-    ValueError: there are no satellites, or `ax` is not polar.
+    Raise ValueError if there are no satellites, or `ax` is not polar.
     """
     if sky.empty:
         raise ValueError("there are no satellites to draw")

@@ -138,7 +138,7 @@ def good_errors(errors: pl.DataFrame, column: str) -> Floats:
 
 
 def error_scale(error_m: Floats) -> dict[str, Any]:
-    """Return the fields of `Chart` for the scale of an error axis, which is symlog if a few errors are far larger."""
+    """Return the fields of `Chart` for the scale of an error axis, which is symlog if a few errors are outliers."""
     size = np.abs(error_m[np.isfinite(error_m)])
     if not len(size):
         return {"y_scale": "linear"}
@@ -149,7 +149,7 @@ def error_scale(error_m: Floats) -> dict[str, Any]:
 
 
 def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the centre of each piece of the x axis with data and the largest y in it, with NaN at gaps."""
+    """Return the centre of each piece of the x axis that has data, and the largest y in the piece, with NaN at gaps."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(rows):
         return np.empty(0), np.empty(0)
@@ -221,7 +221,7 @@ def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
     )
 
 
-#: Label and column of each part of the protection level, and of the level itself.
+#: Label and column of each part of the protection level, of the RAIM level, and of the protection level.
 _PARTS: Final = (
     ("fault-free part", "protection_fault_free_m"),
     ("one-fault part", "protection_one_fault_m"),
@@ -231,7 +231,7 @@ _PARTS: Final = (
 )
 
 
-#: Regions with the text of their labels, and the x and y of the label: 1 is the alarm limit, 2 the end of the axis.
+#: Region, text, x and y of each label; 1 is the alarm limit, 2 the end of the axis.
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),

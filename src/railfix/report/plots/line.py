@@ -175,7 +175,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
 def _line(
     track: Track | None, frame: LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
 ) -> Iterator[Curve]:
-    """Yield the line from before the first to after the last position, and its tunnels."""
+    """Yield the line, from `_BEYOND_M` before the first to `_BEYOND_M` after the last position, and its tunnels."""
     if track is None:
         yield _line_of_positions(here, chainage_m)
         return
@@ -208,7 +208,7 @@ def _classes(
 
 
 def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
-    """Return label, colour and mask of each class of values between `edges` [m], and first of the NaN values."""
+    """Return label, colour and mask of the NaN values, then of each class of values between `edges` [m]."""
     classes = [(unknown, BLACK, np.isnan(size))]
     for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):
         label = f"{quantity} {low:g} to {high:g} m" if np.isfinite(high) else f"{quantity} {low:g} m and more"
@@ -246,10 +246,10 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Return the chainage of positions and the distance from the previous position [m], without standstill if known.
+    """Return the chainage of positions and the distance from the previous position [m].
 
-    `prefix` is the beginning of the names of the columns. Without a column of intervals, the distances are computed
-    from the chainages, and standstill is included.
+    `prefix` is the beginning of the names of the columns. Distances are taken from the column of intervals, and
+    positions at standstill are left out; without this column, distances are differences of chainage, at standstill too.
     """
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")

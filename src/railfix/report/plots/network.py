@@ -41,7 +41,7 @@ def plot_network(
     quality: NetworkQuality | None = None,
     run: tuple[PlanLog, Matched] | None = None,
 ) -> None:
-    """Write `network_plan` as a PNG or SVG file; OutputError if it cannot be written."""
+    """Write `network_plan` as a PNG or SVG file; raise OutputError if it cannot be written."""
     save_figure(draw_figure(network_plan(network, quality, run)), path)
 
 
@@ -75,7 +75,7 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
         layers.append(Marks(label="names", colour=BLACK, x=east, y=north, words=network.names, place="on"))
     caption = f"Origin at latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}."
     if nth > 1:
-        caption += f" One of {nth} points of each track, and its ends, are drawn."
+        caption += f" Every {nth}th point and the ends of each track are drawn."
     return Chart(
         name="network", title="Tracks", caption=caption, x_label="east [m]", y_label="north [m]", layers=tuple(layers),
         equal=True, x_range=view and view[0], y_range=view and view[1],
@@ -126,7 +126,7 @@ def _names_beside(
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
-    """Return indices of every n-th and the last point of each track, and the positions in them where a track begins."""
+    """Return the indices of every n-th and the last point of each track, and where the tracks begin in this array."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
     place = np.arange(len(track)) - first[track]
@@ -176,7 +176,7 @@ _PANELS: Final = {
 def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None:
     """Write a picture of the plan, and of mid-chord deviation, point spacing, turns, gradient and cant over chainage.
 
-    The findings of the map check are marked. The file is PNG or SVG; OutputError if it cannot be written.
+    The findings of the map check are marked. The file is PNG or SVG; raise OutputError if it cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -244,7 +244,7 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
 def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
     """Write a picture of a survey: positions and map in plan, and height and standard deviations over chainage.
 
-    OutputError: the file cannot be written.
+    Raise OutputError if the file cannot be written.
     """
     from matplotlib.figure import Figure
 

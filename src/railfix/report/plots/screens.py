@@ -50,7 +50,7 @@ def draw_screen(
 ) -> Path:
     """Write a picture of a metric with its limit over T times and, if given, over chainage [m]; return its path.
 
-    The file is PNG or SVG. OutputError: it cannot be written.
+    The file is PNG or SVG. Raise OutputError if it cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -150,7 +150,7 @@ def _join(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
 
 
 def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
-    """Return the distinct values of x in ascending order, and the smallest limit at each of them."""
+    """Return the distinct values of x in ascending order, and the smallest limit at each value."""
     known = np.isfinite(x)
     x, limit = x[known], limit[known]
     order = np.argsort(x, kind="stable")
@@ -163,7 +163,7 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
 def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples) -> Path:
     """Write a picture of C/N0 over elevation with mean and threshold (P1 figure 3), and return its path.
 
-    It has one panel per constellation and signal of the curve. OutputError: the file cannot be written.
+    The picture has one panel per constellation and signal. Raise OutputError if the file cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -207,8 +207,8 @@ class _ScreenRows:
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
     """Write one picture per screen and antenna, such as ``front_doppler.png``, into the folder `out`; return the paths.
 
-    Screens that tested nothing have no picture. InputFileError: `run` is not a results folder, or the run wrote no
-    observations (``railfix run --observations``). OutputError: the folder or a file cannot be written.
+    Screens that tested nothing have no picture. Raise InputFileError if `run` is not a results folder, or the run wrote
+    no observations (``railfix run --observations``). Raise OutputError if the folder or a file cannot be written.
     """
     (reported,), _ = read_runs([run])
     if reported.observations is None:
@@ -230,7 +230,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
 
 
 def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
-    """Return the names of columns of the screens that the tables, written by an earlier version, lack."""
+    """Return the columns of the screens that the tables lack, as tables written by an earlier version do, sorted."""
     columns = [column for screen in SCREENS for column in screen.columns]
     missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
     missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())
@@ -260,7 +260,7 @@ class RunScreen:
 
 
 def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
-    """Yield the screens of a run that tested anything, by antenna; `config` has the settings of the run."""
+    """Yield the screens that tested anything, and the protection level, by antenna; `config` has the run's settings."""
     antennas = positions["antenna"].unique(maintain_order=True).to_list()
     for antenna in antennas:
         mine = positions.filter(pl.col("antenna") == antenna) if len(antennas) > 1 else positions

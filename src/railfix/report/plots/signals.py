@@ -51,8 +51,8 @@ def cn0_over_elevation(
 ) -> list[Chart]:
     """Return a chart of C/N0 over elevation for each constellation and signal (P1 figure 3).
 
-    The chart has the mean, the thresholds of the screen `limits`, and the elevation mask. With a `curve`, the mean is
-    that of the curve, otherwise it is computed from the observations.
+    The chart has the mean, the thresholds of the screen `limits`, and the elevation mask. The mean is taken from
+    `curve` if the curve has the signal, and is computed from the observations otherwise.
     """
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
