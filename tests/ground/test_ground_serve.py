@@ -495,7 +495,7 @@ def test_a_database_that_fails_is_an_alarm(
     assert {authority.train: authority.report for authority in sent[2:]} == {1: 1, 2: 0}
     assert control.store.records()[1].sequence == 1
     told = [text for _, _, text in control.store.log()]
-    assert "train 1: heard" in told
+    assert "train 1: first report" in told
     assert "the database can be written again" in control.lines[-1]
 
 

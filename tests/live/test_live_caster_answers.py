@@ -68,17 +68,17 @@ def test_chunks_are_joined_however_the_header_is_written(coding: bytes) -> None:
 @pytest.mark.parametrize(
     ("answer", "says"),
     [
-        (OK + b"Transfer-Encoding: chunked\r\n\r\n-5\r\n" + bytes(300), "answer is no HTTP"),
-        (OK + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", "answer is no HTTP"),
-        (OK + b"Content-Type: gnss/sourcetable\r\n\r\nSTR;A", "are host and mount point right"),
+        (OK + b"Transfer-Encoding: chunked\r\n\r\n-5\r\n" + bytes(300), "answer is not HTTP"),
+        (OK + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", "answer is not HTTP"),
+        (OK + b"Content-Type: gnss/sourcetable\r\n\r\nSTR;A", "check host and mount point"),
         (OK + b"\r\nSTR;MOUNT;here\r\n", "source table, not a receiver's stream"),
-        (b"SOURCETABLE 200 OK\r\n", "is the mount point right"),
+        (b"SOURCETABLE 200 OK\r\n", "check the mount point"),
         (OK + b"Content-Type: text/html\r\n\r\n<p>", "a page of HTML"),
         (OK + b"\r\n<!DOCTYPE html><html>" + bytes(40), "a page of HTML"),
         (OK + b"Content-Encoding: gzip\r\n\r\n" + gzip.compress(b"x" * 50, mtime=0), "coded as 'gzip'"),
         (OK + b"\r\n" + gzip.compress(b"x" * 50, mtime=0), "compressed content"),
-        (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "are user and password right"),
-        (OK + b"X: " + b"y" * 70_000 + b"\r\n\r\n", "answer is no HTTP"),
+        (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "check user and password"),
+        (OK + b"X: " + b"y" * 70_000 + b"\r\n\r\n", "answer is not HTTP"),
         (b"\x00" * 70_000, "the caster answers"),
         (b"", "closed the connection without an answer"),
     ],
@@ -102,7 +102,7 @@ def test_a_caster_that_breaks_its_chunks_later_is_asked_again() -> None:
     assert kinds == ["Connected", b"ok", "Lost", "Connected", b"ok"]
     lost = parts[2]
     assert isinstance(lost, Lost)
-    assert re.search("answer is no HTTP", lost.reason)
+    assert re.search("answer is not HTTP", lost.reason)
 
 
 @pytest.mark.slow

@@ -191,8 +191,8 @@ def test_a_caster(log: bytes, tags: list[np.datetime64], version: int, chunked: 
 @pytest.mark.parametrize(
     ("place", "says"),
     [
-        ("train:wrong@{at}/ROOF", "are user and password right"),
-        ("train:pa%3Ass@{at}/NOWHERE", "is the mount point right"),
+        ("train:wrong@{at}/ROOF", "check user and password"),
+        ("train:pa%3Ass@{at}/NOWHERE", "check the mount point"),
     ],
 )
 def test_what_a_caster_refuses_ends_the_session(log: bytes, place: str, says: str) -> None:

@@ -97,8 +97,8 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
         "settings": (kept, ["--set", "largest_sigma_m=19"], None, "was made with another settings"),
         "damaged": (kept[:-1], [], None, "is damaged or cut off"),
         "changed": (kept[:-1] + bytes([kept[-1] ^ 1]), [], None, "is damaged or cut off"),
-        "empty": (b"", [], None, "is no state file of this version"),
-        "older": (kept.replace(b"live state 5", b"live state 4", 1), [], None, "is no state file of this version"),
+        "empty": (b"", [], None, "is not a state file of this version"),
+        "older": (kept.replace(b"live state 5", b"live state 4", 1), [], None, "is not a state file of this version"),
     }
     for name, (content, words, track, says) in cases.items():
         path.write_bytes(content)
@@ -115,7 +115,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     assert np.array_equal(rows["chainage_m"].to_numpy(), late["chainage_m"].to_numpy(), equal_nan=True)
     path.write_bytes(kept)
     _, _, told = live(parts["first"], tmp_path, "again", "--state", str(path))
-    assert "its last epoch is 2.9 s after the first new one, up to 60 s before it (state_age_s) are allowed" in told
+    assert "its last epoch is 2.9 s after the first new epoch, at most 60 s before it (state_age_s) are allowed" in told
 
 
 @pytest.mark.slow

@@ -524,7 +524,7 @@ def test_a_record_of_an_earlier_version(folder: Path, tmp_path: Path) -> None:
         assert result.exit_code == code, result.output
     assert "run.json: does not fit this version" in " ".join(result.output.split())
     assert "section.colour" in result.output
-    assert "repeat the run with it" in " ".join(result.output.split())
+    assert "repeat the run with this version" in " ".join(result.output.split())
 
 
 def test_observations_that_are_no_table(folder: Path, tmp_path: Path) -> None:

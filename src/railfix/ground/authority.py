@@ -27,7 +27,7 @@ class Authority(Message):
 
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
-    number: Number  #: Number that rises with every authority sent to the train, also over restarts of the centre.
+    number: Number  #: Number that rises with every authority sent to the train, also across restarts of the centre.
     #: Sequence number of the train's newest report that the centre has stored, 0 without one. It acknowledges the
     #: report, and the age of the authority on board is the time since the train sent this report.
     report: Number
@@ -61,7 +61,7 @@ class Authority(Message):
         try:
             kind, version, *values = cbor2.loads(data)
         except (cbor2.CBORDecodeError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
-            raise MessageError("is no authority: an array of CBOR was expected") from None
+            raise MessageError("is not an authority: a CBOR array was expected") from None
         found: dict[Any, type[Authority]] = {Authority.kind: Authority, BrakeOrder.kind: BrakeOrder}
         model = found.get(kind) if type(kind) is int else None
         if model is None or version != VERSION:
@@ -70,7 +70,7 @@ class Authority(Message):
             raise MessageError(f"has {len(values)} fields, {len(model.model_fields)} were expected")
         message = validate_message(model, dict(zip(model.model_fields, values, strict=True)))
         if message.encode() != data:  # trailing bytes, a boolean for a number, or another order
-            raise MessageError("is no authority in its canonical form")
+            raise MessageError("is not an authority in canonical form")
         return message
 
 

@@ -31,7 +31,7 @@ class BrakeLimits(Settings):
     cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most `build_up_s`.
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
-    reaction_s: float = Field(default=3.0, ge=0)  #: Time from the permitted speed to the intervention, for the driver.
+    reaction_s: float = Field(default=3.0, ge=0)  #: Driver's time from the permitted speed to the intervention.
     over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restriction at which the intervention begins.
 
 
@@ -50,7 +50,7 @@ class Steps(NamedTuple):
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed from which braking at a position reaches the target at its speed [m2/s2].
+    """Return the square of the speed from which a train that brakes at `at_m` reaches the target speed there [m2/s2].
 
     ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target it is below ``v_target^2``.
     """
@@ -96,7 +96,7 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 
 
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
-    """Return the speed above which the train is braked, now or after a given time [m/s].
+    """Return the speed above which the train is braked, at once or after `before_s` [m/s].
 
     It is the largest speed at which the train is on the curve of `braking_speed` when its brakes act. Between two
     changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed, which

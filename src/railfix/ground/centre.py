@@ -1,4 +1,4 @@
-"""Control centre: state and displayed position of each train from its reports; a display, not a safety function.
+"""State and displayed position of each train in the control centre; the display is not a safety function.
 
 A pure state machine (P5 3.1): `report_received` and `time_passed` take a train's record and return its new record.
 The displayed position is indicative only; a train occupies the interval from its last safe rear end to the end of the
@@ -68,7 +68,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position after a running time, at most at the next station, regardless of any timetable [m]."""
+        """Return the position after a running time from `from_m`, limited to the next station [m]."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -135,15 +135,15 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 before the first.
-    session: int = 0  #: Identifier of the on-board start that the number belongs to.
+    session: int = 0  #: Identifier of the on-board start that `sequence` belongs to.
     retired: tuple[int, ...] = ()  #: Identifiers of earlier on-board starts, whose late messages are rejected.
     counted_s: float | None = None  #: Centre's clock at the arrival of the newest sequence number [s].
     rejected: str | None = None  #: Reason why the newest report was rejected.
     message: TrainMessage | None = None  #: Newest report with a position.
     heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of `message` [s].
     measured_s: float = 0.0  #: Centre's clock at the instant for which the position of `message` is valid [s].
-    shown_m: float | None = None  #: Displayed position of the front end.
-    #: Reported minus simulated position at the last resynchronisation, positive in running direction.
+    shown_m: float | None = None  #: Displayed position of the front end [m].
+    #: Reported minus simulated position at the last resynchronisation, positive in running direction [m].
     jump_m: float | None = None
 
 

@@ -131,7 +131,7 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 
 
 def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
-    """Return the state without a train; its sections are then occupied by vehicles that report nothing.
+    """Return the state without a train, whose sections are then occupied by vehicles that do not report.
 
     The sections are freed by their detection, or by the order of a person who has seen that they are free. As in
     `correct_interval`, no authority in transit may permit the train to run.

@@ -168,10 +168,10 @@ class ControlCentre:
         if before.state in (TrainState.SIMULATED, TrainState.ERROR):
             self.log(f"train {number}: reports again, position jumps by {after.jump_m or 0.0:.1f} m", train=number)
         elif before.state is TrainState.UNKNOWN:
-            self.log(f"train {number}: heard", train=number)
+            self.log(f"train {number}: first report", train=number)
 
     def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
-        """Count and log contradictions of a report, and its answer to a request for the route."""
+        """Count and log contradictions of a report, and log the train's answer to a request for the route."""
         number = known.train
         if known.contradiction is not None:
             self.rejected["contradicts the record of the train"] += 1
@@ -209,7 +209,7 @@ class ControlCentre:
         ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Process a verdict on satellite positioning from fixes of a given age; the worst since the last step is used.
+        """Process a verdict on satellite positioning from fixes of a given age; each step uses the worst new verdict.
 
         Fixes older than `MonitorLimits.late_s`, or further in the future than this, give no verdict.
         """
@@ -222,8 +222,8 @@ class ControlCentre:
     def step(self) -> None:
         """Order braking, release points, set routes, extend authorities, and commit; then send the committed messages.
 
-        It must be called several times per second. Orders to brake do not wait for a commit. Authorities and commands
-        to points are sent once the state on which they are based is committed.
+        This method must be called several times per second. Orders to brake do not wait for a commit. Authorities and
+        commands to points are sent once the state on which they are based is committed.
         """
         now = self.clock()
         self._monitor(now)

@@ -1,6 +1,7 @@
 """Demonstration of the ground side: two trains on a line with a passing loop, disturbed links, a satellite fault.
 
-It uses the centre of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the simulated traffic.
+The demonstration uses the centre of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the
+simulated traffic.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class LinkDisturbance:
 
 
 class Relay(asyncio.DatagramProtocol):
-    """Relay between one client and a target."""
+    """Relay of UDP datagrams between one client and a target, with disturbances in both directions."""
 
     def __init__(self, target: tuple[str, int], settings: RelaySettings) -> None:
         self.disturbance = LinkDisturbance(settings)
@@ -254,7 +255,8 @@ async def run_demo(
 
     `speed` is in simulated seconds per second. The page is served on the loopback address at `port` (0 takes a free
     port), and `password` permits the release of a stop. `announce` is called with the page's address, and `keep` is
-    awaited with it before the page closes. `picture` is the path of the picture of response rates along the line.
+    awaited with this address before the page closes. `picture` is the path of the picture of response rates along the
+    line.
     """
     async with contextlib.AsyncExitStack() as held:
         folder, done = Path(held.enter_context(tempfile.TemporaryDirectory())), False

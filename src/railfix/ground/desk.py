@@ -1,4 +1,4 @@
-"""Orders of the page: their authors, their effects, and confirmation by a second order.
+"""Orders given on the page, with their authors and effects, and with confirmation by a second order.
 
 Each order is a line of the log with its author and its outcome. Orders based on an observation that no report confirms
 are given twice: by two people, or by one person after a minimum time.
@@ -191,7 +191,7 @@ class OrderDesk:
         return None
 
     def detect(self, values: Values, by: str = "") -> str | None:
-        """Process the detection of a section, which is occupied, free, or null where unknown; a change is logged."""
+        """Process the detection of a section: true if occupied, false if free, null if unknown; changes are logged."""
         name, occupied = str(values.get("section", "")), values.get("occupied")
         if name not in self.supervision.layout.sections:
             return f"no such section: {name!r}"

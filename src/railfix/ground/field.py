@@ -10,7 +10,7 @@ from railfix.ground.layout import PointName
 
 @dataclass(kw_only=True)
 class SimulatedPoints:
-    """Points that lose their detection at a command, and are detected in their new position after `move_s`."""
+    """Points that lose their detection at a command, and are detected in the new position after `move_s` [s]."""
 
     move_s: float
     clock: Callable[[], float]

@@ -34,8 +34,7 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor_setup import parse_position
 
-#: Smallest drop of the mean C/N0 over satellites, below the median of the mean over preceding epochs, that is a fall
-#: [dB-Hz].
+#: Minimum drop of a receiver's mean C/N0 below the median over the preceding epochs that counts as a fall [dB-Hz].
 FALLEN_DBHZ = 6.0
 #: Number of epochs in the median of the mean C/N0.
 USUAL_EPOCHS: Final = 600
@@ -68,7 +67,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     Raises
     ------
     MismatchError
-        The logs have no tag, or no channel, in common.
+        The logs have no epoch in common, or no satellite with the same signal.
     """
     config = Config()
     book = ChannelBook(config)
@@ -173,9 +172,9 @@ def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> St
 
 
 def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]]:
-    """Return the rounded epochs common to all logs, and their rows in each log.
+    """Return the rounded epochs common to all logs, and the rows of these epochs in each log.
 
-    Raise MismatchError if there are none.
+    Raise MismatchError if the logs have no epoch in common.
     """
     epochs = [round_tags(time) for time in times]
     common = reduce(np.intersect1d, epochs)
@@ -226,7 +225,7 @@ _LONGEST_QUEUE: Final = 1000
 class StationStreams:
     """Fixes of receivers at known points, computed from epochs as they arrive.
 
-    An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver sends nothing
+    An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver is silent,
     there are no fixes, and the monitor detects that fixes are late. Records from the streams are added to `navigation`.
     Only epochs at whole seconds are used. `counts` has the numbers of epochs "used", "incomplete", and "without common
     satellites".

@@ -1,4 +1,4 @@
-"""Redundancy layer above two links: frames with sequence number and time stamp, and the defences of EN 50159.
+"""Redundancy layer above two links: frames with sequence number and time stamp, with the defences of EN 50159.
 
 The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults of the layers between, and
 is not cryptographic. A receiver uses each frame once, from the link that delivers it first, and no frame that is older
@@ -69,7 +69,7 @@ class Frame:
     payload: bytes = b""
 
     def encode(self) -> bytes:
-        """Return the bytes of the frame with their check."""
+        """Return the bytes of the frame, followed by their CRC."""
         if len(self.payload) > LONGEST_PAYLOAD:
             raise ValueError(f"a payload of {len(self.payload)} bytes; at most {LONGEST_PAYLOAD} fit a frame")
         data = _HEAD.pack(self.kind, self.sender, self.session, self.sequence, self.time_ns) + self.payload
@@ -104,7 +104,7 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed delay.
     #: Largest relative drift of the clocks; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Largest lead of a sequence number over the newest number, and its growth per second since then.
+    #: Largest lead of a sequence number over the newest number, and increase of this lead per second since its arrival.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=100.0, gt=0)
 
@@ -152,7 +152,7 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return the frame if it is to be answered, and the frame if it is to be used, otherwise None.
+        """Return the frame if it is to be answered, and the frame if it is to be used; None in place of each otherwise.
 
         A second copy of a frame is answered but not used, so that both links are measured.
         """

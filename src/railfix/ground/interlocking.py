@@ -2,7 +2,7 @@
 
 A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority.
 Authorities are extended, less a margin, to the nearest of these limits: another train's interval, a section that is
-closed or occupied, points that are not locked and detected for the train, the end of its route. Authorities are
+closed or occupied, points that are not locked and detected for the train, the end of the train's route. Authorities are
 shortened only by agreement with the train (`railfix.ground.stops`); reports move the intervals
 (`railfix.ground.reports`). Shunting, overlaps behind signals, level crossings and degraded working by hand are not
 modelled.
@@ -23,8 +23,8 @@ from railfix.ground.state import Interlocking, InterlockingLimits, PointState, T
 class NearbyTrains:
     """Index of trains by the blocks of the line that their interval, route and next route include.
 
-    With it the cost of a step grows with the number of trains, not with the number of pairs of trains. `update` locates
-    only trains whose interval or route has changed.
+    With this index the cost of a step grows with the number of trains, not with the number of pairs of trains. `update`
+    locates only trains whose interval or route has changed.
     """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:

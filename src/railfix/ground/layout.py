@@ -92,7 +92,7 @@ class Layout(Settings):
         return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
 
     def blocks_between(self, low_m: float, high_m: float) -> range:
-        """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k the line before it."""
+        """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k the line before k."""
         return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
 
     @cached_property
@@ -133,7 +133,7 @@ class Layout(Settings):
         return tuple(parts)
 
     def zone_m(self, point: PointName) -> tuple[float, float]:
-        """Return the chainages of points, lower first [m]."""
+        """Return the chainages of the two ends of points, lower first [m]."""
         station = self.stations[point[0]]
         if point[1] < 0:
             return station.begin_m, station.inner_m[0]
@@ -180,7 +180,7 @@ class Layout(Settings):
 
 
 def along(between_m: tuple[float, float], direction: int) -> tuple[float, float]:
-    """Return two chainages, lower first, as distances in a running direction: near end and far end [m]."""
+    """Return the near and the far end of a range of chainages, as distances in a running direction [m]."""
     low, high = between_m
     return (low, high) if direction > 0 else (-high, -low)
 
@@ -206,7 +206,7 @@ _STEP_M: Final = 2.0
 def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
     """Return the layout of a network that is one single line with passing loops.
 
-    Its chainage begins at one end and follows the single track and track 1 of each station. A station is a pair of
+    The chainage begins at one end and follows the single track and track 1 of each station. A station is a pair of
     tracks between the same two switches; the line has one track between stations and beyond the outer stations. Points
     extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Track 1 of a station is on the
     side on which trains drive, for trains that run toward rising chainage. Raise MismatchError if the network is of

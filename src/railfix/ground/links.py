@@ -39,11 +39,11 @@ class LinkResult(NamedTuple):
 class LinkLimits(Settings):
     """Limits of the links."""
 
-    #: Time to the echo above which a frame is missed (T); a centre delays an echo by up to 0.2 s to add an authority.
+    #: Longest time to the echo of a frame (T), after which it is a miss; a centre delays echoes by up to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)
     misses: int = Field(default=3, ge=1)  #: Consecutive misses after which the spare link is used.
     good: int = Field(default=10, ge=1)  #: Consecutive answers before the normal link is used again.
-    good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is used again.
+    good_s: float = Field(default=30.0, ge=0)  #: Minimum time on the spare link before the normal link is used again.
     window: int = Field(default=60, ge=1)  #: Number of frames in the response rate.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
     #: A connection without any packet for this time since a frame was sent, at most 10 s, is opened again, so that
@@ -59,7 +59,7 @@ class LinkMeter:
     #: Consecutive misses, and consecutive answers.
     misses: int = 0
     good: int = 0
-    #: Answered and sent frames by position and running direction.
+    #: Numbers of answered and sent frames, by cell of the line and running direction.
     coverage: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     #: The last `KEPT` frames, by the time of their result.
     results: deque[LinkResult] = field(default_factory=lambda: deque(maxlen=KEPT))
@@ -323,10 +323,10 @@ class TrainLinks:
 class CentreLinks:
     """The centre's end: it listens at one address per bearer, answers every frame, and delivers each payload once.
 
-    `received` is called with the train's number and the payload. By default free ports are used; `addresses` has them
-    by bearer. Answers are delayed by up to `wait_s` to be sent with a payload. `masquerades` is the number of
+    `received` is called with the train's number and the payload. By default free ports are used; `addresses` has the
+    addresses by bearer. Answers are delayed by up to `wait_s` to be sent with a payload. `masquerades` is the number of
     connections that were rejected for their certificate, `heard_s` has the monotonic time of the last frame received,
-    by train and bearer, and `alarm` is the fault of the list of revoked certificates.
+    by train and bearer. `alarm` is a sentence on a faulty list of revoked certificates, None without a fault.
     """
 
     def __init__(

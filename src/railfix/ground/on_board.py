@@ -15,7 +15,7 @@ from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, s
 from railfix.ground.links import LinkMode
 from railfix.ground.positions import Clock
 
-#: Backward movement of the safe front end that exceeds the errors of two positions: the train has rolled back [m].
+#: Backward movement of the safe front end, larger than the errors of two positions, that counts as rolling back [m].
 ROLLED_M: Final = 50.0
 #: Number of reports whose time of sending is stored.
 REMEMBERED: Final = 600
@@ -29,7 +29,7 @@ class OnBoardLimits(BrakeLimits):
 
     #: Time limit of authorities: the train brakes if the newest authority answers a report sent longer ago.
     fresh_s: float = option(
-        "Time limit of authorities; an older authority brakes the train.",
+        "Largest age of the newest authority; the train brakes if the authority is older.",
         15.0,
         name="--fresh",
         metavar="S",
@@ -143,9 +143,10 @@ class OnBoard:
         self._granted = False
 
     def receive(self, authority: Authority) -> bool:
-        """Process an authority; return whether it is accepted, as newer, for this direction and this end of the train.
+        """Process an authority; return whether it is accepted.
 
-        An authority that answers a report from before the last change of ends may have been granted for the present
+        An authority must be newer than the last accepted authority, and have the train's direction. An authority that
+        answers a report from before the last change of ends is rejected, as it may have been granted for the present
         direction two changes ago. An authority that has lapsed in transit is rejected. An order to brake is always
         accepted; a late order lasts until the next authority.
         """

@@ -1,8 +1,8 @@
 """QUIC connections with datagrams, and the keys and certificates of both ends.
 
 aioquic requests a client's certificate, and delays acknowledgements, only by private attributes
-(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`); they are
-used in this module alone.
+(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`), which are
+used only in this module.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
 #: Largest sum of over- and under-reading amount of an accepted report [m].
 WIDEST_M: Final = 1000.0
-#: Least time between two positions for the extension of intervals: the largest age of a position when it is sent [s].
+#: Minimum time between two positions in the extension of intervals, the largest age of a position when it is sent [s].
 INSTANT_S: Final = 5.0
 
 
@@ -98,7 +98,7 @@ class PlacedReport:
 
     @property
     def held_m(self) -> float | None:
-        """End of the authority that the report names, limited to the line [m]; None without one."""
+        """End of the authority that the report names, limited to the line [m]; None if the report names none."""
         end_cm, stations = self.message.authority_end_cm, self.layout.stations
         return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
 
@@ -343,7 +343,7 @@ def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:
 
 
 def furthest(facing: int, agreed_m: float, known_m: float) -> float:
-    """Return the further of two rear ends in running direction, which a wider bound does not move back [m]."""
+    """Return the further of two rear ends in running direction, so that a wider bound moves no rear end back [m]."""
     return max(agreed_m, facing * known_m)
 
 

@@ -43,8 +43,7 @@ from railfix.track.network_read import read_network
 STEP_S = 0.1
 #: Longest wait for a commit in progress at the end [s].
 ENDING_S = 3.0
-#: Thresholds of the garbage collection: with a thousand connections a full collection takes 0.3 s, and is therefore
-#: rare.
+#: Thresholds of the garbage collector for rare full collections, which take 0.3 s with a thousand connections.
 COLLECTION = 10_000, 20, 50
 #: Document with the stations and trains that the database belongs to.
 _BELONGS_TO = "stations and trains"
@@ -197,7 +196,7 @@ async def run_centre(
 ) -> tuple[bool, dict[str, Any]]:
     """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time.
 
-    Returns whether SIGTERM ended the centre, and figures of the session.
+    Return whether SIGTERM ended the centre, and figures of the session.
 
     `page` is the host and port of the page, where port 0 takes a free port; at other than loopback addresses the page
     is served by TLS with the centre's certificate. `password` permits orders, and `people` has personal passwords by
@@ -373,7 +372,7 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
 def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
     """Store the stations and trains of the file at the first start.
 
-    Raise InputFileError if they differ at a later start.
+    Raise InputFileError if the stations or trains differ at a later start.
     """
     under = {f"station {s.name}": s.model_dump_json() for s in settings.stations}
     under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}

@@ -48,7 +48,7 @@ class TrainInterval:
     rear_m: float
     front_m: float
     end_m: float  #: End of the authority.
-    sequence: int  #: Newest report, and the on-board start that it belongs to (`TrainMessage.session`).
+    sequence: int  #: Number of the newest report, and on-board start of this number (`TrainMessage.session`).
     session: int = 0
     tracks: Mapping[int, int]  #: Track in each station of the route.
     station: int  #: Station where the route ends.
@@ -76,7 +76,7 @@ class TrainInterval:
     parted: int | None = None  #: Train that was divided from the rear of this train, until the two are apart.
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy with changes, like `dataclasses.replace` without its cost; TypeError for an unknown name."""
+        """Return a copy with changes, faster than `dataclasses.replace`; raise TypeError for an unknown name."""
         if not values.keys() <= _NAMES[TrainInterval]:
             raise TypeError(f"a train has none of {', '.join(sorted(values.keys() - _NAMES[TrainInterval]))}")
         copy = copy_with(self, **values)
@@ -162,7 +162,7 @@ class Interlocking:
     skipped: tuple[int, int] = (0, 0)
     #: Sections (`Layout.sections`) that no authority reaches into, each with its reason: `railfix.ground.stops.BARS`.
     bars: frozenset[tuple[str, str]] = frozenset()
-    restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: By name.
+    restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: Speed restrictions by name.
 
 
 def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:

@@ -105,7 +105,7 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Commit the remaining lines of the log, where the database accepts them, and close it."""
+        """Commit the remaining lines of the log, if the database accepts them, and close the database."""
         if self.abandoned:
             return
         if self._notes and not self._connection.invalidated:

@@ -1,6 +1,6 @@
 """Supervision of a line's trains by the centre: authorities from reports, without input or output.
 
-It is common to `railfix.ground.control` (the centre with its store and page) and simulated traffic
+The supervision is common to `railfix.ground.control` (the centre with its store and page) and simulated traffic
 (`railfix.ground.traffic`).
 """
 
@@ -277,7 +277,7 @@ class Supervision:
     def work(self, now_s: float) -> list[Authority]:
         """Release points, set routes, extend authorities; return the messages to send once the state is stored.
 
-        It processes trains that have reported since the last call, whose stop has changed, or that were sent nothing
+        Trains are processed that have reported since the last call, whose stop has changed, or that were sent nothing
         for `AUTHORITY_S`.
         """
         stopped = stop_orders(self.state)

@@ -39,8 +39,8 @@ async def run_train(
 ) -> tuple[int, int]:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
-    It ends after the end of the positions, once the last report is answered, or `ANSWER_S` later. Returns the number of
-    reports and of authorities.
+    The function ends when the positions have ended and the last report is answered, or `ANSWER_S` later. It returns the
+    numbers of reports and of authorities.
 
     The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as written
     by `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
@@ -68,7 +68,7 @@ async def run_train(
 def is_complete(path: Path) -> bool:
     """Return whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
 
-    A file that is absent, unreadable, older, from the future or of other content is no confirmation.
+    A file that is absent, unreadable, older, from the future or with other content is no confirmation.
     """
     try:
         age_s = time.time() - path.stat().st_mtime
@@ -135,7 +135,7 @@ class _Desk:
 
     @staticmethod
     def _note_position(on_board: OnBoard, message: TrainMessage, now_s: float) -> None:
-        """Pass a position to the on-board supervision, without one its absence."""
+        """Pass a position, or its absence, to the on-board supervision."""
         place, over, under = message.chainage_cm, message.over_cm, message.under_cm
         if place is None or over is None or under is None or message.speed_cmps is None:
             on_board.note_position(None, None, now_s=now_s)

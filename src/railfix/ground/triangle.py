@@ -1,4 +1,4 @@
-"""Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points; its monitor.
+"""Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points, and monitor.
 
 In P3 (reference triangle) each fix is compared with its point by a circle of allowable error, and the vectors between
 neighbouring fixes (distance and bearing) with the vectors between the points. P3 treats a fix inside its circle as the
@@ -41,15 +41,15 @@ class TriangleVerdict(IntEnum):
     RECEIVER_DRIFTING = 1
     #: One fix is outside its circle, and both its sides differ.
     ONE_RECEIVER = 2
-    #: Three fixes are outside, with the shape kept: a fault of satellites, or a disturbance common to all.
+    #: All fixes are outside their circles, and all sides within their limits, as after a satellite fault or jamming.
     SATELLITES_OR_JAMMING = 3
-    #: The fixes coincide: one false signal for all three receivers.
+    #: The fixes coincide, as after one false signal for all three receivers.
     SPOOFING = 4
     #: Any other combination: the ground side cannot decide.
     GROUND_LOST = 5
     #: A fix is absent.
     MONITOR_LOST = 6
-    #: A fix is absent and the C/N0 of all three has fallen.
+    #: A fix is absent, and the C/N0 of all three receivers has fallen.
     JAMMING = 7
 
 
@@ -413,7 +413,7 @@ def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> N
 def judge_fixes(fixes: StationFixes, limits: TriangleLimits) -> TriangleResult:
     """Compare fixes with the triangle of their points.
 
-    Raise SettingsError if its sides are too short for the limits.
+    Raise SettingsError if the sides of the triangle are too short for the limits.
     """
     try:
         return compare_triangle(fixes.points_m, fixes.fixes_m, limits=limits, cn0_fallen=fixes.cn0_fallen)

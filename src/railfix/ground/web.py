@@ -61,8 +61,8 @@ Order = Callable[..., str | None]
 class Sessions:
     """Log-ins of the page.
 
-    `password` is that of the operator, who logs in without a name; `others` are the passwords of other persons and
-    interfaces, by name.
+    `password` is the password of the operator, who logs in without a name; `others` are the passwords of other persons
+    and interfaces, by name.
     """
 
     password: str
@@ -73,7 +73,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None for a wrong password, or after too many from this address."""
+        """Open a session and return its token; None for a wrong password, or after `MOST_WRONG` from this address."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
@@ -107,9 +107,9 @@ class Sessions:
 
 
 def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
-    """Return the web application: the snapshot's plain values, and orders by the last part of their address.
+    """Return the web application, which shows the snapshot, and accepts the orders at ``/orders/NAME``.
 
-    ``done`` in the snapshot ends its events.
+    Events with the snapshot are sent until ``done`` in the snapshot is true.
     """
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
     newest: tuple[float, str, bool] | None = None

@@ -62,8 +62,8 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
 class Commits:
     """Commits of the centre, at most one in progress, and the fault of the store.
 
-    `alarm` is the reason why the store rejects the state, None without a fault. During a fault no authority is sent,
-    but orders to brake are.
+    `alarm` is the reason why the store rejects the state, None without a fault. During a fault no authority is sent;
+    orders to brake are still sent.
     """
 
     writer: ThreadWriter | None = None  #: Executor; without one a commit is carried out at once.

@@ -45,7 +45,7 @@ _BLOCK = 600
 
 
 class ResultTables:
-    """A context manager that writes ``positions.*``, ``train.*`` and ``passings.*`` of a session into a folder."""
+    """Context manager that writes ``positions.*``, ``train.*`` and ``passings.*`` of a session into a folder."""
 
     def __init__(self, out: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
         self._folder = OutputFolder(out, overwrite=overwrite, inputs=list(inputs))
@@ -110,13 +110,13 @@ def _check_outputs(inputs: LiveInputs) -> None:
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """Run a session until its sources end, or until SIGINT or SIGTERM.
 
-    Returns the lines of the summary, and whether SIGTERM ended the session. SIGHUP is logged and counted, and has no
+    Return the lines of the summary, and whether SIGTERM ended the session. SIGHUP is logged and counted, and has no
     other effect. Raise RailfixError if a source, sink, file or setting is invalid, or two channels disagree.
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
     if inputs.live.gga_s > 0.0 and not (inputs.base or "").startswith("ntrip"):
-        raise SettingsError("--live gga_s is given without an NTRIP caster as --base; name one, or leave gga_s out")
+        raise SettingsError("--live gga_s is given without an NTRIP caster as --base; give one, or leave gga_s out")
     _check_outputs(inputs)
     check_filter(inputs.config, inputs.sensors)
     live = inputs.live
@@ -246,14 +246,14 @@ def _hooks(
                 observer(output)
             except OutputError as error:  # raised again when the outlet is closed
                 observers.remove(observer)
-                log.say(f"{error}; this output has ended, the others go on")
+                log.say(f"{error}; this output has ended, the others continue")
 
     show = log.show if log.shows_status else None
     return Hooks(observe=observe, sensed=sensed, save=save, show=show), streams
 
 
 def _close(outlet: Outlet[Any], log: SessionLog) -> None:
-    """Close an outlet, and log the number of items that it has not written."""
+    """Close an outlet, and log the numbers of items that were dropped or not delivered."""
     outlet.close()
     if outlet.dropped or outlet.failed:
         reason = f"; it {outlet.failure}" if outlet.failure else ""
@@ -293,5 +293,5 @@ def _check_reference(line: OpenedLine, live: LiveSettings) -> None:
     if max(abs(end - live.reference_m) for end in ends) > _REACH_OF_REFERENCE_M:
         raise SettingsError(
             f"--live reference_m={live.reference_m:g}: the line extends from 0 to {ends[1]:.0f} m, position reports "
-            f"only to {_REACH_OF_REFERENCE_M:.0f} m from its reference location; give one that is nearer to the line"
+            f"only to {_REACH_OF_REFERENCE_M:.0f} m from the reference location; give a location nearer to the line"
         )

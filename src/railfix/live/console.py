@@ -47,7 +47,7 @@ _WAITING: Final = 1000
 
 
 class _Terminal:
-    """Standard error output: lines of the log, and below them the status line, a `Text`."""
+    """Standard error output with the lines of the log and, below them, the status line (a `Text`)."""
 
     def __init__(self, *, status: bool) -> None:
         self._console = Console(stderr=True, highlight=False)
@@ -111,7 +111,7 @@ def check_log_file(path: Path) -> None:
 class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
-    A file of `LiveSettings.log_bytes` is renamed to ``path.1``, an older file to ``path.2``, and so on. The status line
+    A file that has `LiveSettings.log_bytes` is renamed to ``path.1``, the older file to ``path.2``, and so on. The line
     is shown only where the standard error output is a terminal. Raise OutputError if the file cannot be opened.
     """
 
@@ -266,7 +266,7 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
         raise SettingsError(f"--metrics {address}: no server can be opened at this address ({error})") from None
 
 
-#: Time after which the sensors are checked, interval of the radar checks, least interval of the positions used [ns].
+#: Time after which the sensors are checked, interval of the radar checks, and minimum interval of positions used [ns].
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
@@ -319,7 +319,7 @@ class SensorWatch:
                 self.judge()
 
     def _hear(self, sensed: Sensed) -> None:
-        """Store samples; after twice `WATCHED_NS` without a check, check and drop them, to limit the memory."""
+        """Store samples; after twice `WATCHED_NS` without a check, check the sensors if possible, and drop samples."""
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)

@@ -65,7 +65,7 @@ class EngineState:
 
 @dataclass(frozen=True, kw_only=True)
 class _FromSatellites:
-    """Navigation records, SBAS messages and base-station epochs; `heard` is the number of the last arrival."""
+    """Navigation records, SBAS messages and base-station epochs; `heard` is the serial number of the last arrival."""
 
     heard: int
     navigation: Navigation | None = None
@@ -155,7 +155,7 @@ class LiveEngine:
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
 
     def add_base(self, epoch: Observations) -> None:
-        """Add an epoch of the base station, used from the next epoch on; out of order it is counted and dropped."""
+        """Add an epoch of the base station for the next epochs; an epoch out of order is counted and dropped."""
         if self._based_to is not None and epoch.time[0] <= self._based_to:
             self.counts["base station out of order"] += 1
             return
@@ -186,7 +186,7 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session; its sequence number is `reserved` above the last, for a crash."""
+        """Return the state for a restarted session, with the last sequence number plus `reserved` (for a crash)."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
@@ -204,7 +204,7 @@ class LiveEngine:
         self._saved = saved if saved.done_ns else None
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
-        """Add an antenna's epoch, received at `now_ns` by the clock of `poll`; raise ValueError if no such antenna."""
+        """Add an antenna's epoch, received at `now_ns` (clock of `poll`); raise ValueError for an unknown antenna."""
         if antenna not in self._waiting:
             raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)
@@ -239,10 +239,10 @@ class LiveEngine:
         else:
             self._state = State(received=saved.state.received)
             side = "before" if age_s > 0.0 else "after"
-            allowed = f"up to {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
+            allowed = f"at most {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
             self.reports.append(
                 f"state file: only its ephemerides and sequence number are used: its last epoch is "
-                f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
+                f"{abs(age_s):.1f} s {side} the first new epoch, {allowed}"
             )
         # Navigation files of this session are merged with the data of the state file.
         known = self.processor.received.navigation

@@ -42,7 +42,7 @@ def cbor_bytes(output: LiveOutput) -> bytes:
 def nmea_bytes(output: LiveOutput) -> bytes:
     """Return the NMEA 0183 sentences GGA, RMC and GST of the first antenna.
 
-    They are empty bytes without input. Without a position GGA and RMC have no coordinates, and there is no GST.
+    The result is empty without input. Without a position, GGA and RMC have no coordinates, and there is no GST.
     """
     place = _geodetic(output)
     if output.result is None:
@@ -71,7 +71,7 @@ def nmea_bytes(output: LiveOutput) -> bytes:
 
 
 def gga_sentence(output: LiveOutput) -> bytes:
-    """Return the GGA sentence of a valid position; empty without one."""
+    """Return the GGA sentence of a valid position; empty if the output has none."""
     valid = output.message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
     return nmea_bytes(output).split(b"\r\n")[0] + b"\r\n" if valid and _geodetic(output) is not None else b""
 

@@ -20,7 +20,7 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: Bound of the speed in sigmas: 1e-7 two-sided, the initial value of the protection level (P1 2.4).
+#: K factor of the speed bound, for a two-sided probability of 1e-7, the initial value for protection levels (P1 2.4).
 _SPEED_K = 5.33
 #: Increase of bounds for chainages rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
@@ -50,7 +50,7 @@ class TrainPlace:
     """Position of the train's reference point at the last epoch of a result."""
 
     antenna: str  #: Antenna that determines the position.
-    #: Chainage of the reference point; NaN without a position.
+    #: Chainage of the reference point and its standard deviation [m]; NaN without a position.
     chainage_m: float
     sigma_m: float
     #: Bound of the position error, and the protection level that it contains [m]; infinite without a bound.
@@ -192,7 +192,7 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the worst suspected interference of all antennas at the last epoch; None without this check."""
+    """Return the worst suspected interference of all antennas at the last epoch; None if the check is off."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 

@@ -132,8 +132,8 @@ async def run_session(
 class _Session:
     """Running session: its parts, the states of its streams, and monotonic times of the last actions [s].
 
-    `read_to_ns` has the latest tag received from each source that has not ended, -1 before the first; `place` is the
-    last position as a GGA sentence, for a virtual base station.
+    `read_to_ns` has the latest time tag received from each source that has not ended, -1 before the first tag. `place`
+    is the last position as a GGA sentence, for a virtual base station.
     """
 
     engine: LiveEngine
@@ -223,7 +223,7 @@ class _Session:
                 self.tell(name, source, item)
 
     def tell(self, name: str, source: str, item: Connected | Lost) -> None:
-        """Log the event of a connection, and count losses."""
+        """Log that a connection was opened or lost, and count the losses."""
         if isinstance(item, Lost):
             self.metrics.lost[hidden(source)] += 1
             _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), item.reason, item.wait_s)
@@ -285,7 +285,7 @@ class _Session:
             sink.send(output)
         except OutputError as error:
             self.ended[sink.name] = error
-            _LOG.warning("%s; this output has ended, the others go on", error)
+            _LOG.warning("%s; this output has ended, the others continue", error)
             if len(self.ended) == len(self.sinks):
                 raise
 

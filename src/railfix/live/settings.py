@@ -40,8 +40,8 @@ class LiveSettings(Settings):
     ntrip_certificates: Path | None = None
     #: Number of messages that may wait for a slow target; further messages to it are dropped and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Delay of epochs relative to the shortest observed delay at which epochs are skipped, with a log line; not for
-    #: recorded epochs.
+    #: Delay of epochs, relative to the shortest observed delay, above which epochs are skipped with a line in the log;
+    #: recorded epochs are never skipped.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Period at which the state file is written.
     #: Longest time from the last epoch of a state file to the first new epoch; after a longer time only ephemerides and
@@ -53,15 +53,15 @@ class LiveSettings(Settings):
     #: Identities of train and line in messages.
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
-    #: Direction along the chainage of the train's leading end at the start, 0 where unknown. None: from the vehicle
-    #: file. A train that has run 50 m in the other direction has changed ends.
+    #: Direction along the chainage of the train's leading end at the start, 0 where unknown; by default from the
+    #: vehicle file. A train that has run 50 m in the other direction has changed ends.
     facing: Literal[-1, 0, 1] | None = None
-    #: Distance of the train's front end ahead of the front antenna. None: computed from the vehicle file.
+    #: Distance of the train's front end ahead of the front antenna; by default computed from the vehicle file.
     front_offset_m: float | None = Field(default=None, ge=0.0)
-    length_m: float | None = Field(default=None, gt=0.0)  #: Train length. None: from the vehicle file.
+    length_m: float | None = Field(default=None, gt=0.0)  #: Train length; by default from the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
     reference: int = Field(default=0, ge=0, lt=1 << 24)
-    reference_m: float = 0.0  #: Chainage of this reference location.
+    reference_m: float = 0.0  #: Chainage of the reference location of ETCS position reports.
 
 
 #: On-board sensors.
@@ -111,14 +111,16 @@ class LiveInputs(Settings):
         metavar="FORM@TARGET",
     )
     speed: float | None = option(
-        "Replay files this many times as fast as recorded; by default without pause.", None, metavar="TIMES", ge=0.01
+        "Speed of the replay relative to real time; by default without pauses.", None, metavar="TIMES", ge=0.01
     )
-    channels: Literal["1", "2"] = option("2: a second process checks every message; a difference ends the output.", "1")
+    channels: Literal["1", "2"] = option(
+        "Number of channels; with 2, a second process checks every message, and a difference ends the output.", "1"
+    )
     metrics: str | None = option("Serve metrics as Prometheus text at /metrics.", None, metavar="HOST:PORT")
     state: Path | None = option(
         "Write the state regularly into this file, and continue from it after a restart.", None, metavar="FILE"
     )
-    log: Path | None = option("Also log into this file, which rotates.", None, metavar="FILE")
+    log: Path | None = option("Also write the log into this file, which is rotated.", None, metavar="FILE")
     out: Path | None = option("Also write the tables of results into this folder.", None, metavar="DIR")
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
     config: Config = Field(default_factory=Config)

@@ -51,7 +51,7 @@ class Outlet(Generic[Item]):
         self._thread.start()
 
     def send(self, item: Item) -> None:
-        """Add one item to the queue; OutputError with "wait", if the target has refused the last item."""
+        """Add one item to the queue; with "wait", raise OutputError if the target has refused the last item."""
         if self._defect is not None:
             raise self._defect
         if self._full == "wait":
@@ -109,7 +109,7 @@ class Sink(Protocol):
     name: str  #: Name in counts and messages.
     dropped: int  #: Number of messages dropped for a slow reader.
     failed: int  #: Number of messages that the target refused.
-    failure: str  #: Reason for refusing the last message; blank if it was accepted.
+    failure: str  #: Reason for refusing the last message; blank if the message was accepted.
 
     def send(self, item: LiveOutput, /) -> None:
         """Process one output."""
@@ -235,7 +235,7 @@ class OutletSink(Outlet[LiveOutput]):
             super().send(item)
 
     def close(self) -> None:
-        """Send the remaining outputs, and close the target; OutputError as for `Outlet.close`."""
+        """Send the remaining outputs, and close the target; raise OutputError as `Outlet.close` does."""
         try:
             super().close()
         finally:
@@ -296,7 +296,7 @@ def parse_file_target(text: str) -> Path | None:
 async def open_sink(
     text: str, settings: LiveSettings | None = None, *, overwrite: str = "refuse", full: str = "drop"
 ) -> Sink:
-    """Open the sink of a text ``FORM@TARGET``; `full` as for `Outlet`.
+    """Open the sink of a text ``FORM@TARGET``; `full` is as for `Outlet`.
 
     Raise SettingsError if the text has no valid form or target. Raise OutputError if the target cannot be opened, or is
     an existing file and `overwrite` is "refuse".

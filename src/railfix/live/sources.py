@@ -234,7 +234,7 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
         if answer.ended:
             return
     if not answer.begun:
-        hint = "" if tls is not None else "; does it expect TLS (ntrips://)?"
+        hint = "" if tls is not None else "; it may expect TLS (ntrips://)"
         raise InputFileError(hidden(source), f"the caster has closed the connection without an answer{hint}")
 
 
@@ -309,7 +309,7 @@ class _Answer:
                     self.ended = True
                     break
         except self._h11.RemoteProtocolError as error:  # bytes received before the error are used
-            self._broken = InputFileError(hidden(self._source), f"the caster's answer is no HTTP ({error})")
+            self._broken = InputFileError(hidden(self._source), f"the caster's answer is not HTTP ({error})")
         return bytes(content)
 
     def check(self) -> None:
@@ -342,14 +342,14 @@ class _Answer:
     def _no_stream(self, what: str) -> InputFileError:
         return InputFileError(
             hidden(self._source),
-            f"the caster sends {what}, not a receiver's stream; are host and mount point right?",
+            f"the caster sends {what}, not a receiver's stream; check host and mount point",
         )
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
     """Return a TLS context with the certificates of the system and of a PEM file.
 
-    Raise SettingsError if it has none.
+    Raise SettingsError if the file cannot be read or has no certificate.
     """
     context = ssl.create_default_context()
     if certificates is not None:
@@ -363,8 +363,8 @@ def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
 
 def _refuse(source: str, first: bytes) -> InputFileError:
     text = first[:80].decode("latin-1")
-    hint = "; is the mount point right?" if "SOURCETABLE" in text else ""
-    hint = "; are user and password right?" if "401" in text else hint
+    hint = "; check the mount point" if "SOURCETABLE" in text else ""
+    hint = "; check user and password" if "401" in text else hint
     return InputFileError(hidden(source), f"the caster answers {text!r}{hint}")
 
 

@@ -77,7 +77,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 
 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
-    """Read a state file; its state is used only if its entries agree with those of this session (`belongs_to`).
+    """Read a state file; the state is used only if the entries of the file agree with `under` (`belongs_to`).
 
     Raise OutputError if the file is not a state file, and would be overwritten by the session.
     """
@@ -96,7 +96,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     if data and not form.startswith("railfix live state "):
         raise OutputError(f"{path}: is not a state file of railfix live, which would overwrite it; give another file")
     if form != _FORM:
-        return _refuse(path, "is no state file of this version")
+        return _refuse(path, "is not a state file of this version")
     for name, value in under.items():
         if head.get(name) != value:
             return _refuse(path, f"was made with another {name}")

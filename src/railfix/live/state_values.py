@@ -61,7 +61,7 @@ def _encode(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:
 
     def put(array: np.ndarray[Any, Any]) -> int:
         if array.dtype.hasobject:
-            raise StateFormatError("an array of objects is no part of a state")
+            raise StateFormatError("an array of objects cannot be part of a state")
         arrays.append(array)
         return len(arrays) - 1
 
@@ -93,7 +93,7 @@ def _encode(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:
         return {"settings": _name(kind), "values": value.model_dump(mode="json", exclude_unset=True)}
     if _is_value(kind):
         return {"of": _name(kind), "fields": {f.name: _encode(getattr(value, f.name), arrays) for f in fields(value)}}
-    raise StateFormatError(f"{kind.__module__}.{kind.__qualname__} is no part of a state")
+    raise StateFormatError(f"{kind.__module__}.{kind.__qualname__} cannot be part of a state")
 
 
 def _decode(tree: Any, stored: Mapping[str, Any]) -> Any:
@@ -150,4 +150,4 @@ def _find(name: str, fits: Any) -> Any:
         found = getattr(import_module(module), own, None)
         if isinstance(found, type) and found.__module__ == module and fits(found):
             return found
-    raise StateFormatError(f"{name} is no part of a state")
+    raise StateFormatError(f"{name} cannot be part of a state")

@@ -278,7 +278,7 @@ class SensorLines:
 #: Largest drift of the computer's clock relative to GPS time; the stored shortest delay grows at this rate.
 DRIFT: Final = 1e-4
 #: A delay that is constant within `STEADY_S` for `ADMITTED_S` [s] and `STEADY_EPOCHS` skipped epochs is an offset of
-#: the tags. The delay of a session would decrease, or increase if the computer is too busy even to skip epochs.
+#: the time tags. A processing delay would decrease, or increase if the computer is too busy even to skip epochs.
 ADMITTED_S: Final = 2.0
 STEADY_S: Final = 0.2
 STEADY_EPOCHS: Final = 5

@@ -41,8 +41,8 @@ class TrainFrame:
     trajectories: Mapping[str, Trajectory]
     facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
     running: int  #: Direction of the leading end at the start, 0 where unknown.
-    #: Distances of the train's front end ahead of the reference point and of its rear end behind it, and its length
-    #: [m]; NaN where unknown.
+    #: Distance of the train's front end ahead of the reference point, distance of the rear end behind the reference
+    #: point, and length of the train [m]; NaN where unknown.
     front_m: float
     rear_m: float
     length_m: float
@@ -140,8 +140,8 @@ class RunningEnd:
     """
 
     direction: int  #: 1 toward rising chainage, -1 toward falling, 0 where unknown.
-    #: Bounds of the reference point's chainage since the last change: upper bound of the lowest, lower bound of the
-    #: highest; infinite before the first position.
+    #: Upper bound of the lowest and lower bound of the highest chainage of the reference point since the last change
+    #: [m]; infinite before the first position.
     low_m: float = math.inf
     high_m: float = -math.inf
     last_m: float = math.inf  #: Last chainage; infinite before the first.

@@ -98,7 +98,7 @@ def _read_logs() -> dict[str, Observations]:
 
 
 def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations]) -> None:
-    """Process epochs in one call and one by one."""
+    """Process the first epochs of the logs with the settings `chosen`, in one call and one by one."""
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
@@ -110,7 +110,7 @@ def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations])
 
 
 def _look_beyond() -> None:
-    """Call the kernels for positions beyond a level; the demonstration does not, as its line is straight there."""
+    """Call the kernels for positions beyond a level, which the straight line of the demonstration does not require."""
     nothing, clock = np.zeros((1, 1)), np.zeros(1, dtype=np.intp)
     model = ModelArrays(
         nothing, clock, np.zeros((1, 1, 1)), np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.zeros((3, 3)), nothing

@@ -1,4 +1,4 @@
-"""Campaigns: positioning of many logs by one command that can be resumed, with one results folder per run.
+"""Positioning of many logs by one command, which can be resumed, with one results folder per run.
 
 The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables together are
 one hive-partitioned data set, which ``pl.scan_parquet(out / "runs/**/positions.parquet")`` reads.
@@ -37,9 +37,9 @@ _FIELD: Final = re.compile(r"\{(\w+)\}")
 class Campaign(Settings):
     """Files of a campaign, given by patterns with fields in braces; paths are relative to the campaign file.
 
-    A run has the files whose fields have the same values as those of its front log. With ``nav/{day}.nav*`` a run has
-    the navigation files of its day, with ``{line}/track.csv`` the track of its line. A name without fields and ``*`` is
-    a file of every run.
+    A run has the files whose fields have the same values as the fields of the run's front log. With ``nav/{day}.nav*``
+    a run has the navigation files of its day, with ``{line}/track.csv`` the track of its line. A name without fields
+    and ``*`` is a file of every run.
     """
 
     #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs with the same values of
@@ -73,7 +73,7 @@ class CampaignRun:
     config: Config
     options: RunOptions
     out: Path  #: Results folder.
-    reference: Path | None = None  #: Reference trajectory; None without.
+    reference: Path | None = None  #: Reference trajectory; None if there is none.
 
     @property
     def done(self) -> bool:
@@ -160,7 +160,7 @@ def run_campaign(
 
     `reading`, if it differs from the default, replaces the reading options of the campaign. `executor` has the
     interface of `concurrent.futures`; its workers must have access to the same files. `lost` are the exceptions by
-    which it reports that a worker process has ended.
+    which the executor reports that a worker process has ended.
     """
     runs = read_campaign(path, out)
     if reading not in (None, LogReading()):
@@ -205,9 +205,9 @@ def position_runs(
 
 
 def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Return `position_run` of a run; if a worker process is interrupted in it, end the process.
+    """Return the result of `position_run`; if the worker process is interrupted during the run, end the process.
 
-    The run has then already removed its incomplete results.
+    The incomplete results of the run have been removed before the process ends.
     """
     try:
         return position_run(run)

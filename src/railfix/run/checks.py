@@ -31,7 +31,7 @@ ANOTHER_DAY: Final = np.timedelta64(24, "h")
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
-#: First and last time.
+#: First and last time of a log, of messages, or of navigation records.
 Span = tuple[np.datetime64, np.datetime64]
 
 

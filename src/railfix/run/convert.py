@@ -115,7 +115,7 @@ _APPROXIMATED: Final = 1
 
 
 def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates of a table of positions as an MCAP file of ROS 2 messages; return their number.
+    """Write the rows with coordinates of a table of positions as ROS 2 messages in an MCAP file; return their number.
 
     Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix), ``/ANTENNA/row`` (all columns) and, for the
     filter only, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time stamps are UTC. Absent numbers are NaN, and

@@ -158,7 +158,7 @@ def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
     place = header.approximate_ecef_m
     own = _own_ephemerides(path, date)
     if own is not None:
-        facts.append(f"{own[0]:,} ephemerides inside")
+        facts.append(f"{own[0]:,} ephemerides in the log")
     return FileFinding(
         path=path,
         kind="observations",
@@ -305,7 +305,7 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: Kinds as which a command may use a file, by the kind of its content.
+#: Kinds of input for which a file may be used, by the kind of its content.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "observations": ("observations",),
     "navigation": ("navigation",),
@@ -316,7 +316,7 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
 }
-#: Readers by kind of file; those of `_DATED` have a date as second argument.
+#: Readers by kind of file; the readers in `_DATED` have a date as second argument.
 _DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,

@@ -1,4 +1,4 @@
-"""Positioning of the logs of a run: logs are read in chunks, epochs processed, and tables written."""
+"""Positioning of the logs of a run, chunk by chunk, and writing of the tables and the record of the run."""
 
 from __future__ import annotations
 
@@ -85,7 +85,8 @@ def run_files(
     """Position the logs of one run along its line and write the results into the folder `out`.
 
     `config` has all settings; `asked` has the explicitly given settings, which are recorded in ``run.json``.
-    Raise RailfixError if see `railfix.core.errors`; `out` is then left as it was. Notes are issued as `RailfixWarning`.
+    Notes are issued as `RailfixWarning`. Raise a RailfixError (`railfix.core.errors`) and leave `out` unchanged if the
+    run fails.
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
@@ -368,7 +369,7 @@ _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     """Return a description of a sign of interference for the beginning of a sentence.
 
-    `tag_error_s` are the smallest and largest time-tag error.
+    `tag_error_s` are the smallest and largest time-tag error [s], positive for late tags.
     """
     if sign == "left_map":
         return "the 3-D positions have left the map (column interference_causes)"

@@ -183,7 +183,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Return the checked inputs, including files named by settings, and settings with the logs for "stream"."""
+        """Return the checked inputs with the files that settings name, and settings with the logs for "stream"."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -364,7 +364,7 @@ class LogReading(Settings):
 
     @property
     def instant(self) -> np.datetime64 | None:
-        """`date` as GPS time in the type of the readers' arguments; None if it is not given."""
+        """`date` as a GPS time in nanoseconds, the type of the readers' arguments; None if `date` is not given."""
         return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
 
 
@@ -395,8 +395,8 @@ class ColumnNames(Settings):
 class RunOptions(Settings):
     """Options of a run that do not change the positions."""
 
-    start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
-    end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
+    start: datetime | None = option("GPS time from which epochs are processed.", None, metavar="TIME")
+    end: datetime | None = option("GPS time before which epochs are processed.", None, metavar="TIME")
     base_place: str | None = option(
         "Position of the base station in the frame of the satellites; by default from the header of its log.",
         None,

@@ -331,7 +331,7 @@ class MeasuredFeature:
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
     """Return the features detected in the combined values of all runs (`read_measured`), in order of chainage.
 
-    `of_map` are the features of the map with which they are compared.
+    `of_map` are the features of the map with which the detected features are compared.
     """
     alone = [_features(run) for run in runs]
     found = []

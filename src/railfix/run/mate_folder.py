@@ -16,9 +16,9 @@ _INPUTS: Final = {
 
 
 def find_inputs(folder: Path) -> dict[str, Any]:
-    """Return the paths of the tables in a folder, by the field of `railfix.run.inputs.RunInputs` that each provides.
+    """Return the paths of the tables in a folder, by the name of the field of `railfix.run.inputs.RunInputs`.
 
-    Raise InputFileError if there is no such folder, or it has no table S_GNSS_SAT, or none of the track.
+    Raise InputFileError if there is no such folder, or if it lacks the table S_GNSS_SAT or a table of the track.
     """
     if not folder.is_dir():
         raise InputFileError(folder, "--mate expects a folder with tables of EGNSS MATE")

@@ -1,8 +1,8 @@
-"""Outputs of all commands: files are written under temporary names, moved to the output folder when all are complete,
-and never replace an input.
+"""Writing of output files under temporary names, which are moved to the output folder when all files are complete.
 
-Staging folders are hidden and locked. If a process is killed, its staging folder remains, but the operating system
-releases the lock. A staging folder that is not locked therefore belongs to a process that has ended.
+An output never replaces an input. Staging folders are hidden and locked. If a process is killed, its staging folder
+remains, but the operating system releases the lock. A staging folder that is not locked therefore belongs to a process
+that has ended.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _PREFIX: Final = ".railfix-"
 _LOCK: Final = ".lock"
-#: Name of the folder of complete files inside a staging folder; it appears by one rename.
+#: Name of the folder of complete files inside a staging folder; one rename creates the folder with all files.
 READY: Final = "ready"
 
 
@@ -147,7 +147,7 @@ _LOOK_S: Final = 0.1
 
 
 class ParquetFile:
-    """Parquet file to which tables of one schema are appended, in memory that does not grow with their number.
+    """Parquet file to which tables of one schema are appended; the memory used does not grow with their number.
 
     polars writes a file from one query. The source of that query runs in a thread and waits for the next table; at most
     one table is queued.
@@ -162,7 +162,7 @@ class ParquetFile:
         self._thread.start()
 
     def append(self, table: pl.DataFrame) -> None:
-        """Queue rows for writing; raises errors that occurred while writing earlier rows, or SchemaError."""
+        """Queue rows for writing; raise SchemaError, or an error that occurred while earlier rows were written."""
         from polars.exceptions import SchemaError
 
         if table.schema != self._schema:
@@ -170,7 +170,7 @@ class ParquetFile:
         self._give(table)
 
     def end(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write the remaining rows and the footer with `metadata`; raises errors that occurred while writing."""
+        """Write the remaining rows and the footer with `metadata`; raise an error that occurred during writing."""
         self._metadata = dict(metadata or {})
         self._give(None)
         self._thread.join()
@@ -389,7 +389,7 @@ def check_folder(path: Path, *, overwrite: Overwrite) -> None:
 
 
 def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
-    """Raise OutputError if a file to be written is one of the inputs, also under another name (link)."""
+    """Raise OutputError if a file to be written is one of the inputs, or a link to one of them."""
     for path in inputs:
         if target.resolve() == path.resolve() or (target.exists() and path.exists() and target.samefile(path)):
             raise OutputError(f"{target}: is an input, which is never overwritten; give another output")

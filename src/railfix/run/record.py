@@ -1,4 +1,4 @@
-"""Record of a run (``run.json``): inputs, given and used settings, results; and tables of a record."""
+"""Record of a run (``run.json``) with inputs, settings and results, and tables made from a record."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_leve
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
     """Return statistics of each antenna from the written tables, with lengths in [m]; None for missing statistics.
 
-    They describe the sigma along the line, the chainage, the finite protection levels (with epochs by status), and the
-    filter (with epochs by status, and the number of protection levels within each limit of `WITHIN_M`).
+    The statistics describe the sigma along the line, the chainage, the finite protection levels (with epochs by
+    status), and the filter (with epochs by status, and the number of levels within each limit of `WITHIN_M`).
     """
     return {
         name: {
@@ -227,7 +227,9 @@ class RunRecord:
             return read()
         except SettingsError as error:
             path = self.path / "run.json"
-            raise InputFileError(path, f"does not fit this version ({error}); repeat the run with it") from None
+            raise InputFileError(
+                path, f"does not fit this version ({error}); repeat the run with this version"
+            ) from None
 
     def check_inputs(self) -> None:
         """Raise InputFileError if an input file is missing, or MismatchError if an input has changed since the run."""

@@ -54,13 +54,13 @@ NONE: Final = "none"
 #: Additional columns of positions on a network.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track": "track of the network on which the position lies; it is part of the route found from the log",
-    "track_chainage_m": "distance in plan of the antenna along that track from the first point of the track",
+    "track_chainage_m": "distance in plan of the antenna along `track` from the first point of the track",
     "track_probability": "probability, given the whole log, that the train is on the route at this position; "
     "`tracks.csv` has the alternatives",
     "unmapped_probability": "probability, given the whole log, that the train is on a track that is not in the map",
-    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from that "
-    "track; positive to the right",
-    "unconstrained_up_m": "height of the 3-D position without the map above that track, less the antenna height if the "
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from "
+    "`track`; positive to the right",
+    "unconstrained_up_m": "height of the 3-D position without the map above `track`, less the antenna height if the "
     "vehicle is known",
 }
 #: Columns of the table of tracks near each position.
@@ -69,7 +69,7 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "antenna": "`front` or `rear`",
     "track": "track of the network; `none` is a track that the map does not have",
     "on_route": "whether the track belongs to the route on which the positions are computed",
-    "probability": "probability of this track given the whole log; the rows of an epoch and antenna sum to 1",
+    "probability": "probability of `track` given the whole log; the rows of an epoch and antenna sum to 1",
     "chainage_m": "distance in plan along the track from its first point to the point nearest to the position",
     "kilometrage_m": "kilometrage at the point of `chainage_m` as marked on the line, if the map has it",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
@@ -309,7 +309,7 @@ class RouteOfLog:
 class BaseObservations(Protocol):
     """Observations of a base station in order of time (`railfix.run.processor_setup.BaseLog`)."""
 
-    ecef_m: Floats  #: Position of the station; shape (3,).
+    ecef_m: Floats  #: Position of the station, ECEF, shape (3,) [m].
 
     def until(self, time: np.datetime64) -> Observations | None:
         """Return the epochs up to a time that have not been returned before; None if there are none."""
@@ -326,9 +326,8 @@ class LogPositions:
     time: np.datetime64 | None  #: Epoch of the transformation between frames; None without a navigation record.
     reading: TrackReading
     antenna_up_m: float | None = None  #: Height of the antenna above the rails [m]; None if no vehicle is given.
-    open_base: Callable[[], BaseObservations | None] = lambda: (
-        None
-    )  #: Opens the log of the base station; returns None if there is no base station.
+    #: Opens the log of the base station; returns None if there is no base station.
+    open_base: Callable[[], BaseObservations | None] = lambda: None
 
     @cached_property
     def positions(self) -> PositionLog:

@@ -107,7 +107,7 @@ def sign_notes(
         slope = _slope(_centre(expected), _centre(force(time)), _LEAST_FORCE_MPS2)
         if slope < _REVERSED:
             yield (
-                "inertial: its force forward is opposite to the acceleration by satellites; the unit is mounted "
+                "inertial: its force forward is opposite to the acceleration from satellites; the unit is mounted "
                 "backwards, or facing in the vehicle file is wrong"
             )
         yaw = _means(inertial.time, inertial.rate_radps[:, 2], time)
@@ -136,7 +136,7 @@ def _of_speeds(
     measured = speeds(time)
     known = np.isfinite(measured) & (np.abs(forward) > _MOVING_MPS)
     if directed and known.sum() >= _LEAST_CELLS and np.mean(measured[known] * forward[known] < 0.0) > 0.5:
-        yield f"{name}: {directed} opposite to the motion by satellites; reverse it, or correct the vehicle's facing"
+        yield f"{name}: {directed} opposite to the motion from satellites; reverse it, or correct the vehicle's facing"
 
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:

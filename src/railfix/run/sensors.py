@@ -63,8 +63,8 @@ def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path
     """Read the surveyed ground units of two-way ranges; None without ranges.
 
     `ranging` is the table of the ranges or their stream. Raise InputFileError if `units` is not a table of ground
-    units. Raise MismatchError if it lacks the unit of a range. Raise SettingsError if only one of `units` and `ranging`
-    is given.
+    units. Raise MismatchError if `units` lacks the unit of a range. Raise SettingsError if only one of `units` and
+    `ranging` is given.
     """
     if ranging is None and units is not None:
         raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
@@ -136,7 +136,7 @@ def load_balises(
 ) -> ListedBalises | None:
     """Read the lists of balises (`places`) and of virtual balises (`virtual`); None if neither is given.
 
-    `readings` is the table or the stream of balise readings. Raise InputFileError if see `read_listed_balises`. Raise
+    `readings` is the table or the stream of balise readings. Raise InputFileError as `read_listed_balises` does, and
     SettingsError if readings are given without a list or a list without readings, or virtual balises without protection
     levels of the filter.
     """

@@ -122,7 +122,7 @@ def open_line(
     With a time `at`, the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
     otherwise the coordinates remain in the frame of the map. A single file whose tracks do not join to one route is a
     network, in which the route is found from `log`. If `heights` is `OF_LOG`, the positions of `log` are the heights of
-    a map without heights. Raise RailfixError if see `railfix.core.errors`.
+    a map without heights. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -178,7 +178,7 @@ def _read_line(
         if not is_route(segments):
             if log is None:
                 raise MismatchError(
-                    f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one with "
+                    f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one by "
                     "'railfix map route'"
                 )
             route = log.route(connect_network(segments, track))
@@ -248,7 +248,7 @@ class Log:
                 yield piece
 
     def first_epochs(self) -> Iterator[tuple[Path, np.datetime64]]:
-        """Yield the path and the first epoch of each file, within `start` and `end`; nothing if there is only one."""
+        """Yield the path and the first epoch of each file, within `start` and `end`; nothing for a log in one file."""
         for path in self.paths if len(self.paths) > 1 else ():
             alone = replace(self, paths=(path,), problems=[], skipped=Counter(), chunk_epochs=1)
             with suppress(MismatchError), closing(alone.parts()) as parts:

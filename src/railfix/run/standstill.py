@@ -1,4 +1,4 @@
-"""Pseudoranges (codes) and carrier phases of an antenna at rest, differenced with those of a base station if given."""
+"""Pseudoranges (codes) and carrier phases of an antenna at rest, minus a base station's observations if given."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class StandstillCodes:
     phases: StandstillPhases | None = None  #: Carrier phases; None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
-        """Return the mean position over some epochs; None if the satellites do not determine it."""
+        """Return the mean position over some epochs; None if the satellites do not determine the position."""
         seconds = float((self.time[epochs][-1] - self.time[epochs][0]) / np.timedelta64(1, "s"))
         return standstill_fix(
             self.azimuth_deg,
@@ -180,8 +180,8 @@ class StandstillPhases:
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
         """Return the mean double differences over some epochs, each over its longest part without a cycle slip.
 
-        The reference satellite of a group is the one with the highest elevation. Satellites whose longest part is
-        shorter than `_UNBROKEN` of the epochs are omitted.
+        The reference satellite of a group is the satellite with the highest mean elevation. Satellites whose longest
+        part is shorter than `_UNBROKEN` of the epochs are omitted.
         """
         difference, lost, toward = self.difference_m[epochs], self.lost[epochs], self.toward[epochs]
         least = _UNBROKEN * len(difference)

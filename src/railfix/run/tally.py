@@ -93,7 +93,7 @@ class AntennaTally:
     #: satellites were observed, `used` that enough remained, but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
     short_only: Counter[str] = field(default_factory=Counter)
-    #: Rejected observations by their first reason, and observations with one reason only by that reason.
+    #: Observations by the first rejection reason, and observations with a single rejection reason by this reason.
     first_reason: Counter[str] = field(default_factory=Counter)
     only_reason: Counter[str] = field(default_factory=Counter)
     satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
@@ -121,8 +121,8 @@ class AntennaTally:
     #: Smallest and largest time-tag error at epochs with suspected time tags [s], positive for late tags; NaN without
     #: such epochs.
     tag_error_s: tuple[float, float] = (float("nan"), float("nan"))
-    #: Smallest (row 0) and largest (row 1) over all windows of the map offset that a window can detect, across (column
-    #: 0) and up (column 1); shape (2, 2) [m]; NaN without a window.
+    #: Smallest (row 0) and largest (row 1) detectable map offset of all windows, across (column 0) and up (column 1),
+    #: shape (2, 2) [m]; NaN without a window.
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -378,7 +378,7 @@ def shorten_notes(notes: list[str]) -> list[str]:
 
 
 class Replays:
-    """Input of the filter for smoothing, stored in a temporary file that is deleted at the latest with the process."""
+    """Input of the filter for smoothing, stored in a temporary file that is deleted with the object or the process."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run

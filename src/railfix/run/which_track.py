@@ -35,7 +35,7 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 
-#: Largest distance moved for which the train is still on the same track [m], due to wheel creep and coupler slack.
+#: Largest distance moved, due to wheel creep and coupler slack, for which the train counts as not moved [m].
 _SAME_PLACE_M: Final = 1.0
 #: Error bound of the distance moved: a fraction of the distance plus a constant [m].
 _ODOMETER_SHARE: Final = 0.05
@@ -128,10 +128,10 @@ _MOST_TRACKS: Final = 64
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Return the tracks of a network near a position, with points relative to it; raise MismatchError if none is near.
+    """Return the tracks of a network near a position, with points relative to the position.
 
     `origin_ecef_m` is in the frame of the network. Tracks within 60 m of the position are returned, with their points
-    within 400 m.
+    within 400 m. Raise MismatchError if no track is within 60 m.
     """
     latitude, longitude, height = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
     near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
@@ -261,8 +261,8 @@ class WhichTrackOptions(Settings):
     missed_move: float = option(
         "Probability that the train was moved unnoticed since --last was written.", 1e-3, metavar="P", gt=0, lt=1
     )
-    start: datetime | None = option("First epoch of the standstill, GPS time.", None, metavar="TIME")
-    end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
+    start: datetime | None = option("GPS time from which epochs are processed.", None, metavar="TIME")
+    end: datetime | None = option("GPS time before which epochs are processed.", None, metavar="TIME")
     same_frame: Literal["no", "yes"] = option(
         "The position of the base station is in the frame of the map, not in the frame of the satellites.",
         "no",
@@ -276,7 +276,7 @@ class WhichTrackOptions(Settings):
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
     """Decide on which track a train at rest is, from its logs and a map.
 
-    Raise RailfixError if see `railfix.core.errors`.
+    Raise a RailfixError (`railfix.core.errors`) if an option or a file is unusable, or the train moves.
     """
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
@@ -315,7 +315,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     tracks = yard_tracks(network, origin)
     prior, unmapped = _prior(inputs, options, network)
     if not any(prior[track.name] > 0.0 for track in tracks):
-        raise MismatchError("none of the tracks near the train is possible by --prior and --last")
+        raise MismatchError("according to --prior and --last, none of the tracks near the train is possible")
     decision = decide_track(
         tracks,
         codes,
@@ -344,7 +344,7 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Return the product of the interlocking's weights and those of the last position, and the unmapped prior."""
+    """Return track weights, the product of interlocking and last position, and the prior of an unmapped track."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(
