@@ -104,7 +104,7 @@ def test_a_deleted_working_directory_is_one_sentence(tmp_path: Path) -> None:
         ["sh", "-c", script], env={**NARROW, "PYTHONPATH": str(source)}, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout) == (3, "")
-    assert done.stderr == "railfix: error: .: the working directory does not exist any more; change to one that does\n"
+    assert done.stderr == "railfix: error: .: the working directory no longer exists; change to an existing folder\n"
 
 
 def test_a_name_that_is_not_utf_8_is_one_sentence(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ class _Program(LazyCommands):
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
         "doctor": "Identify files, check that they fit together, and print the command to run.",
-        "explain": "Explain one epoch of a run: its satellites, sigma, level and status.",
+        "explain": "Explain one epoch of a run: its satellites, sigma, protection level and status.",
         "export": "Write the positions of a run as KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP.",
         "campaign": "Position many logs in parallel; an interrupted campaign is continued.",
         "benchmark": "Run a folder of cases, and evaluate railfix and other programs with the same code.",

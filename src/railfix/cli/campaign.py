@@ -102,7 +102,7 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print the number of finished runs, of which earlier calls did `kept`, and the time left, on standard error."""
+    """Print the number of finished runs, `kept` of them by earlier calls, and the time left, on standard error."""
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} of earlier calls)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
@@ -218,7 +218,7 @@ def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> 
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
     console = TableConsole()
     head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
-    caption = "Errors in metres, along the line and straight (3-D); second line: performance feature of EN 16803-1"
+    caption = "Errors in metres, along the line and straight (3-D); below each, the performance feature of EN 16803-1"
     show_table(console, plain_table(head, shown_rows(table), caption, texts=2))
     show_notes(console, notes)
     show_files(console, [out / f"benchmark.{kind}" for kind in ("csv", "json", "md")])

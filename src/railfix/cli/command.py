@@ -24,7 +24,7 @@ from railfix.core.errors import InputFileError, OutputError, RailfixError, Railf
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: Number to which the number of a signal is added for the exit code of a program that the signal ended (POSIX shells).
+#: Exit code, less the number of the signal, of a program that a signal ended, as in POSIX shells.
 SIGNALLED: Final = 128
 #: Message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
@@ -186,7 +186,7 @@ def _check_surroundings() -> None:
     try:
         os.getcwd()  # noqa: PTH109
     except OSError:
-        raise InputFileError(".", "the working directory does not exist any more; change to one that does") from None
+        raise InputFileError(".", "the working directory no longer exists; change to an existing folder") from None
     for word in sys.argv[1:]:
         try:
             word.encode("utf-8")

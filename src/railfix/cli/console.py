@@ -247,7 +247,7 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
     def show(*, epochs: int, fraction: float) -> None:
-        bar.start()  # only now, as it starts a thread, and a run must fork before it has threads
+        bar.start()  # not earlier: the bar starts a thread, and a run must fork before it has threads
         elapsed = bar.tasks[task].elapsed or 0.0
         bar.update(task, completed=fraction, epochs=epochs, rate=epochs / elapsed if elapsed > 0 else 0.0)
 

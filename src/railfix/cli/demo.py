@@ -50,8 +50,8 @@ def demo(
     `run.json` of the run, the folder `unscreened` with the run for the conventional positions, and the page
     `report.html`, to open in a browser.
 
-    With `--real` the log is a car's drive of 20 minutes through a town. It is part of the wheel `gnss-benchmark` (MIT)
-    of the package index, which pip downloads and which is kept unpacked in the user's cache. The map is made from the
+    With `--real` the log is a car's drive of 20 minutes through a town, from the wheel `gnss-benchmark` (MIT) of the
+    package index. pip downloads the wheel, which is kept unpacked in the user's cache. The map is made from the
     drive's ground truth, which RTKLIB computes where it is installed. `railfix benchmark` evaluates the positions of
     railfix and of RTKLIB against the ground truth; the case is written into `DIR/drive`, the results into
     `DIR/benchmark`.

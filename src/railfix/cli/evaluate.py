@@ -168,7 +168,7 @@ def reference(
     r"""Build the reference trajectory of each antenna from RTK fixed positions on the track, and bridge its gaps.
 
     A position is rejected if it is not an RTK fix, has a low ambiguity ratio, lies off the antenna's trajectory,
-    disagrees with the distance travelled, or if the two antennas are not as far apart as on the vehicle. The remaining
+    disagrees with the distance travelled, or disagrees with the distance between the two antennas. The remaining
     positions are matched to the trajectory. The gaps between them are bridged by Doppler speeds, tachometer pulses and
     accelerations, as far as they are given, weighted by their variances; the closing error of a gap is distributed over
     it. The following files are written into DIR:

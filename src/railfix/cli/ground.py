@@ -209,10 +209,11 @@ def keys(
 ) -> None:
     """Make keys and certificates of a centre and its trains, add trains, and renew certificates.
 
-    A certificate authority signs the certificates. Its key (authority.key) must stay in DIR. Copy authority.pem and the
-    centre's two files to the centre, and authority.pem and a train's two files to each train. If DIR already has a
-    certificate authority, trains are added. The serial number of each certificate is printed; to revoke a certificate,
-    write its serial number into revoked.txt in the centre's folder. Key files can be read only by their owner.
+    A certificate authority signs the certificates; the key of the authority (authority.key) must stay in DIR. Copy
+    authority.pem and the centre's two files to the centre, and authority.pem and a train's two files to each train. If
+    DIR already has a certificate authority, trains are added. The serial number of each certificate is printed; to
+    revoke a certificate, write its serial number into revoked.txt in the centre's folder. Key files can be read only by
+    their owner.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
@@ -316,7 +317,7 @@ class CentreChoices(Settings):
 def centre(
     choices: CentreChoices,
     *,
-    path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="Line, trains, keys and addresses.")],
+    path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="File with line, trains, keys and addresses.")],
 ) -> None:
     r"""Supervise the trains of a line: receive reports, send movement authorities, set points and routes, show a page.
 

@@ -60,7 +60,7 @@ def check(
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
     mid_chord: Annotated[
-        float, typer.Option(metavar="M", help="Largest mid-chord deviation from the arc that is not an error.")
+        float, typer.Option(metavar="M", help="Largest mid-chord deviation from the arc that is accepted.")
     ] = 0.30,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -95,7 +95,7 @@ def check(
         try:
             picture.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{picture.parent}: the folder cannot be made ({error.strerror})") from None
+            raise OutputError(f"{picture.parent}: the folder cannot be created ({error.strerror})") from None
         plot_track_quality(quality, picture)
     _print_quality(quality, picture)
     if quality.errors:

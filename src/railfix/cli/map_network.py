@@ -245,7 +245,7 @@ def match_command(
     maps: Maps,
     *,
     log: Annotated[Path, typer.Option(metavar="LOG", help="Positions: .pos, NMEA, GPX, or CSV with named columns.")],
-    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Positions on the network to write.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File to write, with the positions on the network.")],
     options: MatchOptions,
     columns: ColumnNames,
     connecting: Connecting,
@@ -269,7 +269,7 @@ def match_command(
     positions, notes = _in_frame_of(net, as_read, connecting, reading)
     matched = match(net, positions, sigma_m=options.sigma, within_m=options.within)
     if not (matched.track >= 0).any():
-        raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
+        raise MismatchError(f"{log}: no position lies near a track of the network; give the map of this region")
     write_whole(
         out, _write_matches(net, positions, matched, fill_gaps(net, matched, positions, rows_to_fill=options.fill))
     )

@@ -71,7 +71,7 @@ def service(
     served = found.filter(pl.col("within_limit_share") >= _SERVED)
     worst = found.sort("within_limit_share", "tracking_share", "ok_share", nulls_last=True).row(0, named=True)
     console = TableConsole()
-    verdict = [f"{len(found)} stretches of {stretch:g} m passed by {plural(runs, 'run')}"]
+    verdict = [f"{len(found)} stretches of {stretch:g} m with epochs of {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
             f"{len(served)} of them have a level within {limit:g} m in {100 * _SERVED:.0f} % of the epochs or more; "
@@ -81,7 +81,7 @@ def service(
     else:
         verdict.append("the runs have no filter and no levels; fractions are of single epochs")
     show_verdict(console, verdict)
-    caption = f"By stretch of {stretch:g} m; served: protection level within the limit"
+    caption = f"Stretches of {stretch:g} m; served: fraction of epochs with a protection level within the limit"
     table = listing("service", found, _COLUMNS, caption)
     show_table(console, table)
     if page is not None:
@@ -98,7 +98,7 @@ class SurveyFiles(Settings):
     """Navigation files, picture and name of a survey."""
 
     nav: tuple[Path, ...] = option(
-        "Navigation file of the logs; may be repeated, for several days.", (), metavar="NAV", panel=INPUTS
+        "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS
     )
     picture: Path | None = option(
         "Picture of the map, the runs and the standard deviations (.png or .svg).", None, metavar="FILE"

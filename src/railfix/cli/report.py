@@ -120,7 +120,7 @@ def explain(
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Page to write, with a sky plot as well.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain one epoch: its position, every satellite with its outcome, and the causes of sigma, level and status.
+    """Explain an epoch: its position, the outcome of every satellite, the causes of sigma, protection level and status.
 
     For each used satellite the table has the distance by which the single-epoch position would move along the line
     without this satellite. The epoch nearest to TIME is explained; it may be at most one minute away.

@@ -228,7 +228,7 @@ def _columns(
 ) -> dict[str, Floats]:
     """Return the columns of one antenna and chunk from which the effect is computed, each of shape (T,).
 
-    Positions and standard deviations are those of the filter if `track` is given. Masks are 1.0 or 0.0.
+    Positions and standard deviations are taken from the filter if `track` is given. Masks are 1.0 or 0.0.
     """
     counted = result.status != Status.NO_OBSERVATION
     without = ~counted

@@ -133,7 +133,7 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
     """Write RTKLIB's single-point positions of the front antenna to `out`; return None, or the reason for a failure.
 
-    The elevation mask and the constellations are those of `config`.
+    The elevation mask and the constellations are taken from `config`.
     """
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:

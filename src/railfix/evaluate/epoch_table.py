@@ -146,7 +146,7 @@ def distance_travelled(
 def since_last(values: Floats, has: Masks) -> Floats:
     """Return the increase of a quantity since the previous row of the mask `has`, shape (T,).
 
-    NaN at rows outside the mask, at the first row of the mask, and where the quantity is NaN.
+    The increase is NaN at rows outside the mask, at the first row of the mask, and where the quantity is NaN.
     """
     grown = np.full(len(values), np.nan)
     at = np.flatnonzero(has & np.isfinite(values))

@@ -276,7 +276,7 @@ def _note_of_passes(
 
 
 def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[str | None, bool]:
-    """Return the reason why differences of chainage are not errors, or None.
+    """Return the reason why differences of chainage cannot be used as errors, or None if they can.
 
     Also return whether the chainage of the reference is on the map of the run.
     """

@@ -28,8 +28,8 @@ class Authority(Message):
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
     number: Number  #: Number that rises with every authority sent to the train, also across restarts of the centre.
-    #: Sequence number of the train's newest report that the centre has stored, 0 without one. It acknowledges the
-    #: report, and the age of the authority on board is the time since the train sent this report.
+    #: Sequence number of the train's newest report that the centre has stored, 0 before the first. The authority
+    #: acknowledges this report, and the age of the authority on board is the time since the train sent the report.
     report: Number
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]

@@ -58,8 +58,9 @@ def correct_interval(
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason for a refusal.
 
-    Its route and its authority end, and its locks on points are removed. The train must therefore report that it obeys
-    an order to brake which no authority in transit can end, unless all authorities have `lapsed` on board.
+    The train's route and authority end, and the train's locks on points are removed. The train must therefore report
+    that it obeys an order to brake which no authority in transit can end, unless all authorities have lapsed on board
+    (`lapsed`).
     """
     known = state.trains.get(train)
     if known is None:
@@ -140,7 +141,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     if known is None:
         return state, f"no such train: {train}"
     if known.stop is None or not known.standstill:
-        return state, f"train {train} is not stopped, or does not stand still"
+        return state, f"train {train} is not stopped, or not at rest"
     if (reason := _may_run(known, lapsed=lapsed)) is not None:
         return state, reason
     pieces = pieces_of(known, layout)
@@ -197,7 +198,7 @@ def divide_train(state: Interlocking, train: int, other: int, *, length_m: float
     if other in state.trains or not 0 < other < 1 << 32:
         return state, f"{other} is not a valid number for the other part"
     if known.stop is None or not known.standstill:
-        return state, f"train {train} is not stopped, or does not stand still"
+        return state, f"train {train} is not stopped, or not at rest"
     if not 0.0 < length_m < known.length_m:
         return state, f"a length between 0 and {known.length_m:g} m was expected"
     if known.reported_m is None or known.outside_m() > 0.0:

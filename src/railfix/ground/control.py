@@ -268,7 +268,7 @@ class ControlCentre:
         self.send(order.train, order.encode())
 
     def _send(self, authority: Authority) -> None:
-        """Send an authority, unless its train has meanwhile been ordered to brake, or is not supervised any more."""
+        """Send an authority, unless its train has meanwhile been ordered to brake, or is no longer supervised."""
         if authority.train not in self.supervision.state.trains:
             return
         if authority.train not in self.supervision.ordered:

@@ -159,7 +159,7 @@ def route_requested(
 
 
 def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: Mapping[int, str]) -> str | None:
-    """Return the reason for refusing a route that does not depend on other trains' intervals, None without one."""
+    """Return the reason for refusing a route, apart from other trains' intervals; None if there is no reason."""
     target = here.station + here.direction
     if here.asked_m is not None:
         return "a shorter authority is being agreed with the train"
@@ -183,7 +183,7 @@ def reached(train: TrainInterval, station: int, layout: Layout) -> bool:
 
 
 def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: NearbyTrains) -> str | None:
-    """Return the obstacle between a train and the next station, or on its track there; None without one."""
+    """Return the obstacle between a train and the next station, or on its track there; None if there is none."""
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
@@ -203,7 +203,7 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
 
 
 def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str, str] | None:
-    """Return a barred section that shares track with a path, and its bar; None without one."""
+    """Return a barred section that shares track with a path, and the bar of the section; None if there is none."""
     for name, kind in sorted(state.bars):
         if any(shares(piece, mine) for piece in layout.sections[name] for mine in path):
             return name, kind

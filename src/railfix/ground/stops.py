@@ -129,7 +129,7 @@ def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[Po
 
 
 def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
-    """Return a section that a train occupies, with a bar for which trains inside are stopped; None without one."""
+    """Return a section that a train occupies, with a bar for which trains inside are stopped, or None."""
     occupied = pieces_of(train, layout)
     bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
     return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)

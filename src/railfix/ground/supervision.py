@@ -63,7 +63,7 @@ class Supervision:
     centre: CentreLimits = field(default_factory=CentreLimits)
     records: dict[int, TrainRecord] = field(default_factory=dict)
     routes_set: int = 0
-    heard: set[int] = field(default_factory=set)  #: Trains that have reported since the last authorities.
+    heard: set[int] = field(default_factory=set)  #: Trains that have reported since authorities were last computed.
     #: Time of the last authority sent to a train [s], and whether it was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
     granted_s: dict[int, float] = field(default_factory=dict)  #: Time of the last authority to run sent to a train [s].
@@ -227,7 +227,7 @@ class Supervision:
             self.command(point, track)
 
     def forget(self, trains: Iterable[int]) -> None:
-        """Drop the data of trains that are not supervised any more."""
+        """Drop the data of trains that are no longer supervised."""
         for number in trains:
             for kept in (self.records, self.sent, self.granted_s, self.ordered, self.issued, self._clocks):
                 kept.pop(number, None)

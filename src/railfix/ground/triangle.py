@@ -120,7 +120,7 @@ class TriangleResult(FrozenArrays):
     distance_error_m: Floats  #: Deviation of the distance between two fixes, shape (T, 3).
     bearing_error_deg: Floats  #: Deviation of the bearing between two fixes, clockwise, in [-180, 180); shape (T, 3).
     verdict: Codes  #: `TriangleVerdict`, shape (T,).
-    receiver: Integers  #: Receiver that the verdict names, -1 without one; shape (T,).
+    receiver: Integers  #: Receiver that the verdict names, -1 if it names none; shape (T,).
 
 
 def compare_triangle(
@@ -133,7 +133,7 @@ def compare_triangle(
     points_m : ndarray, shape (3, 2) [m]
         Known points, east and north of any origin.
     fixes_m : ndarray, shape (T, 3, 2) [m]
-        Raw fixes from the same satellites at the same epoch, in the same frame; NaN where missing.
+        Raw fixes from the same satellites at the same epoch, in the same frame; NaN for an absent fix.
     cn0_fallen : ndarray of bool, shape (T, 3), optional
         True where the C/N0 of a receiver has fallen.
 
@@ -237,7 +237,7 @@ class MonitorState:
 
     stopped: bool = True  #: Whether trains are stopped, as at the start, or since a stop that is not released.
     cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None at the start.
-    receiver: int = -1  #: Receiver that the cause names, -1 without one.
+    receiver: int = -1  #: Receiver that the cause names, -1 if it names none.
     since_s: float = 0.0  #: Time of the stop [s].
     complete_s: float = 0.0  #: Time of the last set of three fixes [s].
     healthy_since_s: float | None = None  #: Start of the present healthy time [s]; None if fixes are not healthy.
@@ -314,7 +314,7 @@ class MonitoredLog:
 
     fixes: StationFixes
     triangle: TriangleResult
-    #: Orders to the trains: time, order, cause, and the receiver that the cause names, -1 without one.
+    #: Orders to the trains: time, order, cause, and the receiver that the cause names, -1 if it names none.
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:

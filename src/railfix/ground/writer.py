@@ -66,7 +66,7 @@ class Commits:
     orders to brake are still sent.
     """
 
-    writer: ThreadWriter | None = None  #: Executor; without one a commit is carried out at once.
+    writer: ThreadWriter | None = None  #: Executor of the commits; with None a commit is carried out at once.
     alarm: str | None = None
     _open: tuple[Future[None], Callable[[], None], float] | None = None
     _failed_s: float = float("-inf")

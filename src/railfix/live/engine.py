@@ -1,6 +1,6 @@
 """Live positioning: a result for each epoch of one or two antennas, and a message for each period.
 
-`LiveEngine` processes single epochs with the same `EpochProcessor` as logs, and keeps its state. It reads no files. Its
+`LiveEngine` processes single epochs with the same `EpochProcessor` as logs, keeps the state, and reads no files. The
 memory is bounded: a limited number of epochs waits, and expired records and SBAS messages are dropped.
 """
 

@@ -155,7 +155,7 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
 
 
 def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
-    """Return latitude, longitude [deg], ellipsoidal height and sigma [m] of the first antenna; None without them."""
+    """Return latitude, longitude [deg], ellipsoidal height and sigma [m] of the first antenna, or None."""
     place = output.place
     if place is None or place.geodetic is None or not math.isfinite(place.sigma_m):
         return None

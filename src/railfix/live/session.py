@@ -232,7 +232,7 @@ class _Session:
             _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
     def take(self, name: str, received: ReceivedData, now_ns: int | None) -> int:
-        """Pass the completed items of one source to the engine, and return the last epoch's tag [ns], -1 without one.
+        """Pass the completed items of one source to the engine, and return the tag [ns] of its last epoch, or -1.
 
         Without `now_ns` the tags of the epochs are their times of arrival.
         """
@@ -259,7 +259,7 @@ class _Session:
         return tag_ns
 
     def emit(self, now_ns: int, sent_ns: int | None) -> list[LiveOutput]:
-        """Pass the outputs that are due to the sinks, and return them."""
+        """Pass the outputs that `LiveEngine.poll` returns to the sinks and observers, and return the outputs."""
         began = time.perf_counter()
         outputs = self.engine.poll(now_ns=now_ns, sent_ns=sent_ns)
         if outputs:

@@ -1,8 +1,8 @@
 """State file, from which a restarted session continues; it is written regularly, and checked before use.
 
 Its first line, in JSON, has versions, hashes of map, vehicle and settings, and the length and SHA-256 of the state that
-follows. A state is used only if all of them agree with the session. It contains only plain values, arrays and data
-classes of this package (`railfix.live.state_values`), and reading it executes no content.
+follows. A state is used only if all of these agree with the session. The state contains only plain values, arrays and
+data classes of this package (`railfix.live.state_values`), and reading the file executes no content.
 """
 
 from __future__ import annotations

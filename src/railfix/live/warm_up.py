@@ -66,7 +66,7 @@ def prepare_kernels() -> bool:
     _process(*_WITH_FILTER, logs)
     kernels.record_compiled()
     if sys.stderr.isatty():
-        sys.stderr.write(f"compiled in {time.monotonic() - begin:.0f} s; later commands load it\n")
+        sys.stderr.write(f"compiled in {time.monotonic() - begin:.0f} s; later commands load the kernels\n")
     return True
 
 

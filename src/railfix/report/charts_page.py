@@ -148,7 +148,7 @@ def read_background(path: Path) -> tuple[Floats, ...]:
 
 
 def _lines(path: Path, node: Any) -> Iterator[Floats]:
-    """Yield the coordinates of every line in a GeoJSON object and the objects in it."""
+    """Yield the coordinates of every line in a GeoJSON object and in the objects that it contains."""
     kind = node.get("type") if isinstance(node, dict) else None
     if kind == "FeatureCollection":
         for feature in node.get("features") or ():

@@ -31,7 +31,7 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
     "off_map": "beyond an end of the map, or too far from the position without the map",
-    "map_end": "moved to an end of the map; by the ranges it is slightly beyond that end",
+    "map_end": "moved to an end of the map; the ranges place it slightly beyond that end",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
@@ -42,7 +42,7 @@ SINGLE_STATUS: Final[Mapping[str, str]] = {
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
     "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
-    "spoofing_suspected": "the signals may be those of a spoofer (column interference_causes)",
+    "spoofing_suspected": "the signals may come from a spoofer (column interference_causes)",
 }
 #: Explanation of each status of the filter.
 FILTER_STATUS: Final[Mapping[str, str]] = {
@@ -52,12 +52,12 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "lost": "measurements contradict the track: positions are searched for again",
     "expired": "no position: dead reckoning has lasted too long",
     "not_started": "no position yet: no epoch so far had redundant codes",
-    "off_map": "no position: the satellite positions have been off the line for some time",
+    "off_map": "no position: the positions from satellites have been off the line for some time",
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
     "antennas_disagree": "its distance from the other antenna's position disagrees with the antenna spacing",
-    "doubtful": "measurements contradict the position or its bound: its error is not bounded",
-    "spoofing_suspected": "the signals may be those of a spoofer: its error is not bounded",
+    "doubtful": "measurements contradict the position or its bound: the error is not bounded",
+    "spoofing_suspected": "the signals may come from a spoofer: the error is not bounded",
 }
 #: Columns of `Explanation.satellites` with the effect of omitting the satellite.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")
@@ -217,7 +217,7 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
         if track["hypotheses"]:
             count = track["hypotheses"]
             positions = "one position is possible" if count == 1 else f"{count} positions are possible"
-            lines.append(f"filter: {positions}, this one with a probability of {track['branch_probability']:.3f}")
+            lines.append(f"filter: {positions}; the given position has probability {track['branch_probability']:.3f}")
         lines.append(f"filter's level: {_level_of_filter(track)}")
     status = single["status"]
     lines.append(f"single epoch: {_place(single)}; {status}: {SINGLE_STATUS.get(status, 'see the reference')}")

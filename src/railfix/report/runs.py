@@ -49,7 +49,7 @@ _ERRORS: Final = (
 class ReportedRun:
     """Run with the data for its part of the report."""
 
-    name: str  #: Name of the folder, with as many parent folders as distinguish the runs.
+    name: str  #: Name of the folder, with as many parent folders as needed to distinguish the runs.
     folder: RunFolder
     config: Config  #: Settings that were used.
     observations: pl.LazyFrame | None  #: Table of observations; None if the run wrote none.

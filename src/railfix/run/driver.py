@@ -301,7 +301,7 @@ def _notes_of_sensors(
 
 #: Last clause of a note on positions off the map whose cause was not found.
 _TRACK: Final = "check whether this is the right track"
-#: Largest number of excluded satellites that are named in notes.
+#: Maximum number of excluded satellites that a note names.
 _NAMED: Final = 3
 
 

@@ -225,7 +225,7 @@ _ATTEMPTS: Final = 10
 class OutputFolder:
     """Output folder of a command, which receives all files at once or none; it is created if it does not exist.
 
-    It is a context manager. In its block, files are written to a hidden staging folder, from which `commit` moves them
+    In the block of this context manager, files are written to a hidden staging folder, from which `commit` moves them
     to the output folder. If the block ends with an error, the written files are removed, and the output folder too if
     it was created. Remains of a killed process are removed by the next `OutputFolder` at the same path. With "replace",
     existing files of the same names are replaced by `commit`; `inputs` are never overwritten.
@@ -377,7 +377,8 @@ class OutputFolder:
 def check_folder(path: Path, *, overwrite: Overwrite) -> None:
     """Remove the remains of killed processes from a results folder, and raise OutputError if it must not be written.
 
-    It must not be written if it is a file, is being written by another process, or, with "refuse", is not empty.
+    The folder must not be written if the path is a file, if another process is writing to it, or, with "refuse", if it
+    is not empty.
     """
     with _writing(path):
         if path.exists() and not path.is_dir():

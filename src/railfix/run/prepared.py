@@ -1,8 +1,8 @@
 """Cache of prepared lines on disk: tracks as read from their files, and antenna trajectories.
 
 Reading a line of 2000 km and computing the trajectories of two antennas takes seconds. The result depends only on the
-files, the settings and the version of railfix, so that long lines are stored in a cache folder. It is the platform's
-folder (``~/.cache/railfix`` on Linux) or the folder named by `VARIABLE`, and may be deleted at any time.
+files, the settings and the version of railfix, so that long lines are stored in a cache folder. The cache folder is the
+platform's (``~/.cache/railfix`` on Linux) or the folder named by `VARIABLE`, and may be deleted at any time.
 """
 
 from __future__ import annotations

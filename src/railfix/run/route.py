@@ -73,7 +73,7 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "chainage_m": "distance in plan along the track from its first point to the point nearest to the position",
     "kilometrage_m": "kilometrage at the point of `chainage_m` as marked on the line, if the map has it",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
-    "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive right of it",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive to the right",
 }
 
 

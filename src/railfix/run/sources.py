@@ -164,7 +164,7 @@ def _read_line(
 ) -> tuple[Track, RouteOfLog | None]:
     """Read the track, and find the route if the file is a network; the route is None otherwise."""
     if not track:
-        raise SettingsError("no track map was given")
+        raise SettingsError("no track map was given; give it with --track")
     segments = [segment for path in track for segment in read_segments(path, reading.of_map)]
     options: dict[str, Any] = {
         "geoid": reading.geoid, "height_datum": reading.height_datum, "sigma_height_m": reading.height_sigma

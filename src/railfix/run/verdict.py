@@ -60,7 +60,7 @@ class AntennaVerdict:
         return self.leading.positions > off_map
 
     def figures(self) -> Iterator[tuple[str, str, str]]:
-        """Yield name, value of `leading`, and single-epoch value of each figure; the latter is "" without a filter."""
+        """Yield name, value of `leading`, and single-epoch value ("" if the filter was off) of each figure."""
         texts: dict[str, Callable[[PositionFigures], str]] = {
             POSITIONS: lambda of: f"{count(of.positions)} of {count(of.epochs)}",
             PASSED: lambda of: f"{count(of.passed)} of {count(of.epochs)}",

@@ -1,7 +1,7 @@
 """Probability of each track of a network from logs of a train at rest.
 
 A train that was switched off on a known track and has not moved since is still on that track. A cold-movement detector
-or the odometer measures the distance moved; it misses a movement with a given probability.
+or the odometer measures the distance moved; each misses a movement with a given probability.
 """
 
 from __future__ import annotations

@@ -231,7 +231,7 @@ def find_start(table: pl.DataFrame) -> np.datetime64:
 
 
 def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
-    """Return the times of a table since a start [s]."""
+    """Return the times of a table, counted from `start` [s]."""
     return seconds(table["time_gpst"].to_numpy().astype("datetime64[ns]") - start)
 
 

@@ -111,7 +111,7 @@ def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[f
 def _names_beside(
     network: Network, frame: LocalFrame, matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
 ) -> Marks:
-    """Return the names of the tracks on which a run has positions, beside the middle position on alternating sides."""
+    """Return the names of the tracks of a run, each next to the middle position on the track, on alternating sides."""
     passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
     places = [np.flatnonzero(matched.track == track) for track in passed][:_NAMED]
     rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
