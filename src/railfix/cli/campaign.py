@@ -77,7 +77,7 @@ def campaign(
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where some runs have failed, 7 where all have failed.
+    Exit codes are listed in `railfix --help`; the code is 5 if some runs have failed, 7 if all have failed.
     """
     with open_executor(workers, scheduler) as (executor, lost):
         prepare_kernels()
@@ -202,7 +202,7 @@ def benchmark(
 
     Example: `railfix benchmark cases --out benchmark`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where some cases have failed, 7 where all have failed.
+    Exit codes are listed in `railfix --help`; the code is 5 if some cases have failed, 7 if all have failed.
     """
     config, _ = resolve_settings(choices)
     show_benchmark(folder, config, out=out, workers=workers)

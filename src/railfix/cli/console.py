@@ -129,7 +129,7 @@ def prepare_kernels() -> None:
         import_module("railfix.live.warm_up").prepare_kernels()
 
 
-#: Width of tables in characters where the output is not a terminal, wide enough that no cell is cut or folded.
+#: Width of tables in characters if the output is not a terminal, wide enough that no cell is cut or folded.
 _FILE_WIDTH: Final = 500
 #: Number of map findings printed; further findings are only counted.
 MOST_FINDINGS: Final = 40

@@ -58,7 +58,7 @@ def demo(
 
     Example: `railfix demo --out first-look`
 
-    Exit codes are listed in `railfix --help`; with `--real` the code is also 3 where the drive cannot be downloaded.
+    Exit codes are listed in `railfix --help`; with `--real` the code is also 3 if the drive cannot be downloaded.
     """
     if real:
         from railfix.cli.campaign import show_benchmark

@@ -185,7 +185,7 @@ def reference(
         railfix reference --rtk rtk.pos --track line.csv --vehicle car.toml \
             --front front.obs --nav brdc.nav --pulses tacho.csv --out reference
 
-    Exit codes are listed in `railfix --help`; the code is 7 where there are fewer than two good fixes.
+    Exit codes are listed in `railfix --help`; the code is 7 if there are fewer than two good fixes.
     """
     asked = settings.model_dump(mode="json", exclude_unset=True)
     show_reference(reference_files(inputs, settings, out=out, options=options, asked=asked))
@@ -233,7 +233,7 @@ def error_model(
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where run, reference and station do not match.
+    Exit codes are listed in `railfix --help`; the code is 5 if run, reference and station do not match.
     """
     reference = beside.reference
     if len(reference) != len(runs):
@@ -329,7 +329,7 @@ def cn0_curve(
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where the position or the navigation files do not match the
+    Exit codes are listed in `railfix --help`; the code is 5 if the position or the navigation files do not match the
     log.
     """
     fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")

@@ -91,7 +91,7 @@ def monitor(
 
     Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where the logs have no satellite or no epoch in common.
+    Exit codes are listed in `railfix --help`; the code is 5 if the logs have no satellite or no epoch in common.
     """
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
@@ -217,7 +217,7 @@ def keys(
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
-    Exit codes are listed in `railfix --help`; the code is 8 where all certificates exist already.
+    Exit codes are listed in `railfix --help`; the code is 8 if all certificates exist already.
     """
     from cryptography.x509 import load_pem_x509_certificate
 
@@ -401,7 +401,7 @@ def train(
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes are listed in `railfix --help`; the code is also 0 where no authority was received, which is reported on
+    Exit codes are listed in `railfix --help`; the code is also 0 if no authority was received, which is reported on
     standard error.
     """
     import asyncio

@@ -50,7 +50,7 @@ def locate(
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 
-    Exit codes are listed in `railfix --help`; the code is 7 where no epoch has a position.
+    Exit codes are listed in `railfix --help`; the code is 7 if no epoch has a position.
     """
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -94,7 +94,7 @@ def which_track(
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where the train moves or no track is near.
+    Exit codes are listed in `railfix --help`; the code is 5 if the train moves or no track is near.
     """
     check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -158,7 +158,7 @@ def convert(
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
 
-    Exit codes are listed in `railfix --help`; the code is 3 where a log contains nothing that was requested.
+    Exit codes are listed in `railfix --help`; the code is 3 if a log contains nothing that was requested.
     """
     if out is None and nav_out is None:
         raise SettingsError("nothing to write: give --out for observations, --nav-out for ephemerides, or both")
@@ -199,7 +199,7 @@ def export(
 
     Example: `railfix export results --out positions.gpkg`
 
-    Exit codes are listed in `railfix --help`; the code is 4 where a package is not installed, 7 where no epoch has a
+    Exit codes are listed in `railfix --help`; the code is 4 if a package is not installed, 7 if no epoch has a
     position.
     """
     tables = list_position_tables(run)
@@ -243,7 +243,7 @@ def doctor(
 
     Example: `railfix doctor front.obs brdc.nav line.csv car.toml`
 
-    The exit code is 0 where all files fit together, 3 where a given file does not exist, and 5 where files do not
+    The exit code is 0 if all files fit together, 3 if a given file does not exist, and 5 if files do not
     match, a required file is missing, or the kind of a file is unknown.
     """
     from railfix.run.doctor import examine_files

@@ -72,7 +72,7 @@ def check(
 
     Example: `railfix map check line.csv --out report`
 
-    Exit codes are listed in `railfix --help`; the code is 6 where the track map has errors.
+    Exit codes are listed in `railfix --help`; the code is 6 if the track map has errors.
     """
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
@@ -136,7 +136,7 @@ def features(
 
         railfix map features line.csv --run results-1 --run results-2
 
-    Exit codes are listed in `railfix --help`; the code is also 3 where a run has no measurements.
+    Exit codes are listed in `railfix --help`; the code is also 3 if a run has no measurements.
     """
     import polars as pl
 
@@ -222,7 +222,7 @@ def from_positions_command(
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 
-    Exit codes are listed in `railfix --help`; the code is also 3 where the positions form no line.
+    Exit codes are listed in `railfix --help`; the code is also 3 if the positions form no line.
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")

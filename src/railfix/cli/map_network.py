@@ -126,7 +126,7 @@ def network(
 
     Example: `railfix map network tracks.gpkg --out network.png`
 
-    Exit codes are listed in `railfix --help`; the code is 6 where the network has gaps, kinks, or connections whose
+    Exit codes are listed in `railfix --help`; the code is 6 if the network has gaps, kinks, or connections whose
     ends do not meet.
     """
     check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
@@ -175,7 +175,7 @@ def route(
 
     Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where no route connects two positions.
+    Exit codes are listed in `railfix --help`; the code is 5 if no route connects two positions.
     """
     files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=files)

@@ -53,7 +53,7 @@ def service(
 
     Example: `railfix map service monday-results tuesday-results --out service.csv --page service.html`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where the runs are on different maps.
+    Exit codes are listed in `railfix --help`; the code is 5 if the runs are on different maps.
     """
     from railfix.core.staged_files import write_whole
     from railfix.evaluate.intervals import compute_service
@@ -133,7 +133,7 @@ def survey(
 
     Example: `railfix map survey monday.obs tuesday.obs --nav monday.nav --nav tuesday.nav --out line.csv`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where the runs lie apart.
+    Exit codes are listed in `railfix --help`; the code is 5 if the runs lie apart.
     """
     from railfix.run.locate import survey_files
     from railfix.track import write_track_csv

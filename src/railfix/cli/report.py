@@ -75,8 +75,8 @@ def report(
 
     Example: `railfix report results --reference truth.csv --out report.html`
 
-    Exit codes are listed in `railfix --help`; the code is 4 where the number of references does not match the runs, 5
-    where a reference covers another time.
+    Exit codes are listed in `railfix --help`; the code is 4 if the number of references does not match the runs, 5
+    if a reference covers another time.
     """
     in_runs = [
         path
@@ -127,7 +127,7 @@ def explain(
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
-    Exit codes are listed in `railfix --help`; the code is 4 where the time or the antenna does not exist, 5 where no
+    Exit codes are listed in `railfix --help`; the code is 4 if the time or the antenna does not exist, 5 if no
     epoch is near the time.
     """
     inputs = sorted(run.iterdir()) if run.is_dir() else []

@@ -107,7 +107,7 @@ def live(
         railfix live --front tcp://127.0.0.1:3001 --rear tcp://127.0.0.1:3002 --track line.csv \
             --vehicle car.toml --send json@- --send cbor@udp://127.0.0.1:4000
 
-    Exit codes are listed in `railfix --help`; the code is 9 where two channels disagree, 143 after SIGTERM.
+    Exit codes are listed in `railfix --help`; the code is 9 if two channels disagree, 143 after SIGTERM.
     """
     import asyncio
 

@@ -75,7 +75,7 @@ def simulate(
 
     Example: `railfix simulate demo --out simulated`
 
-    Exit codes are listed in `railfix --help`; the code is 5 where the navigation file does not cover the time of the
+    Exit codes are listed in `railfix --help`; the code is 5 if the navigation file does not cover the time of the
     scenario.
     """
     if list_shipped:

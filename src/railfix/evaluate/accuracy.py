@@ -295,7 +295,7 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     """Return epochs with the columns of one kind of position from which the statistics are computed.
 
     ``has`` is true for epochs with a position. ``error``, ``size`` (error magnitude) and ``normalised`` (error / sigma)
-    are null without a position, and where the reference is not accurate enough. ``sigma`` and ``distance`` are null for
+    are null without a position, or if the reference is not accurate enough. ``sigma`` and ``distance`` are null for
     conventional positions.
     """
     conventional = position == "conventional"

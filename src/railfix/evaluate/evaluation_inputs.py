@@ -201,8 +201,8 @@ def read_table(
 ) -> tuple[Path, pl.DataFrame]:
     """Read one table of a run; return its file and its rows in order of time.
 
-    Raise InputFileError if the file or a `needed` column is missing, where there are no rows, or where an antenna
-    has several rows at the same time.
+    Raise InputFileError if the file or a `needed` column is missing, if there are no rows, or if an antenna has several
+    rows at the same time.
     """
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:

@@ -1,6 +1,6 @@
 """Comparison of protection levels with errors: Stanford counts, availability, continuity, and errors above the level.
 
-Epochs are counted with two choices of levels. `usable`: a level is used where the status of the position is ok (of the
+Epochs are counted with two choices of levels. `usable`: a level is used if the status of the position is ok (of the
 filter: tracking or coasting) and the level raises no alarm; any other position is given an infinite level. `all`: every
 level is used, whatever its status.
 """

@@ -291,7 +291,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
 
     `stretch_m` is the length of a stretch, `limit_m` the alarm limit [m]. The chainage of an epoch is taken from the
     filter, else from the single-epoch position, else interpolated between the neighbouring epochs with a position. The
-    level is infinite where the filter is neither tracking nor coasting, and null for runs without the filter. Raise
+    level is infinite if the filter is neither tracking nor coasting, and null for runs without the filter. Raise
     MismatchError if the runs are on different maps, or no epoch has a position.
     """
     runs = [read_run(folder) for folder in folders]

@@ -120,7 +120,7 @@ def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLim
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Return the largest speed for which `fits` is true [m/s], 0 without one; `fits` is true for all lower speeds."""
+    """Return the largest speed [m/s] for which `fits` is true, as for all lower speeds; 0 if there is none."""
     low, high = 0.0, _TOP_MPS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -178,7 +178,7 @@ def supervise(
 def _supervised(
     front_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, release: float = 0.0
 ) -> Supervised:
-    """Return the speeds ahead of one target; ahead of a stop they are at least the release speed, up to the end."""
+    """Return the supervised speeds for a target; before the target position they are at least `release` [m/s]."""
     aimed = target if target.speed_mps == 0.0 else target._replace(speed_mps=target.speed_mps + brakes.over_mps)
     brake, warn = (intervention_mps(front_m, aimed, steps, brakes, before_s=s) for s in (0.0, brakes.warning_s))
     permitted = intervention_mps(front_m, target, steps, brakes, before_s=brakes.reaction_s)

@@ -205,7 +205,7 @@ def divide_train(state: Interlocking, train: int, other: int, *, length_m: float
         return state, f"train {train} has not reported its position"
     d = known.direction
     back, front = sorted(d * end for end in known.reported_m)
-    cut = d * (front - length_m)  # the front part's rear end is at most here
+    cut = d * (front - length_m)  # foremost possible rear end of the front part
     rear = d * max(min(back + known.length_m - length_m, d * cut), d * known.rear_m)
     stop = f"divided: trains {train} and {other}"
     first = replace(known, rear_m=rear, length_m=length_m, stop=stop, claimed_m=None, parted=other)

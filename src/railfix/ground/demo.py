@@ -341,7 +341,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        # Time lost on a busy machine is not recovered, as the links would have less than the simulated time.
+        # Time lost on a busy machine is not recovered: the links would otherwise run faster than the simulated time.
         start = max(start, loop.time() - traffic.now_s / speed)
         await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 

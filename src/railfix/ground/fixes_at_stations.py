@@ -47,10 +47,10 @@ class StationFixes(FrozenArrays):
     """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
     time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
-    points_m: Floats  #: Known points, east and north of the first point; shape (N, 2).
-    #: Fixes, east and north of the first point; NaN where there are too few common satellites; shape (T, N, 2).
+    points_m: Floats  #: Known points, east and north of the first point [m]; shape (N, 2).
+    #: Fixes, east and north of the first point [m]; NaN if too few satellites are common; shape (T, N, 2).
     fixes_m: Floats
-    n_satellites: Integers  #: Number of common satellites, 0 where unknown; shape (T,).
+    n_satellites: Integers  #: Number of common satellites, 0 if unknown; shape (T,).
     cn0_fallen: Masks  #: Whether the mean C/N0 of a receiver has fallen; shape (T, N).
 
 
@@ -209,7 +209,7 @@ def mean_cn0(log: Observations) -> Floats:
 
 
 def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
-    """Return where the mean C/N0 of a receiver has fallen by `FALLEN_DBHZ`, shape (T, N).
+    """Return whether the mean C/N0 of each receiver has fallen by `FALLEN_DBHZ`, shape (T, N).
 
     The reference is the median over the `USUAL_EPOCHS` before each epoch, including `earlier_dbhz`, shape (M, N).
     """

@@ -90,7 +90,7 @@ class Echo(NamedTuple):
 
     @classmethod
     def decode(cls, payload: bytes) -> Echo | None:
-        """Return the echo, None where the payload is not an echo."""
+        """Return the echo, None if the payload is not an echo."""
         return cls(*_ECHO.unpack(payload)) if len(payload) == _ECHO.size else None
 
     def round_trip_s(self, now_ns: int) -> float:

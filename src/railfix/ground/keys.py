@@ -31,7 +31,7 @@ def check_keys(folder: Path, name: str) -> None:
     """Raise InputFileError if a file that an end of the links requires is missing."""
     for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
         if not (folder / file).is_file():
-            raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
+            raise InputFileError(folder / file, "does not exist; create it by railfix ground keys")
 
 
 class Peer(NamedTuple):
@@ -218,7 +218,7 @@ def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path
         for name in parts if replace else ():
             (folder / f"{name}.new").replace(folder / name)
     except FileExistsError as error:
-        raise OutputError(f"{error.filename}: is there already; remove it, or give another folder") from None
+        raise OutputError(f"{error.filename}: exists already; remove it, or give another folder") from None
     except OSError as error:
         raise OutputError(f"{folder}: keys cannot be written ({error.strerror})") from None
     return written

@@ -145,11 +145,11 @@ class Layout(Settings):
         return last if direction > 0 else first
 
     def points(self) -> Iterator[PointName]:
-        """Return all points; the outer points of the first and the last station do not exist."""
+        """Return the points of all stations; the line has no points at its two outer ends."""
         return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
-        """Return the pieces of an interval; `tracks` has the track in each station, 1 where it has none."""
+        """Return the pieces of an interval; `tracks` has the train's track by station, by default 1."""
         low, high = min(from_m, to_m), max(from_m, to_m)
         pieces, at = [], low
         for k in self.stations_between(low, high):

@@ -39,7 +39,7 @@ class LinkResult(NamedTuple):
 class LinkLimits(Settings):
     """Limits of the links."""
 
-    #: Longest time to the echo of a frame (T), after which it is a miss; a centre delays echoes by up to 0.2 s.
+    #: Longest time to the echo of a frame (T); a later echo is a miss. A centre delays echoes by up to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)
     misses: int = Field(default=3, ge=1)  #: Consecutive misses after which the spare link is used.
     good: int = Field(default=10, ge=1)  #: Consecutive answers before the normal link is used again.
@@ -122,7 +122,7 @@ class LinkChoice:
     """Link in use with a normal link A and a spare link B."""
 
     active: LinkName = "A"
-    since_s: float = 0.0  #: Time since which the link is in use.
+    since_s: float = 0.0  #: Time of the last change of the link.
     switches: int = 0
 
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:

@@ -47,7 +47,7 @@ class OnBoardLimits(BrakeLimits):
 
 @dataclass(kw_only=True)
 class Motion:
-    """Newest position of a train: safe ends, highest speed, and its time, None where unknown."""
+    """Newest position of a train: safe ends, highest speed, and its time, None if unknown."""
 
     front_m: float
     rear_m: float
@@ -151,7 +151,7 @@ class OnBoard:
         accepted; a late order lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
-            # also from a centre whose database is an older copy, with smaller numbers than the train's
+            # accepted also with a number below the train's, from a centre whose database is an older copy
             if self.order is None or authority.number >= self.order.number:
                 self.order = authority
             return True

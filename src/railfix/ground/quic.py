@@ -296,7 +296,7 @@ class LinkServer(QuicServer):
     def _read(self) -> None:
         """Read the packets that have arrived."""
         now_s, length = self._loop.time(), self._configuration.connection_id_length
-        with suppress(OSError):  # no more packets, or a peer that did not take one
+        with suppress(OSError):  # no more packets have arrived, or a peer has refused a packet
             for _ in range(MOST_WAITING):
                 data, addr = self._bound.recvfrom(65_536)
                 protocol = None if data[:1] >= b"\x80" else self._protocols.get(data[1 : 1 + length])

@@ -62,8 +62,8 @@ class PlacedReport:
     limits: InterlockingLimits
     granted: int  #: Number of the newest authorities.
     skipped: tuple[int, int]  #: `Interlocking.skipped`.
-    #: Longest time since the previous position [s]: negative where the report's clock is behind the previous report's,
-    #: None where unknown, as at the first report.
+    #: Longest time since the previous position [s]: negative if the report's clock is behind the previous report's,
+    #: None if unknown, as at the first report.
     elapsed_s: float | None
 
     @property
@@ -189,7 +189,7 @@ def longest_way_m(before: float | None, now: float | None, elapsed_s: float, lim
     """Return the longest distance that a train can have run in a time, by its speeds at both ends where known [m]."""
     top = limits.speed_mps
     if before is not None and now is not None:
-        # the speed in between exceeds the speeds at both ends by at most these terms
+        # highest speed between the two reports: errors of the reported speeds, and acceleration until the middle
         top = min(top, max(before, now) + SPEED_ERROR_MPS + 0.5 * limits.acceleration_mps2 * elapsed_s)
     return top * elapsed_s
 

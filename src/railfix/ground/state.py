@@ -54,7 +54,7 @@ class TrainInterval:
     station: int  #: Station where the route ends.
     length_m: float  #: Length of the train as configured.
     standstill: bool = True
-    #: Safe rear end of the newest report; the interval begins there once the next report confirms it. None where the
+    #: Safe rear end of the newest report; the interval begins there once the next report confirms it. None if the
     #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
     line: int | None = None  #: Line of the train's reports; None before the first.
@@ -78,7 +78,9 @@ class TrainInterval:
     def changed(self, **values: Any) -> Self:
         """Return a copy with changes, faster than `dataclasses.replace`; raise TypeError for an unknown name."""
         if not values.keys() <= _NAMES[TrainInterval]:
-            raise TypeError(f"a train has none of {', '.join(sorted(values.keys() - _NAMES[TrainInterval]))}")
+            raise TypeError(
+                f"a train has no fields of these names: {', '.join(sorted(values.keys() - _NAMES[TrainInterval]))}"
+            )
         copy = copy_with(self, **values)
         if not values.keys().isdisjoint(("direction", "rear_m", "front_m", "end_m")):
             for computed in ("interval_m", "span_m"):
@@ -105,7 +107,7 @@ class TrainInterval:
         return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
 
     def outside_m(self) -> float:
-        """Return the distance of the newest reported position from the interval [m], 0 where it may be inside."""
+        """Return the distance of the newest reported position from the interval [m], 0 if it may be inside."""
         if self.reported_m is None:
             return 0.0
         front = max(self.direction * end for end in self.reported_m)
@@ -227,7 +229,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
             values = json.loads(text or "")
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    # in the order of the line, in any order of the texts
+    # sorted, so that the order does not depend on the order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
         granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),

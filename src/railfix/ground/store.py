@@ -74,7 +74,7 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self.abandoned = False  #: Whether a commit hangs in another thread, which keeps the connection.
+        self.abandoned = False  #: Whether a thread with a hanging commit keeps the connection.
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:

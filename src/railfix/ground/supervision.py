@@ -125,7 +125,7 @@ class Supervision:
     ) -> tuple[float | None, tuple[float, float], bool]:
         """Return the longest time since the train's previous position, and the delay of the train's clock [s].
 
-        The time, None where unknown, is computed with the least delay of earlier reports; after an on-board start,
+        The time, None if unknown, is computed with the least delay of earlier reports; after an on-board start,
         whose clock is new, only the centre's clock is used. The delay is returned with the time of its observation. The
         third value is True for a new clock and for a clock that has been set back, whose earlier delays would lengthen
         the time since every later position.
@@ -150,7 +150,7 @@ class Supervision:
         return ", ".join(f"train {number}" for number in sorted(self.awaited))
 
     def set_detected(self, point: PointName, track: int | None) -> None:
-        """Process the detection of points: a track, or None where the points are in neither end position."""
+        """Process the detection of points: a track, or None if the points are in neither end position."""
         self._asked_s.pop(point, None)
         self.state = points_reported(self.state, point, track, self.layout)
 
@@ -202,8 +202,8 @@ class Supervision:
     def set_route(self, train: int, **step: Any) -> str | None:
         """Set a route to the next station; return the reason for a refusal.
 
-        `step` has the arguments `nearby` and `stopped` of `route_requested`. The points of the route move once
-        `command_points` is called.
+        The arguments `nearby` and `stopped` in `step` are passed to `route_requested`. The points of the route move
+        once `command_points` is called.
         """
         if train not in self.state.trains:
             return f"no such train: {train}"

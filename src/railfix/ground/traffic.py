@@ -171,7 +171,7 @@ class Traffic:
         raise NotImplementedError
 
     def exchange(self) -> None:
-        """Deliver the messages that are due, and let the centre work for a step."""
+        """Deliver the messages that are due, and run the centre for a step."""
         raise NotImplementedError
 
     def authority(self, authority: Authority) -> None:

@@ -39,8 +39,8 @@ async def run_train(
 ) -> tuple[int, int]:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
-    The function ends when the positions have ended and the last report is answered, or `ANSWER_S` later. It returns the
-    numbers of reports and of authorities.
+    The function returns the numbers of reports and of authorities when the last report is answered, or `ANSWER_S` after
+    the end of the positions.
 
     The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as written
     by `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected

@@ -104,7 +104,7 @@ def limits_for_false_stops(
         raise ValueError("0 < own_sigma_m <= sigma_m, stops_per_year > 0 and independent_s > 0 were expected")
     probability = stops_per_year * independent_s / YEAR_S / 6.0
     if probability >= 0.1:
-        raise ValueError(f"{stops_per_year} stops per year are more than the limits can be chosen for")
+        raise ValueError(f"{stops_per_year} stops per year are too many: no limits exist for this number")
     factor = float(np.sqrt(-2.0 * np.log(probability)))
     return TriangleLimits(
         radius_m=factor * sigma_m, side_m=min(factor * np.sqrt(2.0) * own_sigma_m, 2.0 * factor * sigma_m)
@@ -135,7 +135,7 @@ def compare_triangle(
     fixes_m : ndarray, shape (T, 3, 2) [m]
         Raw fixes from the same satellites at the same epoch, in the same frame; NaN for an absent fix.
     cn0_fallen : ndarray of bool, shape (T, 3), optional
-        True where the C/N0 of a receiver has fallen.
+        Whether the C/N0 of a receiver has fallen.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def _verdicts(
 ) -> tuple[Codes, Integers]:
     """Return verdict and named receiver of each set of fixes, shapes (T,)."""
     outside = (~inside).sum(axis=1)
-    # a single receiver i: both sides at receiver i differ, and the third side does not
+    # a receiver i is named if both sides at this receiver differ, and the third side does not
     alone = np.stack([~small[:, i] & ~small[:, i - 1] & small[:, i - 2] for i in range(3)], axis=1)
     named = np.where(alone.any(axis=1), alone.argmax(axis=1), -1)
     own_outside = np.take_along_axis(~inside, np.maximum(named, 0)[:, None], axis=1)[:, 0] & (named >= 0)
@@ -235,7 +235,7 @@ class MonitorLimits(Settings):
 class MonitorState:
     """State of the monitor."""
 
-    stopped: bool = True  #: Whether trains are stopped, as at the start, or since a stop that is not released.
+    stopped: bool = True  #: Whether trains are stopped; true at the start, and from a stop until its release.
     cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None at the start.
     receiver: int = -1  #: Receiver that the cause names, -1 if it names none.
     since_s: float = 0.0  #: Time of the stop [s].

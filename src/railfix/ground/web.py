@@ -42,7 +42,7 @@ REQUEST_S: Final = 10.0
 #: connections without a complete request.
 MOST_CONNECTIONS: Final = 500
 MOST_IDLE: Final = 20
-#: Name for a log-in by the password alone.
+#: Author of the orders of a person who has logged in without a name.
 OPERATOR: Final = "operator"
 _COOKIE: Final = "railfix-session"
 _LONGEST_BODY: Final = 1000

@@ -76,7 +76,7 @@ class Commits:
         return self._open is None and now_s - self._failed_s >= RETRY_S
 
     def begin(self, work: Callable[[], None], then: Callable[[], None], now_s: float) -> None:
-        """Begin a commit; `then` is called by `settle` once it is done."""
+        """Begin a commit; `settle` calls `then` once the commit is done."""
         outcome = _carry_out(work, Future()) if self.writer is None else self.writer.submit(work)
         self._open = outcome, then, now_s
 

@@ -112,7 +112,7 @@ class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
     A file that has `LiveSettings.log_bytes` is renamed to ``path.1``, the older file to ``path.2``, and so on. The line
-    is shown only where the standard error output is a terminal. Raise OutputError if the file cannot be opened.
+    is shown only if the standard error output is a terminal. Raise OutputError if the file cannot be opened.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:

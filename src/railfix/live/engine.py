@@ -87,7 +87,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """Epoch that waits for its pair or for sensors; `heard` is the number of arrivals of satellite data before it."""
+    """Epoch that waits for its pair or for sensors; `heard` is the number of arrivals of satellite data before."""
 
     epoch: Observations
     arrived_ns: int
@@ -287,7 +287,7 @@ class LiveEngine:
         """Return the outputs due: of complete pairs, of epochs that waited long enough, and of a period without input.
 
         `now_ns` is a time of the clock used for `push`. With `sent_ns`, the GPS time of sending [ns], one message is
-        sent per period, for the newest epoch. Without it, for recorded epochs whose tags are the clock, every epoch has
+        sent per period, for the newest epoch. Without `sent_ns`, for recorded epochs whose tags are the clock, each has
         a message. At `END_NS` all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]

@@ -53,7 +53,7 @@ class TrainPlace:
     #: Chainage of the reference point and its standard deviation [m]; NaN without a position.
     chainage_m: float
     sigma_m: float
-    #: Bound of the position error, and the protection level that it contains [m]; infinite without a bound.
+    #: Bound of the position error, and the protection level that it contains [m]; infinite if there is no bound.
     bound_m: float
     level_m: float
     status: MessageStatus
@@ -66,8 +66,8 @@ class TrainPlace:
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
     """Return the position of the train by the antenna with the lowest protection level, at the reference point.
 
-    The position is computed by the filter along the track where it runs, otherwise from the single epoch. The bound is
-    the filter's over- and under-reading amount where the filter has a protection level (`tracking.level`). Otherwise it
+    The position is computed by the filter along the track if it runs, otherwise from the single epoch. The bound is
+    the filter's over- and under-reading amount if the filter has a protection level (`tracking.level`). Otherwise it
     is the single-epoch protection level plus the distance between the two positions, so that it is valid for both.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
@@ -108,7 +108,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
 
 
 def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tuple[float, float, float] | None:
-    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna; None where unknown."""
+    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna; None if unknown."""
     source = result.fusion[name] if _has_place(result.fusion.get(name)) else result.antennas[name]
     values = np.array([source.latitude_deg[-1], source.longitude_deg[-1], source.height_m[-1]])
     if name != frame.first:
@@ -236,7 +236,7 @@ def _has_passed(antenna: AntennaResult) -> bool:
 
 
 def _level_m(antenna: AntennaResult) -> float:
-    """Return the single-epoch protection level of the last epoch [m]; infinite without one."""
+    """Return the single-epoch protection level of the last epoch [m], infinite if there is none."""
     if antenna.protection is None:
         return math.inf
     level = float(antenna.protection.level.level_m[-1])

@@ -75,7 +75,7 @@ async def run_session(
         Source of each antenna, and of a base station (`BASE`); see `railfix.live.sources.read_source`.
         RINEX observation files are replayed as well.
     speed : float or None
-        Replay speed of recorded files relative to real time. With None, files are replayed as fast as possible, and
+        Replay speed of recorded files relative to real time. If None, files are replayed as fast as possible, and
         the time tags are the clock (set `LiveSettings.no_input` to "skip" for exactly one message per epoch).
     sensors : mapping of str to str, optional
         Streams of on-board sensors (`railfix.live.stream`) by name; tables from files are added to the engine before.
@@ -354,7 +354,7 @@ class _InTurn:
     """
 
     def __init__(self, files: Sequence[str]) -> None:
-        #: Time tag of each file's waiting epoch, and whether it is of the train; None while the file is being read.
+        #: Time tag of each file's waiting epoch, and whether the file is of the train; None while it is being read.
         self._waiting: dict[str, tuple[np.datetime64, bool] | None] = dict.fromkeys(files)
 
     async def wait(self, name: str, tag: np.datetime64) -> None:

@@ -53,7 +53,7 @@ class LiveSettings(Settings):
     #: Identities of train and line in messages.
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
-    #: Direction along the chainage of the train's leading end at the start, 0 where unknown; by default from the
+    #: Direction along the chainage of the train's leading end at the start, 0 if unknown; by default from the
     #: vehicle file. A train that has run 50 m in the other direction has changed ends.
     facing: Literal[-1, 0, 1] | None = None
     #: Distance of the train's front end ahead of the front antenna; by default computed from the vehicle file.

@@ -41,7 +41,7 @@ class SavedSession:
 class Loaded:
     """Outcome of reading a state file."""
 
-    session: SavedSession | None  #: None where the file is not used.
+    session: SavedSession | None  #: None if the file is not used.
     outcome: str  #: One sentence for the log.
 
 

@@ -174,7 +174,7 @@ FOREVER: Final = np.datetime64("2200-01-01", "ns")
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
-#: Longest line; a longer line is not a row [bytes].
+#: Number of bytes that are kept of an incomplete line; a longer line loses its beginning.
 _LINE_BYTES: Final = 4096
 
 

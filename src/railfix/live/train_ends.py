@@ -19,13 +19,13 @@ CHANGED_ENDS_M: Final = 50.0
 
 
 class Ends(NamedTuple):
-    """Positions of a train's ends relative to its reference point along the line [m]; NaN where unknown.
+    """Positions of a train's ends relative to its reference point along the line [m]; NaN if unknown.
 
-    Without a running direction each end may be on either side.
+    If the running direction is unknown, each end may be on either side.
     """
 
     front_m: float  #: Middle of the possible positions of the front end, positive ahead.
-    spread_m: float  #: Largest distance of the front end from this middle.
+    spread_m: float  #: Largest distance of the front end from `front_m`.
     foremost_m: float  #: Largest distance of any part of the train ahead of the reference point.
     rearmost_m: float  #: Largest distance of any part of the train behind the reference point.
 
@@ -39,10 +39,10 @@ class TrainFrame:
     """
 
     trajectories: Mapping[str, Trajectory]
-    facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
-    running: int  #: Direction of the leading end at the start, 0 where unknown.
+    facing: int  #: Direction of the vehicle's front along the line, 0 if unknown.
+    running: int  #: Direction of the leading end at the start, 0 if unknown.
     #: Distance of the train's front end ahead of the reference point, distance of the rear end behind the reference
-    #: point, and length of the train [m]; NaN where unknown.
+    #: point, and length of the train [m]; NaN if unknown.
     front_m: float
     rear_m: float
     length_m: float
@@ -139,7 +139,7 @@ class RunningEnd:
     this position.
     """
 
-    direction: int  #: 1 toward rising chainage, -1 toward falling, 0 where unknown.
+    direction: int  #: 1 toward rising chainage, -1 toward falling, 0 if unknown.
     #: Upper bound of the lowest and lower bound of the highest chainage of the reference point since the last change
     #: [m]; infinite before the first position.
     low_m: float = math.inf
@@ -147,7 +147,7 @@ class RunningEnd:
     last_m: float = math.inf  #: Last chainage; infinite before the first.
 
     def after(self, reference_m: float, bound_m: float, moving: int) -> RunningEnd:
-        """Return the state after an epoch, the same state without a bound; `moving` is the direction of motion."""
+        """Return the state after an epoch, unchanged if there is no bound; `moving` is the direction of motion."""
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)

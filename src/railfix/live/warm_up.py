@@ -51,7 +51,7 @@ def prepare_kernels() -> bool:
     if kernels.is_compiled():
         return False
     begin = time.monotonic()
-    # numba compiles one function at a time in a process: the filter's functions, about half of all, are compiled in
+    # numba compiles one function at a time in a process: the filter's functions, about half of them, are compiled in
     # another process
     filter_process = subprocess.Popen(
         [sys.executable, "-c", f"from {__name__} import compile_filter; compile_filter()"]

@@ -73,7 +73,7 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "chainage_m": "distance in plan along the track from its first point to the point nearest to the position",
     "kilometrage_m": "kilometrage at the point of `chainage_m` as marked on the line, if the map has it",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
-    "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive to the right",
+    "unconstrained_offset_m": "offset from the track, in plan, of the position without the map; positive to the right",
 }
 
 
@@ -163,7 +163,7 @@ class RouteOfLog:
     def with_unmapped(self, config: Config) -> Config:
         """Return settings in which the prior of a wrong map is at least the probability of an unmapped track.
 
-        The largest probability in the log is used, limited to `_UNMAPPED_LIMIT`; where the probability is larger, there
+        The largest probability in the log is used, limited to `_UNMAPPED_LIMIT`; if the probability is larger, there
         is no protection level (`is_uncertain`).
         """
         share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
