@@ -142,7 +142,7 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
             try:
-                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # inherited by the workers until their initializer
+                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # workers inherit the mask until their initializer
                 for _ in range(workers):
                     pool.submit(int)
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)

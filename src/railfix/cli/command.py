@@ -24,7 +24,7 @@ from railfix.core.errors import InputFileError, OutputError, RailfixError, Railf
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: Exit code, less the number of the signal, of a program that a signal ended, as in POSIX shells.
+#: Offset of the exit code of a program that a signal ended; the signal's number is added, as in POSIX shells.
 SIGNALLED: Final = 128
 #: Message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")

@@ -114,7 +114,7 @@ def features(
         typer.Option(
             metavar="DIR",
             help="Folder of `railfix run` with --tachometer and --inertial; the features that the train measured are "
-            "listed next to those of the map; may be repeated.",
+            "listed next to the features of the map; may be repeated.",
         ),
     ] = None,
     out: Annotated[

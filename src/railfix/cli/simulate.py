@@ -23,10 +23,10 @@ class SimulateOptions(Settings):
     out: Path | None = option(
         "Folder for the files; each run of a recipe has a subfolder.", None, metavar="DIR", panel="Options"
     )
-    seconds: float | None = option("Duration, instead of the scenario's.", None, metavar="S", gt=0.0)
-    seed: int | None = option("Seed of the random numbers, instead of the scenario's.", None)
+    seconds: float | None = option("Duration, in place of the duration in the scenario.", None, metavar="S", gt=0.0)
+    seed: int | None = option("Seed of the random numbers, in place of the seed in the scenario.", None)
     setting: tuple[str, ...] = option(
-        "One setting that overrides the scenario's, such as --set receiver.code_sigma_m=0; may be repeated.",
+        "Setting that overrides the scenario, such as --set receiver.code_sigma_m=0; may be repeated.",
         (),
         name="--set",
         metavar="KEY=VALUE",
@@ -39,7 +39,7 @@ class SimulateOptions(Settings):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Settings that override the scenario's; raise SettingsError if a key is given twice."""
+        """Settings that override the scenario; raise SettingsError if a key is given twice."""
         check_set_once(self.setting)
         changes: dict[str, Any] = {}
         for text in self.setting:
@@ -150,7 +150,7 @@ def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
             numbers.append(int(word) - 1)
         else:
             raise SettingsError(
-                f"--only {word}: {recipe.path} has no such run; it has {len(recipe.names)}, "
+                f"--only {word}: {recipe.path} has no such run; it has {len(recipe.names)} runs, "
                 f"{recipe.names[0]} to {recipe.names[-1]}"
             )
     return sorted(set(numbers))

@@ -65,7 +65,9 @@ class Effect:
     rate: float  #: Fraction of the epochs that have coordinates.
     ok_rate: float  #: Fraction of the epochs with status ok; for the filter, with status tracking.
     n_used: float  #: Mean number of satellites used.
-    sigma_p50_m: float  #: Median standard deviation along the line of the epochs with coordinates; NaN without any.
+    sigma_p50_m: (
+        float  #: Median standard deviation along the line of the epochs with coordinates; NaN if there are none.
+    )
     coordinates: Score | None = None  #: Errors of all positions; None without a reference.
     ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
     #: Errors of the conventional positions from the same ranges; None without a reference.
@@ -129,7 +131,7 @@ def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> t
     )
     chosen = [screen for screen in SCREENS if screen.name in config.screens]
     unable = [screen for screen in chosen if screen.unable(getattr(config, screen.name), setup)]
-    notes = tuple(f"screen {screen.name}: left out, it needs {screen.needs}" for screen in unable)
+    notes = tuple(f"screen {screen.name}: left out, as it needs {screen.needs}" for screen in unable)
     return tuple(screen.name for screen in chosen if screen not in unable), notes
 
 

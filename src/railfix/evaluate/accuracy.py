@@ -136,7 +136,7 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
     """Compute the percentile of each resample, shape (replicates,), by counting values at increasingly fine nodes.
 
     `size` and the block numbers `member` have shape (T,); `times` is the number of times that a resample has a block,
-    shape (replicates, blocks); `errors` is the number of values of a resample. NaN where a resample has no value.
+    shape (replicates, blocks); `errors` is the number of values of each resample; if it is 0, the result is NaN.
     """
     found = np.full(len(times), np.nan)
     drawn = errors > 0

@@ -74,7 +74,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
     """Return another program's positions, moved to the nearest point of the line, as a positions table of a run.
 
     The table has one row per epoch in `epochs`; epochs without a position have the status no_convergence, or
-    no_observation where railfix has no observation either.
+    no_observation if railfix has no observation either.
     """
     time = epochs["time_gpst"].to_numpy()
     row = rows_at_epochs(time, log.time)

@@ -134,7 +134,7 @@ def read_cases(folder: Path) -> list[Case]:
         [folder] if (folder / CASE_FILE).is_file() else sorted(path.parent for path in folder.glob(f"*/{CASE_FILE}"))
     )
     if not folders:
-        raise InputFileError(folder, f"no folder in it has a {CASE_FILE}; railfix benchmark --help shows one")
+        raise InputFileError(folder, f"no folder in it has a {CASE_FILE}; railfix benchmark --help shows an example")
     return [read_case(path) for path in folders]
 
 

@@ -84,7 +84,7 @@ class Evaluation(NotebookTable):
     epochs: pl.DataFrame  #: One row per epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
     figures: pl.DataFrame  #: Error statistics of every grouping: `FIGURE_COLUMNS`.
     intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
-    levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None where no run has a protection level.
+    levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None if no run has a protection level.
     integrity: Mapping[str, Integrity]  #: Levels against errors, by the kind of level.
     outages: pl.DataFrame | None  #: `OUTAGE_COLUMNS`; None without a table of the filter along the track.
     branches: pl.DataFrame | None  #: `BRANCH_COLUMNS`; None without a table of the filter along the track.

@@ -57,7 +57,7 @@ class RunFolder(RunRecord):
 
     @property
     def chainage_of(self) -> Mapping[str, str]:
-        """Point of the train whose chainage is given, by antenna, such as "antenna"; empty where not recorded."""
+        """Point of the train whose chainage is given, by antenna, such as "antenna"; empty if not recorded."""
         return dict(self._line.get("chainage_of") or {})
 
     def turn_m(self, antenna: str) -> float:
@@ -72,7 +72,7 @@ class RunFolder(RunRecord):
 
     @property
     def track_facts(self) -> Mapping[str, Any]:
-        """Entry of ``run.json`` on the track that the run used; empty where not recorded."""
+        """Entry of ``run.json`` on the track that the run used; empty if not recorded."""
         return dict(self._line.get("track") or {})
 
     @property
@@ -90,15 +90,15 @@ class RunFolder(RunRecord):
 
     @property
     def protection(self) -> Mapping[str, Any]:
-        """Assumptions of the protection levels; empty without levels."""
+        """Assumptions of the protection levels; empty if the run has no levels."""
         assumptions = self.record.get("protection")
         return assumptions if isinstance(assumptions, Mapping) else {}
 
     @property
     def level_kind(self) -> str | None:
-        """Kind of the protection levels; `UNKNOWN_KIND` where not recorded, None without levels.
+        """Kind of the protection levels; `UNKNOWN_KIND` if it is not recorded, None if the run has no levels.
 
-        Raise InputFileError if positions and ``run.json`` state several kinds.
+        Raise InputFileError if positions and ``run.json`` state different kinds.
         """
         level = "protection_level_m"
         if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
@@ -122,7 +122,7 @@ class RunFolder(RunRecord):
 
     @property
     def alarm_limit_m(self) -> float | None:
-        """Alarm limit of the run [m], None where not recorded; raise InputFileError if it is not a positive number."""
+        """Alarm limit of the run [m], None if not recorded; raise InputFileError if it is not a positive number."""
         limit = self.protection.get("alarm_limit_m")
         if limit is None:
             return None

@@ -109,7 +109,7 @@ def level_name(kind: str) -> str:
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
     """Return the levels that are compared with errors, shape (T,) [m].
 
-    A level is infinite where it is missing or, with `levels_of` "usable", not usable; it is NaN without a position
+    A level is infinite if it is missing or, with `levels_of` "usable", not usable; it is NaN without a position
     (mask `has`). `status` is the status of the position, `verdict` the status of the level.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
@@ -181,7 +181,7 @@ def _sort(
 def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
     """Compare the levels of all runs with the errors at all alarm limits.
 
-    Return the comparison by kind of level; empty where no run has levels.
+    Return the comparison by kind of level; empty if no run has levels.
     """
     own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})

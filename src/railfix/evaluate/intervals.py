@@ -110,7 +110,7 @@ LEAST_S: Final = 2.0
 #: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "begin_gpst": "first epoch without a used satellite, GPS time",
-    "duration_s": "time from the last epoch with a used satellite to the last epoch without one",
+    "duration_s": "time from the last epoch with a used satellite to the last epoch without a used satellite",
     "travelled_m": "distance travelled in the stretch, from the reference",
     "environment": "environment in the middle of the stretch, from the reference or from the sections",
     "carried_by": "measurements that the filter used within the stretch",
@@ -229,7 +229,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
 def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
     """Return the counts and percentiles of every protection level (`LEVEL_COLUMNS`), grouped by the columns `by`.
 
-    Return None where no run has a protection level.
+    Return None if no run has a protection level.
     """
     tables = []
     for level in level_columns(epochs):
@@ -299,7 +299,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
     for folder, run in zip(folders, runs, strict=True):
         if (run.line_name, run.track_facts.get("length_m")) != (runs[0].line_name, first.get("length_m")):
             raise MismatchError(
-                f"{folder}: is a run on {run.line_name!r} of {run.track_facts.get('length_m')} m, {folders[0]} one on "
+                f"{folder}: is on {run.line_name!r} of {run.track_facts.get('length_m')} m, but {folders[0]} is on "
                 f"{runs[0].line_name!r} of {first.get('length_m')} m; give runs on one map"
             )
     parts = [_epochs(folder, run, number) for number, (folder, run) in enumerate(zip(folders, runs, strict=True))]

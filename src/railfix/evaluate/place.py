@@ -31,7 +31,7 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 class Bracket:
     """Neighbouring instants of a reference of R instants for each of T times."""
 
-    #: Indices of the instants before and after each time, or twice of the instant equal to the time; shape (T,).
+    #: Indices of the instants before and after each time, equal if an instant is at the time itself; shape (T,).
     left: Indices
     right: Indices
     share: Floats  #: Fraction of the interval from left to right that has passed, 0 to 1, shape (T,).
@@ -93,7 +93,7 @@ def along_track_error(
     map passes the reference more than once (laps, two carriageways of a road), the pass nearest to the position is
     used, because the ranges of one epoch cannot distinguish the passes. Where the line returns near itself (a
     crossing), the straight distance between the two points is used if it is shorter. On a line that passes every point
-    once these rules have no effect, except that the error in a curve is the length of the chord.
+    once, these rules have no effect, except that the error in a curve is the length of the chord.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Run and reference share a map if their distances in chainage and in ECEF differ by at most this at the median [m].
+#: Largest median difference between distances in chainage and in ECEF of run and reference on the same map [m].
 SAME_MAP_M: Final = 1.0
 #: Largest distance of a position from the trajectory of its run [m].
 SAME_TRAJECTORY_M: Final = 0.01
@@ -186,7 +186,8 @@ class PlaceErrors:
     #: Straight distance (3-D) from the position on the map to the reference, shape (T,): to its nearest point on the
     #: map with the method "trajectory", to the reference position with the method "chainage".
     distance_m: Floats
-    reference_chainage_m: Floats  #: Chainage of the reference; from the map where the reference has none; shape (T,).
+    #: Chainage of the reference, computed from the map if the reference has none; shape (T,).
+    reference_chainage_m: Floats
     files: tuple[tuple[str, Path], ...] = ()  #: Kinds and paths of track and vehicle, if they were read.
     notes: tuple[str, ...] = ()
 
@@ -203,7 +204,7 @@ def compute_errors(
 
     With the method "auto" the errors are differences of chainage if run and reference share a map (`SAME_MAP_M`),
     otherwise distances along the trajectory. Raise MismatchError if the reference is of another region, the method
-    "chainage" is impossible, or the track is not that of the run; raise InputFileError if a file is missing.
+    "chainage" is impossible, or the track is not the run's; raise InputFileError if a file is missing.
     """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
@@ -271,7 +272,7 @@ def _note_of_passes(
     return (
         f"{antenna}: the line passes the same point several times; {others} of {int(known.sum())} errors "
         "are to the "
-        "pass nearest to the position, which may not be the one that the train was on",
+        "pass nearest to the position, and the train may have been on another pass",
     )
 
 
@@ -349,8 +350,8 @@ def find_trajectory(
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
     """Return the sets of options (CRS, height datum, geoid) with which the track is to be read, in order of preference.
 
-    Given options are the only set. Otherwise the track is read first without options, then with the options in
-    ``run.json``.
+    If options are given, they are the only set. Otherwise the track is read first without options, then with the
+    options in ``run.json``.
     """
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):

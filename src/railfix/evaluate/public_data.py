@@ -118,8 +118,8 @@ def write_drive(recordings: Path, folder: Path) -> str:
         sigma = np.percentile(np.linalg.norm(truth.sigma_m[:, :2], axis=1), 95.0)
         quality = (
             f"RTKLIB's kinematic solution with a station 14 km away: fixed at {fixed:.0f} % of the epochs, a stated "
-            f"sigma of {sigma:.2f} m (95 %), which may be decimetres too small where float; the publisher's trajectory "
-            f"is {_distance_p95_m(published, truth):.1f} m from it (95 %)"
+            f"sigma of {sigma:.2f} m (95 %), which may be decimetres too small for float solutions; the publisher's "
+            f"trajectory is {_distance_p95_m(published, truth):.1f} m from it (95 %)"
         )
     track, _ = from_position_log(truth, name="public drive")
     write_track_csv(track, folder / "track.csv")

@@ -233,7 +233,7 @@ def outages(rows: pl.DataFrame) -> Table:
 
 
 def _where(rows: pl.DataFrame) -> list[Column]:
-    """Return the columns of run and antenna for a table; without the run where all rows are of a single run."""
+    """Return the columns of run and antenna for a table; the run is omitted if all rows are of a single run."""
     antenna: Column = ("antenna", "antenna", str)
     return [antenna] if rows["run"].n_unique() == 1 and "all" not in rows["run"] else [("run", "of", str), antenna]
 

@@ -154,7 +154,7 @@ class Rejection(Enum):
     OTHER_TRAIN = "of another train"
     REPEATED = "repeated or older than the newest"
     EARLIER_START = "of an earlier start on board"
-    FAR_AHEAD = "number further ahead than a train can have counted; start its unit again"
+    FAR_AHEAD = "sequence number higher than the train can have reached; start its unit again"
     NO_PLACE = "without a position"
     NO_FACING = "the direction of the front end is unknown"
     NO_FRONT_END = "the position of the front end is unknown"

@@ -37,7 +37,7 @@ def draw_session() -> int:
 class FrameKind(IntEnum):
     """Kind of a frame."""
 
-    #: Payload, used once.
+    #: Frame with a payload, which the receiver uses once.
     DATA = 1
     #: Answer to a frame.
     ECHO = 2

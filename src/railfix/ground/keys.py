@@ -67,7 +67,7 @@ class Revoked(NamedTuple):
 
 
 def read_revoked(folder: Path) -> Revoked:
-    """Return the revoked certificates, listed as words in ``revoked.txt``; none without this file.
+    """Return the revoked certificates, listed as words in ``revoked.txt``; there are none if this file is missing.
 
     A name (``train-7``) revokes all certificates of that name, including later certificates. A serial number
     (``0x5a1f...``, as printed by `railfix ground keys`) revokes one certificate, so that a train whose key was lost can

@@ -171,7 +171,7 @@ class Layout(Settings):
         return front_m > here.begin_m if direction > 0 else front_m < here.end_m
 
     def station_at(self, low_m: float, high_m: float) -> int | None:
-        """Return the station whose tracks contain a whole interval, None without one."""
+        """Return the station whose tracks contain a whole interval, None if there is none."""
         for k in self.stations_between(low_m, high_m):
             station = self.stations[k]
             if station.inner_m[0] <= low_m and high_m <= station.inner_m[1]:

@@ -102,13 +102,13 @@ class LinkMeter:
 
     @property
     def response_rate(self) -> float:
-        """Fraction of the frames of the window that were answered in time; NaN without frames."""
+        """Fraction of the frames of the window that were answered in time; NaN if there are no frames."""
         window = self._window_s
         return float(np.isfinite(window).mean()) if window else float("nan")
 
     @property
     def round_trip_s(self) -> float:
-        """Median round-trip time of the window [s]; NaN without answers."""
+        """Median round-trip time of the window [s]; NaN if no frame was answered."""
         answered = [value for value in self._window_s if value == value]
         return float(np.median(answered)) if answered else float("nan")
 

@@ -134,7 +134,7 @@ class OnBoard:
         self.stops_at_m = self._further(before, self._place_m)
 
     def _further(self, before_m: float | None, now_m: float) -> float | None:
-        """Return the farther of two positions in running direction; None without a first position [m]."""
+        """Return the farther of two positions in running direction [m], None if `before_m` is None."""
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:

@@ -238,7 +238,7 @@ CHECKS: tuple[Check, ...] = (
 
 
 def compute_contradiction(report: PlacedReport) -> str | None:
-    """Return the first contradiction of a report with a position, None without a contradiction."""
+    """Return the first contradiction of a report with a position, None if there is none."""
     return next((reason for check in CHECKS if (reason := check(report)) is not None), None)
 
 

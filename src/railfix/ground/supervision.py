@@ -74,7 +74,7 @@ class Supervision:
     begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
     #: Trains that must report before anything is granted (`begin_again`).
     awaited: set[int] = field(default_factory=set)
-    #: Whether each section is detected as occupied; None without an answer, or if the last answer is too old.
+    #: Whether each section is detected as occupied; None if there is no answer, or if the last answer is too old.
     detected: dict[str, bool | None] = field(default_factory=dict)
     #: Time of a section detection's last answer [s], for detections that must be repeated.
     answered_s: dict[str, float] = field(default_factory=dict)

@@ -40,11 +40,11 @@ _ORDER_STEP_M = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """Message, and the result of its epoch (None without input)."""
+    """Message, and the result of its epoch, which is None in a period without input."""
 
     message: TrainMessage
     result: Result | None
-    place: TrainPlace | None = None  #: Position of the message; None without input.
+    place: TrainPlace | None = None  #: Position of the message; None in a period without input.
     #: Parts to be sent: message and rows of the result; rows alone, if the message is delayed or omitted; or a delayed
     #: message alone.
     part: Literal["both", "rows", "message"] = "both"
@@ -287,8 +287,8 @@ class LiveEngine:
         """Return the outputs due: of complete pairs, of epochs that waited long enough, and of a period without input.
 
         `now_ns` is a time of the clock used for `push`. With `sent_ns`, the GPS time of sending [ns], one message is
-        sent per period, for the newest epoch. Without `sent_ns`, for recorded epochs whose tags are the clock, each has
-        a message. At `END_NS` all waiting epochs are due, and no message without input is added.
+        sent per period, for the newest epoch. Without `sent_ns`, as for recorded epochs, every epoch has a message. At
+        `END_NS` all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -313,7 +313,7 @@ class LiveEngine:
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
-        """Return the outputs, the newest with its message if the last message is at least half a period old.
+        """Return the outputs; only the newest has a message, if the last message is at least half a period old.
 
         An earlier message waits until one period after the last message, unless a newer message replaces it.
         """

@@ -165,7 +165,7 @@ class _Session:
                 now = time.monotonic_ns()
                 if isinstance(item, Sensed):
                     skipped, units = self.metrics.skipped, self.engine.processor.units
-                    skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
+                    skipped[f"lines of the {item.sensor} that are not rows"] += item.skipped
                     skipped["ranges to ground units that are not surveyed"] += item.count_unsurveyed(units)
                     self.engine.add_samples(item)
                     if self.hooks.sensed is not None:

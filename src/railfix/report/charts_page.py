@@ -226,8 +226,8 @@ class Figure:
     json: Markup  #: Values of the chart for the script of the page.
     width: str  #: Style class of the width: "wide" or "half".
     sky: str  #: Element id of the sky plot in which a click shows its epoch; "" if there is no sky plot.
-    zoomed_with: str  #: Figures with the same text share the range of their x axis; "" for none.
-    linked: str  #: Figures with the same text show the same epochs; "" for none.
+    zoomed_with: str  #: Figures with the same text share the range of their x axis; "" for a range of its own.
+    linked: str  #: Figures with the same text show the same epochs; "" for a figure that is not linked.
 
     @property
     def is_sky(self) -> bool:

@@ -270,7 +270,7 @@ def _level_of_filter(track: Mapping[str, Any]) -> str:
 def _level_of_single(single: Mapping[str, Any]) -> str:
     level, cause = single["protection_level_m"], single["protection_cause"]
     if level is None or not np.isfinite(level):
-        return f"none ({cause or 'a fault is left'})"
+        return f"none ({cause or 'a fault remains'})"
     parts = ", ".join(
         f"{name.replace('_', ' ')} {single[f'protection_{name}_m']:.1f} m"
         for name in ("fault_free", "one_fault", "two_faults")

@@ -270,14 +270,14 @@ def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: flo
 
 
 def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
-    """Return the error of each position, shape (rows,) [m]; NaN without an error."""
+    """Return the error of each position, shape (rows,) [m]; NaN if the table has no error."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")
 
 
 def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
-    """Return the epochs with the largest errors on the map and of conventional positions; None without errors."""
+    """Return the epochs with the largest errors on the map and of conventional positions, None without errors."""
     if errors is None:
         return None
     times = errors["time_gpst"].to_numpy()

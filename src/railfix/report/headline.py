@@ -87,8 +87,8 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
         verdict=verdict,
         figures=(*figures, stated[POSITIONS], replace(level, beside=_count_beyond(run, antenna, evaluation, passed))),
         compared=(
-            f"All errors are along the line. {large} refer to positions on the map, computed from one epoch each, that "
-            f"passed every check. Conventional positions are 3-D single-point positions from {ranges}, moved to the "
+            f"All errors are along the line. {large} refer to single-epoch positions on the map that passed every "
+            f"check. Conventional positions are 3-D single-point positions from {ranges}, moved to the "
             "nearest point of the line. The table of figures of merit also compares the positions on the map with the "
             "conventional positions at the same epochs."
         ),

@@ -38,8 +38,8 @@ class Campaign(Settings):
     """Files of a campaign, given by patterns with fields in braces; paths are relative to the campaign file.
 
     A run has the files whose fields have the same values as the fields of the run's front log. With ``nav/{day}.nav*``
-    a run has the navigation files of its day, with ``{line}/track.csv`` the track of its line. A name without fields
-    and ``*`` is a file of every run.
+    a run has the navigation files of its day, with ``{line}/track.csv`` the track of its line. A pattern without
+    fields or ``*`` names a file of every run.
     """
 
     #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs with the same values of
@@ -244,7 +244,7 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
     """Return the files that match a pattern, in order of their names, each with the values of the fields.
 
-    A name without fields and ``*`` is returned even if there is no such file; the run then reports the error.
+    A pattern without fields or ``*`` is returned even if there is no such file; the run then reports the error.
     """
     if not pattern:
         return []

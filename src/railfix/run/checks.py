@@ -185,7 +185,7 @@ def check_positions(tally: Tally, likely: Mapping[str, str]) -> None:
     if tally.positioned:
         return
     if not tally.epochs:
-        raise NoPositionError("no epoch between --start and --end; the logs have none there")
+        raise NoPositionError("no epoch of the logs lies between --start and --end; give other times")
     causes = "; ".join(_why_nothing(name, antenna) for name, antenna in tally.antennas.items() if antenna.epochs)
     causes += "".join(f"; {name}: {cause}" for name, cause in likely.items() if cause)
     raise NoPositionError(f"there is no position: {causes}")

@@ -47,7 +47,9 @@ class FileFinding:
     facts: tuple[str, ...]  #: Phrases on the content for the user.
     span: Span | None = None  #: First and last time of the content, GPS time; None if unknown.
     place_ecef_m: Floats | None = None  #: A position in the file, ECEF, shape (3,) [m]; None if unknown.
-    ephemerides: Span | None = None  #: First and last reference time of the ephemerides in the file; None without any.
+    ephemerides: Span | None = (
+        None  #: First and last reference time of the ephemerides in the file; None if there are none.
+    )
     options: tuple[str, ...] = ()  #: Options that a command needs to read the file.
     problems: tuple[str, ...] = ()  #: Sentences on faults of the file itself.
 

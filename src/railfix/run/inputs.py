@@ -129,7 +129,7 @@ class RunInputs(InputFiles):
         (),
         metavar="OBS",
     )
-    sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used instead of the broadcast ones.", ())
+    sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used instead of broadcast orbits and clocks.", ())
     heights: Path | None = input_option(
         "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV with chainage_m or "
         "kilometrage_m, "
@@ -223,7 +223,7 @@ class RunInputs(InputFiles):
 
 
 def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Antenna, tuple[Path, ...]]:
-    """Return the observation files by antenna, without antennas that have none."""
+    """Return the observation files by antenna; antennas without files are omitted."""
     both: dict[Antenna, tuple[Path, ...]] = {"front": front, "rear": rear}
     return {name: paths for name, paths in both.items() if paths}
 

@@ -405,7 +405,7 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
     with _writing(target):
         check_not_input(target, inputs)
         if not target.parent.is_dir():
-            raise OutputError(f"{target}: the folder {target.parent} does not exist; create it, or give another")
+            raise OutputError(f"{target}: the folder {target.parent} does not exist; create it, or give another folder")
         if target.is_dir():
             raise OutputError(f"{target}: is a folder, expected the name of a file to write")
         what, endings, other = _ENDINGS.get(kind, ("", (), ""))
@@ -416,7 +416,7 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
         if target.exists() and overwrite == "refuse":
             raise OutputError(f"{target}: the file exists already; give another file, or add --overwrite")
         if not os.access(target.parent, os.W_OK):
-            raise OutputError(f"{target}: the folder {target.parent} cannot be written; give another")
+            raise OutputError(f"{target}: the folder {target.parent} cannot be written; give another folder")
 
 
 @contextmanager

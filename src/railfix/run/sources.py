@@ -178,13 +178,13 @@ def _read_line(
         if not is_route(segments):
             if log is None:
                 raise MismatchError(
-                    f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one by "
+                    f"{track[0]}: has {len(segments)} tracks that do not join to one route; make a map of one route by "
                     "'railfix map route'"
                 )
             route = log.route(connect_network(segments, track))
             segments = [route.network.tracks[k] for k in route.tracks]
     if heights == OF_LOG and log is None:
-        raise SettingsError("--heights log: heights of the log itself are for railfix run; give a file here")
+        raise SettingsError("--heights log: only railfix run can use the heights of the log; give a file here")
     centreline = track_of_segments(
         segments,
         heights=log.positions if heights == OF_LOG and log is not None else heights,
@@ -201,7 +201,7 @@ def _paths(
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
-                f"the chainage of {reading.reference} was requested, which needs a vehicle file; give one"
+                f"the chainage of {reading.reference} was requested; give the vehicle file (--vehicle) that it requires"
             )
         return None, dict.fromkeys(antennas, Trajectory.from_antenna_path(track))
     body = read_vehicle(vehicle)

@@ -178,7 +178,7 @@ class StandstillPhases:
     distance_m: float  #: Distance of the antenna from the base station [m].
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
-        """Return the mean double differences over some epochs, each over its longest part without a cycle slip.
+        """Return the mean of each double difference over the longest part of `epochs` without a cycle slip.
 
         The reference satellite of a group is the satellite with the highest mean elevation. Satellites whose longest
         part is shorter than `_UNBROKEN` of the epochs are omitted.

@@ -40,7 +40,7 @@ Scale = Literal["linear", "symlog", "log"]
 
 @dataclass(frozen=True, kw_only=True)
 class _Layer:
-    """Values that are drawn in one colour; `label` is the name in the legend, "" for none."""
+    """Values that are drawn in one colour; `label` is the name in the legend, "" if it has no name there."""
 
     label: str
     colour: str
@@ -152,7 +152,7 @@ class Chart:
     x_label: str
     y_label: str
     layers: tuple[Layer, ...]  #: Layers in the order in which they are drawn.
-    start: np.datetime64 | None = None  #: GPS time from which `x` counts [s]; None if the x axis is not time.
+    start: np.datetime64 | None = None  #: GPS time at which `x` is 0; None if the x axis is not time.
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
     y_linear: float = 1.0  #: Absolute value up to which a symlog axis is linear.

@@ -231,7 +231,7 @@ _PARTS: Final = (
 )
 
 
-#: Region, text, x and y of each label; 1 is the alarm limit, 2 the end of the axis.
+#: Region, text, x and y of each label, with x and y equal to 1 at the alarm limit and 2 at the end of the axis.
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),

@@ -66,8 +66,8 @@ def draw_screen(
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
     """Return a chart of a metric with its limit over time.
 
-    `time` has the time of each of T rows of the picture. With `epoch`, shape (T,), it has the times of E epochs, and
-    `epoch` is the index of the epoch of each row.
+    `time` has the time of each of T rows of the picture. With `epoch`, shape (T,), `time` has the times of E epochs,
+    and `epoch` is the index of the epoch of each row.
     """
     start = time.min() if len(time) else np.datetime64(0, "ns")
     return _screen(picture, seconds(time - start), epoch, start)
