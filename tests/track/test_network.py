@@ -306,7 +306,7 @@ def test_plan_of_a_large_network_is_thinned(monkeypatch: pytest.MonkeyPatch, tmp
     write_network_page(net, check_network(net), tmp_path / "thin.html")
     sizes = [(tmp_path / name).stat().st_size for name in ("whole.html", "thin.html")]
     assert sizes[1] < sizes[0] - 20_000
-    assert "points of each track, and its ends, are drawn" in (tmp_path / "thin.html").read_text()
+    assert "point and the ends of each track are drawn" in (tmp_path / "thin.html").read_text()
 
 
 def test_route_and_match_commands(recordings: Path, tmp_path: Path) -> None:
