@@ -28,7 +28,7 @@ BDT_MINUS_GPST_S: Final = -14.0  #: BDT - GPST [s]: BeiDou time lags GPS time by
 FREQUENCY_L1: Final = 1_575.42e6
 
 #: Carrier frequency [Hz] by constellation letter and RINEX 3 band digit (RINEX 3.05, tables 4 to 10).
-#: For GLONASS bands 1 and 2 it is the frequency of channel 0; add the channel number times `GLONASS_STEP`.
+#: For GLONASS bands 1 and 2, the value is the frequency of channel 0; add the channel number times `GLONASS_STEP`.
 CARRIER_FREQUENCY: Final[dict[str, dict[str, float]]] = {
     "G": {"1": 1_575.42e6, "2": 1_227.60e6, "5": 1_176.45e6},
     "J": {"1": 1_575.42e6, "2": 1_227.60e6, "5": 1_176.45e6, "6": 1_278.75e6},
@@ -59,7 +59,7 @@ CLEAR_M: Final = 200.0
 #: Largest distance from a tangent at which a point counts as lying on the tangent [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Prior probability of a joint fault of the low satellites on one side of the track. It is the upper bound, with 95 %
-#: confidence, from the largest data set, with faults in 2 of 30 943 blocks of 30 s in 70 simulated hours in a city
+#: Prior probability of a joint fault of the low satellites on one side of the track. The value is the upper bound, with
+#: 95 % confidence, from the largest data set, with faults in 2 of 30 943 blocks of 30 s in 70 simulated hours in a city
 #: (docs/level-results.md). The recordings are shorter and support 1e-2 only.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

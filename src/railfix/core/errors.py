@@ -103,7 +103,7 @@ _EXTRAS: Final = {
 def needs_extra(what: object = "this") -> Iterator[None]:
     """Raise SettingsError if an optional package imported in the block is not installed.
 
-    The message names `what` needs the package, and the extra of railfix that installs it.
+    The message states that `what` needs the package, and names the extra of railfix that installs it.
     """
     try:
         yield

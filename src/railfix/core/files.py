@@ -32,7 +32,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip, zip_member
 from railfix.core.staged_files import FilePath as FilePath
 
-Paths = FilePath | Sequence[FilePath]  #: One file, or several.
+Paths = FilePath | Sequence[FilePath]  #: Path of one file, or paths of several files.
 #: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
 Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation files.
@@ -70,7 +70,7 @@ class ByteStream(io.BufferedIOBase):
         return True
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return up to `size` bytes, or all remaining bytes if it is negative or None; ``b""`` at the end."""
+        """Return up to `size` bytes, or all remaining bytes if `size` is negative or None; ``b""`` at the end."""
         try:
             return self._source.read(-1 if size is None else size)
         except EOFError as error:
@@ -124,7 +124,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of strings; raise SettingsError if there is none or one is no path."""
+    """Return one or several paths as a list of strings; raise SettingsError if there is none, or an item is no path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise SettingsError("no file was given")

@@ -22,7 +22,8 @@ SECONDS_PER_DAY: Final = 86_400
 _NS: Final = 1_000_000_000
 _NAT: Final = np.iinfo(np.int64).min
 
-#: UTC instants at which GPST - UTC changes: it is 0 s at the first, and 1 s more at each later one (IERS Bulletin C).
+#: UTC instants at which GPST - UTC changes: the difference is 0 s from the first, and 1 s more from each later instant
+#: on (IERS Bulletin C).
 _LEAP_UTC: Final = np.array(
     [
         "1980-01-06", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01",

@@ -106,7 +106,7 @@ class Observations(NotebookTable):
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
     #: Messages about skipped faults (file, line, fault); at most `MAX_PROBLEMS`, then a message with the number of
-    #: further faults. A slice of epochs has none.
+    #: further faults. A slice of epochs has no messages.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of faults.
     #: Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs, external events,

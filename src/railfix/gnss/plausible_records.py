@@ -18,7 +18,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 
 #: Limits of semi-major axes [m]: medium orbits of GPS, Galileo (E14 and E18 at 27,978 km) and BeiDou; geosynchronous
-#: orbits of BeiDou and QZSS. Of 2,104 broadcast records of ten days from 2005 to 2025 one is outside: a QZSS orbit
+#: orbits of BeiDou and QZSS. Of 2,104 broadcast records of ten days from 2005 to 2025, one is outside: a QZSS orbit
 #: under the number of a GPS satellite (`tests/gnss/test_plausible_records.py`).
 _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "G": ((26.2e6, 26.9e6),),

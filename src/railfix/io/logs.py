@@ -61,8 +61,8 @@ def read_observations(
     date : datetime64 or str, optional
         Any time within half a week of the log; needed for RTCM 3 logs without ephemerides, which have no week number.
     reader : {"railfix", "georinex"}
-        "georinex" reads RINEX files with georinex, an independent reader, for comparison. It is slower, ignores events,
-        scale factors and the indicators of bands other than 1 and 2, and does not count broken lines.
+        "georinex" reads RINEX files with georinex, an independent reader, for comparison. georinex is slower, ignores
+        events, scale factors and the indicators of bands other than 1 and 2, and does not count broken lines.
 
     Raises
     ------

@@ -37,7 +37,7 @@ class _Gga:
 
     line: int
     of_day_s: float  #: UTC time of day, NaN where blank.
-    quality: int  #: As in `QUALITY`.
+    quality: int  #: RTKLIB's quality (`QUALITY`).
     geodetic: tuple[float, float, float]  #: Latitude, longitude [deg], ellipsoidal height [m]; NaN where unknown.
     separation_m: float  #: Height of the geoid above the ellipsoid, NaN where blank.
 
@@ -63,7 +63,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
         With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", it is
         skipped and noted, as a broken last line always is.
     date : datetime64, optional
-        UTC date of the first GGA, for logs without RMC and ZDA. With it, the dates in the log are ignored.
+        UTC date of the first GGA, for logs without RMC and ZDA. If `date` is given, the dates in the log are ignored.
 
     Returns
     -------

@@ -19,7 +19,7 @@ from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, gpst_to_utc, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 
-SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations in a CSV log.
+SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Columns of standard deviations in a CSV log.
 #: Columns of a CSV log. Times are GPS time, UTC, Unix time, or GPS week and seconds; positions are geodetic or ECEF.
 CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
@@ -41,7 +41,7 @@ class PositionLog(NotebookTable):
     time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).
     ecef_m: Floats  #: NaN where a row has no position or no height, shape (n, 3).
     #: Quality as numbered by RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP. A CSV log
-    #: may have other numbers. -1 where the log has none; shape (n,).
+    #: may have other numbers. -1 where the log has no quality; shape (n,).
     quality: Integers
     sigma_m: Floats  #: Standard deviations north, east, up; NaN where the log has none; shape (n, 3).
     line: Integers  #: Line number of each row in the file, shape (n,).

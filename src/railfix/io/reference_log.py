@@ -189,7 +189,8 @@ class Pulses:
 
     path: str
     time: Datetimes
-    #: Pulses, or metres for kind "distance"; falls where the train runs backward, if `signed`; shape (P,).
+    #: Count of pulses, or distance [m] for the kind "distance"; falls where the train runs backward, if `signed`; shape
+    #: (P,).
     count: Floats
     kind: str  #: Source of the count: "count" (readings of a counter), "pulse" (single pulses) or "distance".
     signed: bool  #: Whether the table has the running direction, as a column or by a falling count.

@@ -1,7 +1,7 @@
 """Position message of a train, for live positions, supervision and control.
 
 A message is encoded in CBOR with integer keys (RFC 8949, canonical order) in about 100 bytes; receivers skip unknown
-keys. It can also be written as JSON, and as an ETCS position report (SUBSET-026 v4, 7.4.2, packet 0). CBOR needs
+keys. A message can also be written as JSON, and as an ETCS position report (SUBSET-026 v4, 7.4.2, packet 0). CBOR needs
 ``railfix[live]``.
 """
 
@@ -93,7 +93,7 @@ class TrainMessage(Message):
     #: Probability that the train is on `line`, in thousandths, rounded down.
     track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
     length_cm: Unsigned = 0  #: Train length.
-    complete: bool = False  #: Train integrity confirmed.
+    complete: bool = False  #: Whether the train's integrity is confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
     #: Number of the newest movement authority that the train has accepted, which acknowledges it to the ground side.
     authority: Unsigned | None = None

@@ -26,7 +26,7 @@ class XmlLine:
 
 
 def read_root(path: FilePath) -> Element:
-    """Return the root element of an XML file; InputFileError if the file is not XML."""
+    """Return the root element of an XML file; raise InputFileError if the file is not XML."""
     content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros behind
     try:
         text: str | bytes = content.decode("utf-8")

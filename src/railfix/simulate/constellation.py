@@ -4,7 +4,8 @@ Orbits have the semi-major axis, eccentricity and inclination of the real conste
 zenith at the start of the run. All records of a satellite describe the same orbit and clock to within a millimetre.
 Signals are computed from the newest transmitted record, which receivers use, too.
 
-`links` computes the states at every instant; `SatelliteTable` computes them at nodes and interpolates all satellites.
+`links` computes the states at every instant; `SatelliteTable` computes the states of all satellites at nodes, and
+interpolates them.
 """
 
 from __future__ import annotations

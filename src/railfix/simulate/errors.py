@@ -84,14 +84,16 @@ def node_count(duration_s: float, spacing_s: float) -> int:
 
 
 class GaussMarkov(Interpolated):
-    """Independent Gauss-Markov processes of first order, one per key, which is its seed.
+    """Independent Gauss-Markov processes of first order, one per key, which is the seed of the process.
 
     `sigma` is the standard deviation and `time_s` the correlation time. A longer duration does not change the values
     within a shorter duration.
     """
 
     def __init__(self, keys: Sequence[Sequence[int]], *, sigma: float, time_s: float, duration_s: float) -> None:
-        from scipy.signal import lfilter  # its import takes 0.4 s, which reading a scenario does not need
+        from scipy.signal import (
+            lfilter,
+        )  # imported here, because the import takes 0.4 s, and reading a scenario does not need it
 
         spacing = time_s / _NODES_A_TIME
         rho = float(np.exp(-1.0 / _NODES_A_TIME))

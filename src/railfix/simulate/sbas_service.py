@@ -157,8 +157,8 @@ class Service:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # The mask has all satellites, not only those in view of the train. Their errors equal the errors of the train's
-        # signals, because the errors of a satellite do not depend on the other satellites.
+        # The mask has all satellites, not only satellites in view of the train. Their errors equal the errors of the
+        # train's signals, because the errors of a satellite do not depend on the other satellites.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))

@@ -17,8 +17,8 @@ its folder or a shipped scenario, and the settings of each run that differ from 
     [parts.back]
     run.direction = "falling"
 
-The settings of a run override those of its parts, later parts override earlier parts, and all override the base. Paths
-in a file (``sky.nav``, ``line.file.path``) are relative to the folder of the file.
+The settings of a run override the settings of its parts, later parts override earlier parts, and all override the base.
+Paths in a file (``sky.nav``, ``line.file.path``) are relative to the folder of the file.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Bal
 
 
 def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.DataFrame:
-    """Return the list of balises, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the list of balises, with the columns `COLUMNS`."""
     balises, line = balises_along(simulation, settings), simulation.line
     at = np.array([balise.chainage_m for balise in balises], dtype=np.float64)
     mapped = np.interp(at, line.point_chainage_m(), line.track().chainage_m)
@@ -41,7 +41,7 @@ def balise_list_table(simulation: Simulation, settings: BaliseSettings) -> pl.Da
 
 
 def balise_tables(simulation: Simulation, settings: BaliseSettings) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return the readings, and the ground truth of all passings, see `railfix.simulate.sensor_columns.COLUMNS`.
+    """Return the readings, and the ground truth of all passings, with the columns `COLUMNS`.
 
     Errors, missed readings and wrong identities are drawn once per balise, so that they are the same at every passing
     of a balise.
@@ -83,7 +83,7 @@ _NOISE, _SWAY, _DROPOUTS = 26, 27, 28  #: Streams of random numbers: noise, sway
 
 
 def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame:
-    """Return the samples of the radar, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the samples of the radar, with the columns `COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(int(scenario.duration_s * settings.rate_hz + 1e-9) + 1) / settings.rate_hz
     true = simulation.motion.at(time)[1]
@@ -130,7 +130,7 @@ def unit_ecef_m(line: Alignment, unit: GroundUnit) -> Floats:
 
 
 def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFrame:
-    """Return the surveyed positions of the ground units, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the surveyed positions of the ground units, with the columns `COLUMNS`."""
     line = simulation.line
     place = np.array([unit_ecef_m(line, unit) for unit in settings.units]).reshape(-1, 3)
     chainage = np.array([unit.chainage_m for unit in settings.units])
@@ -142,7 +142,7 @@ def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFram
 
 
 def ranging_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFrame:
-    """Return the measured ranges in order of time, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the measured ranges in order of time, with the columns `COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(0.0, scenario.duration_s + 1e-9, settings.interval_s)
     offset = (settings.along_m, settings.across_m, settings.up_m)

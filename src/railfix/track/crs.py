@@ -208,7 +208,7 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 
 
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
-    """Return the CRS of a file, which the user gives or the file names; None without either.
+    """Return the CRS of a file, which the user gives or the file names; None if it is unknown.
 
     If both name the same CRS, a given compound CRS is returned, because it has a height datum. Raise SettingsError if
     the two CRS contradict each other, or a CRS is unknown.
@@ -367,6 +367,6 @@ def _in_bounds(bounds: Box, latitude_deg: Floats, longitude_deg: Floats, margin_
     south, north, west, east = bounds
     inside = (latitude_deg >= south - margin_deg) & (latitude_deg <= north + margin_deg)
     width = (east - west) % 360.0 if east - west < 360.0 else 360.0
-    with np.errstate(invalid="ignore"):  # outside a grid the longitude is undefined
+    with np.errstate(invalid="ignore"):  # outside a grid, the longitude is undefined
         from_west = (longitude_deg - west + margin_deg) % 360.0
     return np.asarray(inside & (from_west <= width + 2.0 * margin_deg))

@@ -1,6 +1,6 @@
 """Curve of a centreline between its points, which follows arcs and clothoids in plan, and parabolas in height.
 
-Between two points the curve is a cubic over their chord, defined by the directions at both ends. For a curvature that
+Between two points, the curve is a cubic over their chord, defined by the directions at both ends. For a curvature that
 is linear between points, each chord implies a direction at its ends; the direction at a point is the mean from both
 adjacent chords. The curvature at a point is from the map's radius, or from the circle through the point and its
 neighbours. The curve passes through every point, and follows arcs, clothoids and parabolas within millimetres.
@@ -20,8 +20,9 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest difference between the middle ordinates of a chord by the map's radius and by neighbouring points [m]. With a
-#: larger difference, the radius is not used, because it belongs to another point or has the wrong sign.
+#: Largest difference between the middle ordinates of a chord that follow from the map's radius and from neighbouring
+#: points [m]. With a larger difference, the radius is not used, because it belongs to another point or has the wrong
+#: sign.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Smallest change of direction that is a corner, which the curve does not round [rad].
 #: Minimum distance of a ramp's end from either point, as a fraction of the distance between the points, and minimum

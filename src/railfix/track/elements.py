@@ -298,7 +298,7 @@ class Design:
     plan: Sequence[Plan]
     profile: Sequence[ProfileElement] = ()
     cant: Sequence[CantElement] = ()
-    stations: Stations | None = None  #: Stations; None if the file has none.
+    stations: Stations | None = None  #: Stations; None if the file states none.
 
 
 def segment_of_design(
@@ -368,7 +368,7 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
     """Check that a profile covers the plan, except at most `_PROFILE_BEYOND_M`, and return a note on any uncovered
     length.
 
-    Raise InputFileError otherwise.
+    Raise InputFileError if more is uncovered.
     """
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)
@@ -382,7 +382,7 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
 def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> None:
     """Raise InputFileError if the length of an alignment on the map differs from its design length.
 
-    This occurs with a wrong CRS, or elements that do not meet.
+    The lengths differ if the CRS is wrong, or elements do not meet.
     """
     designed = sum(element.length_m for element in plan)
     geod = CRS.from_user_input(place.frame).get_geod()

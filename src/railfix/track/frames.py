@@ -1,7 +1,7 @@
 """Reference frames of track maps, and transformation of maps to the frame of the satellites.
 
 Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation within centimetres. Maps are in a plate-fixed
-frame, or in an ITRF realisation at the epoch of their survey. PROJ transforms coordinates with their epoch. Where it
+frame, or in an ITRF realisation at the epoch of their survey. PROJ transforms coordinates with their epoch. Where PROJ
 has no transformation, the ITRF2020 plate motion model (Altamimi et al. 2023, doi:10.1029/2023GL106373) is used, and a
 note reports this.
 """
@@ -85,7 +85,8 @@ class MapMotion(TypedDict, total=False):
     epoch: float | None  #: Epoch of the map's coordinates, for a frame that is an ITRF realisation [year].
     plate: str | None  #: Plate, one of `PLATES`, with which ITRF coordinates move from `epoch` to the time of the log.
     #: Parameter file of the semi-dynamic correction of Japan (``SemiDynaEXE`` format), which transforms JGD2011 to the
-    #: epoch of the file with crustal deformation. `epoch` is then this epoch, after which the plate motion is used.
+    #: epoch of the file with crustal deformation. `epoch` is then the epoch of the file, after which the plate motion
+    #: is used.
     parameters: FilePath | None
 
 

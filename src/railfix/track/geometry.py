@@ -109,7 +109,7 @@ def _circle_curvature(plan: Floats) -> Floats:
 
 
 def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
-    """Compute the means of a piecewise linear function from `low` to `high`; NaN if it has an unknown value there."""
+    """Compute the means of a piecewise linear function from `low` to `high`; NaN if a value there is unknown."""
     unknown = np.isnan(values)
 
     def between(part: Floats) -> Floats:

@@ -77,7 +77,7 @@ class EllipsoidalHeights:
 
 
 def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
-    """Return the bounds of points [deg]; across the date line the east bound is more than 180."""
+    """Return the bounds of points [deg]; across the date line, the east bound is more than 180."""
     west = float(longitude_deg.min())
     if float(longitude_deg.max()) - west > 180.0:
         longitude_deg = longitude_deg % 360.0

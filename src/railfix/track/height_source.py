@@ -34,8 +34,8 @@ _WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are rea
 _NEAR_M: Final = 15.0  #: Largest distance in plan from the line of positions that are used [m].
 _REACH_M: Final = 200.0  #: Largest distance along the line between a point and the positions that give its height [m].
 #: Standard deviation of the Gaussian weights along the line [m], for RTK fixed positions, and for single-point
-#: positions, whose errors persist for hundreds of metres. The latter causes up to 5 m error in a vertical curve of 2 km
-#: radius.
+#: positions, whose errors persist for hundreds of metres. The length for single-point positions causes up to 5 m error
+#: in a vertical curve of 2 km radius.
 _KERNEL_M: Final = 15.0
 _LARGEST_KERNEL_M: Final = 150.0
 #: Deviation, in median deviations, beyond which a height has zero weight, and number of reweighting iterations (robust

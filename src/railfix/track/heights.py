@@ -63,7 +63,7 @@ def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidM
     """Compute the heights of a geoid above the ellipsoid at the points of a map.
 
     The geoid is a name in `JAPAN_MODELS`, ``egm96``, a grid of PROJ, or a vertical or compound CRS. Raise SettingsError
-    if it is unknown or not installed, InputFileError if it does not cover all points.
+    if the geoid is unknown or not installed, and InputFileError if it does not cover all points.
     """
     key = geoid.strip().lower() if isinstance(geoid, str) else ""
     if isinstance(geoid, CRS) and geoid.to_authority() == ("EPSG", "5773"):
@@ -178,8 +178,8 @@ def heights_of_file(
     """Convert the heights of a file to ellipsoidal heights.
 
     `datum`, `geoid` and `geoid_m` are stated in the file. A datum and a geoid in `reading` are given by the user, and
-    take precedence. Raise InputFileError if the file names an unknown datum, SettingsError if no datum is known or if
-    two datums contradict each other.
+    take precedence. Raise InputFileError if the file names an unknown datum, and SettingsError if no datum is known or
+    if two datums contradict each other.
     """
     check_height_datum(reading.height_datum)
     if datum is not None and datum not in HEIGHT_DATUMS:
@@ -248,7 +248,7 @@ def ellipsoidal_heights(
 ) -> EllipsoidalHeights:
     """Convert heights of a datum to ellipsoidal heights, by a geoid model or the geoid heights `geoid_m` of the map.
 
-    Raise SettingsError for contradictory options, InputFileError for orthometric heights without a geoid.
+    Raise SettingsError for contradictory options, and InputFileError for orthometric heights without a geoid.
     """
     if datum == "ellipsoidal":
         if geoid is not None:

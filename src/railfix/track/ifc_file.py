@@ -199,7 +199,7 @@ def _map_conversion(
 ) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
     """Return easting, northing, height [m], cosine, sine and scale of the IfcMapConversion, and the name of its CRS.
 
-    Both are None without an IfcMapConversion. Raise InputFileError if the scale does not match the units.
+    Both results are None without an IfcMapConversion. Raise InputFileError if the scale does not match the units.
     """
     found = step.of_kind("IFCMAPCONVERSION")
     if not found:
@@ -220,7 +220,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of its horizontal layout if that is relative to the alignment."""
+    """Return the placement of an alignment, or of its horizontal layout if the layout is relative to the alignment."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative
@@ -240,7 +240,7 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return the references of placements from an object to the world; raise InputFileError if one is not local."""
+    """Return the references of placements from an object to the world; raise InputFileError if any is not local."""
     found: list[Any] = []
     while reference is not None and reference not in found:
         entity = step.at(reference, what="ObjectPlacement")
@@ -256,8 +256,8 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
     """Return the elements, with cubic parabolas as ordinates over the tangent.
 
-    A parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``), unless the next element begins at the end of the form
-    with the projected length, or of the form with the Japanese correction.
+    A parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``), unless the next element begins where the form with the
+    projected length, or the form with the Japanese correction, ends.
     """
     result: list[Plan] = []
     for element, after in zip(plan, [*plan[1:], None], strict=True):

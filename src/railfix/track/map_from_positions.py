@@ -31,8 +31,8 @@ _LEAST_RADIUS_M: Final = 150.0
 _ROUNDS: Final = 20  #: Largest number of searches for outliers, each without the outliers found before.
 _ENOUGH: Final = 10  #: Minimum number of positions for a search.
 _ACCELERATION_MPS2: Final = 2.0  #: Acceleration that is allowed for in the distance along the line.
-#: The path between the neighbours of a position counts as straight if both are at most this far from it in time [s], or
-#: if the cosine of the change of direction before and after them is at least this.
+#: The path between the neighbours of a position counts as straight if both neighbours are within this time of the
+#: position [s], or if the cosine of the change of direction from before to after them has at least this value.
 _NEAR_S: Final = 2.5
 _STRAIGHT: Final = 0.87
 _STANDING_WINDOW_S: Final = 3.0  #: Half length of the window over which the displacement is computed [s].
@@ -42,8 +42,8 @@ class ThinningLimits(Settings):
     """Limits for the selection of positions as points of a map."""
 
     spacing_m: float = Field(default=5.0, gt=0)  #: Smallest distance between consecutive points.
-    #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). Beyond it, the farthest
-    #: position becomes a point, too. Times are required, to distinguish a bend from noise at standstill.
+    #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). If the deviation is larger,
+    #: the farthest position also becomes a point. Times are required, to distinguish a bend from noise at standstill.
     chord_m: float = Field(default=0.30, gt=0)
     #: Horizontal speed below which the antenna is stationary, so that its positions are noise or drift. Times are
     #: required; with 0, all positions are kept.
@@ -229,7 +229,9 @@ def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
 
 
 def _at_spacing(points: Floats, spacing_m: float) -> Indices:
-    """Return the indices of points at least the spacing apart, and of the last point if it is a fifth of this ahead."""
+    """Return the indices of points at least the spacing apart, and the last point if it is at least a fifth of the
+    spacing ahead.
+    """
     if not len(points):
         return np.zeros(0, dtype=np.intp)
     kept = [0]
@@ -369,7 +371,7 @@ SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
     """Return the standard deviations of a map in plan and height [m], and a note on their basis.
 
-    Each is the largest of the value stated in the log, the value of the quality number, and the value of P1.
+    Each result is the largest of the value stated in the log, the value of the quality number, and the value of P1.
     """
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]

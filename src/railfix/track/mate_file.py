@@ -2,8 +2,8 @@
 
 The tables are described at https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the
 arc length from its northernmost point. A clothoid is given by its point of zero curvature, the azimuth at this point
-and the arc length from it. The tables define neither the sign of curves nor the constant of a clothoid. Therefore the
-interpretation is used with which a segment meets the adjacent segments of its edge.
+and the arc length from this point. The tables define neither the sign of curves nor the constant of a clothoid. The
+interpretation is therefore used in which a segment meets the adjacent segments of its edge.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float
     """Create the part of a clothoid that begins at the arc length `arc` from its point of zero curvature."""
     if arc == 0.0:
         return _element(east, north, azimuth, 0.0, rate * length, length)
-    # before its origin a clothoid is the curve after the origin, rotated by 180 degrees
+    # before its origin, a clothoid is the curve after the origin, rotated by 180 degrees
     way = _element(east, north, azimuth if arc > 0.0 else azimuth + np.pi, 0.0, rate * abs(arc), abs(arc))
     (x, y), _ = _end(way)
     return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)

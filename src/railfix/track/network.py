@@ -1,6 +1,6 @@
 """Network of tracks: track centrelines, connections of their ends, and routes through the network (P1 4.2(1)).
 
-Connections are stated by the file, or join ends within a tolerance of each other. At a switch a train can pass between
+Connections are stated by the file, or join ends within a tolerance of each other. At a switch, a train can pass between
 the stem and either leg, but not between the two legs.
 """
 
@@ -34,7 +34,8 @@ ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].
 _NEAR_WAY_M: Final = 5_000.0  #: Length of the routes that are searched before the whole network [m].
 _SAMPLE_M: Final = 50.0  #: Largest spacing of the samples in the spatial index [m].
-#: Number of nearest samples that are examined first for each position; it is increased if they are not enough.
+#: Number of nearest samples that are examined first for each position; more samples are examined if these are not
+#: enough.
 _SAMPLES: Final = 32
 _TOGETHER: Final = 256  #: Number of positions processed at once, which bounds the memory for nearby samples.
 #: Cached properties that do not depend on the connections.
@@ -276,7 +277,7 @@ class Network(NotebookTable):
     def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
         """Return the chainages of positions on given tracks, and their distances in plan, shape (n,) each [m].
 
-        Both are NaN without a track (-1) or a position (NaN).
+        Both results are NaN without a track (-1) or a position (NaN).
         """
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         chainage, offset = np.full(len(track), np.nan), np.full(len(track), np.nan)
@@ -352,7 +353,7 @@ class Network(NotebookTable):
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the indices of the tracks of the shortest route over given tracks in order; None if there is none."""
+        """Return the indices of the tracks of the shortest route over given tracks in order; None without a route."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         routes = {4 * wanted[0] + end: (0.0, [4 * wanted[0] + end]) for end in (1, 3)}
         for stop in wanted[1:]:

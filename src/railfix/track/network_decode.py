@@ -53,12 +53,14 @@ _SLACK_SHARE: Final = 0.2
 #: Difference of path length and distance that halves the probability of a transition over joints [m].
 _PASSING_M: Final = 5.0
 #: Minimum gain of a change of track, in expected positions on the right track. At a joint, where the transition
-#: probability is at least `_AT_JOINT`, it is smaller, because a short track of a switch has only one or two positions.
+#: probability is at least `_AT_JOINT`, the minimum is smaller, because a short track of a switch has only one or two
+#: positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
 COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
-#: Number of balls of the urn of a horizontal axis, and of the vertical axis; a quarter of it is the variance in steps.
+#: Number of balls of the urn of a horizontal axis, and of the vertical axis; a quarter of the number is the variance in
+#: steps.
 _BALLS: Final = 12
 _BALLS_UP: Final = 8
 _BLOCK: Final = 1024  #: Number of positions whose probabilities are in memory at once, if heights are not used.
@@ -175,8 +177,8 @@ class Transitions:
 def _shifted(moved_m: float, turned: bool) -> Floats:
     """Return relative transition probabilities between `SHIFTS_M`, from row to column, shape (S, S).
 
-    The reference track of the columns is `moved_m` to the right of the reference track of the rows. Their directions
-    are opposite if `turned`.
+    The reference track of the columns is `moved_m` to the right of the reference track of the rows. The two reference
+    tracks have opposite directions if `turned`.
     """
     place = (SHIFTS_M - moved_m) * (-1.0 if turned else 1.0)
     apart = np.abs(place[:, None] - SHIFTS_M)

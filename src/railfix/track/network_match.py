@@ -38,8 +38,8 @@ _BEST: Final = 0.1  #: Quantile of the stated standard deviations from which the
 _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
 _FARTHEST_M: Final = 100.0
-#: Distance from all tracks, as a multiple of the search distance, beyond which positions are wrong if the train is back
-#: near a track within this time [s].
+#: Positions farther from all tracks than this multiple of the search distance are wrong if the train is near a track
+#: again within this time [s].
 _FAR: Final = 6.0
 _WRONG_S: Final = 60.0
 _MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position far from all tracks.

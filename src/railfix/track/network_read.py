@@ -33,7 +33,7 @@ def read_network(
 ) -> Network:
     """Read a network of tracks from map files.
 
-    Tracks are connected as the files state. Without such statements, they are connected where two ends, or an end and
+    Tracks are connected as the files state. Without such statements, tracks are connected where two ends, or an end and
     another track, are within `tolerance_m`. Raise InputFileError or SettingsError as `railfix.track.read_track` does.
     """
     tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]

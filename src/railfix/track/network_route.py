@@ -40,7 +40,7 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
     """Fill rows without a usable position along the shortest route between known positions.
 
     The speed on the route is assumed to be constant. If the log has positions off the map, and `rows_to_fill` includes
-    them, their speed is used instead.
+    them, the speed of these positions is used instead.
     """
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)

@@ -94,7 +94,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name of a feature, or its id, as property "name"; an empty dictionary without either."""
+    """Return the name of a feature, or its id, as property "name"; an empty dictionary if it has neither."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -184,7 +184,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
 def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of a GeoJSON file as segments; `reading` has options that the file does not state.
 
-    An Overpass JSON file (OpenStreetMap) is read, too. Raise InputFileError if the file is not valid.
+    Overpass JSON files (OpenStreetMap) are also read. Raise InputFileError if the file is not valid.
     """
     text = read_text(path)
     try:
@@ -385,7 +385,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
 
 
 def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:
-    """Return the positions of latitudes and longitudes in a geographic CRS; WGS 84 is assumed if it is None.
+    """Return the positions of latitudes and longitudes in a geographic CRS; WGS 84 if None.
 
     Raise SettingsError if the CRS is not geographic or its unit is not the degree.
     """

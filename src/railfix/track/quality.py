@@ -21,7 +21,7 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Rounding of coordinates that is reported [deg]; errors are up to half of it, 0.6 m.
+_COARSE_DEG: Final = 1e-5  #: Rounding of coordinates that is reported [deg]; it causes errors of up to 0.6 m.
 _LEAST_CANT_M: Final = 5e-4  #: Maximum cant of a map below which the unit must be wrong [m].
 _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are probably the same point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
@@ -228,8 +228,8 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
     """Yield the curves with negative cant.
 
-    They are errors if all curves to one side have negative cant, and otherwise warnings, as negative cant is usual in
-    turnouts.
+    The findings are errors if all curves to one side have negative cant, and otherwise warnings, as negative cant is
+    usual in turnouts.
     """
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))

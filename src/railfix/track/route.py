@@ -194,8 +194,9 @@ def join(
 ) -> Track:
     """Join segments to one track.
 
-    A point shared by two segments is kept once. Its attributes are from the earlier segment or, where this segment has
-    none, from the later segment. Raise InputFileError if segments do not meet, MismatchError if their frames differ.
+    A point shared by two segments is kept once. The attributes of this point are from the earlier segment or, where
+    this segment has none, from the later segment. Raise InputFileError if segments do not meet, and MismatchError if
+    their frames differ.
     """
     pieces = orient(segments, max_gap_m=max_gap_m)
     ends = _ends(pieces)

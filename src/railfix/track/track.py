@@ -188,8 +188,8 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
     """Interpolate the kilometrage at chainages of any shape.
 
     The result is NaN for NaN, and where a point of the segment has no kilometrage. The kilometrage is linear between
-    two points, and is extrapolated beyond the ends. Within a segment that has a break, it is extrapolated from the
-    nearer point in the direction of the kilometrage on that side of the break.
+    two points, and is extrapolated beyond the ends. Within a segment that has a break, the kilometrage is extrapolated
+    from the nearer point in the direction of the kilometrage on that side of the break.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2

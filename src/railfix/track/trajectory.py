@@ -17,8 +17,8 @@ from railfix.core.geodesy import axes_at
 from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
-#: Number of candidates in the first round of the search. It is multiplied by 4 in each further round, for positions
-#: whose nearest point is not yet proven.
+#: Number of candidates in the first round of the search. The number is multiplied by 4 in each further round, for
+#: positions whose nearest point is not yet proven.
 _FIRST_CANDIDATES = 6
 _CHUNK = 2_000_000  #: Largest product of the numbers of positions and candidates in one array.
 
@@ -113,7 +113,9 @@ def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest part of the line beside its end and parallel to it [m]; NaN if none."""
+    """Return the arc length of the nearest part of the line beside and parallel to its end [m]; NaN without such a
+    part.
+    """
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -144,8 +146,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     #: Roll of the car body, positive to the right, shape (V,); 0 if the track itself is used as the path.
     roll_deg: Floats
     reference: str = "antenna"  #: Point of the vehicle to which `chainage_m` refers.
-    #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising, shape (V,). It
-    #: relates the positions of two antennas on one vehicle. None without a vehicle.
+    #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising, shape (V,). This
+    #: chainage relates the positions of two antennas on one vehicle. None without a vehicle.
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
     #: Distance of the antenna ahead of the middle between the bogies, toward the vehicle's front.
@@ -275,8 +277,9 @@ class Trajectory(FrozenArrays, NotebookTable):
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
         """Return the segment at each arc length, of any shape, and the distance along the segment [m].
 
-        A point shared by two segments belongs to the later segment. Before the start the result is the first segment
-        with a negative distance. Beyond the end it is the last segment; for NaN it is the last segment with NaN.
+        A point shared by two segments belongs to the later segment. Before the start, the result is the first segment
+        with a negative distance. Beyond the end, the result is the last segment; for NaN, the last segment with a
+        distance of NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)

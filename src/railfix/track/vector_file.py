@@ -40,7 +40,7 @@ _OTHERS: Final = (
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
     "turntable", "yard",
 )  # fmt: skip
-#: Columns that can contain the id of a feature, beginning with those that only OpenStreetMap export programs write.
+#: Columns that can contain the id of a feature, beginning with columns that only OpenStreetMap export programs write.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
 _ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
@@ -57,7 +57,8 @@ class Way:
 
     row: dict[str, Any]  #: Tags and id of the way.
     points_deg: np.ndarray[Any, np.dtype[np.float64]]  #: Longitude and latitude of the points, shape (n, 2).
-    #: Node ids of the points, empty if the file has none. They begin with `CROSSING` at a crossing without connection.
+    #: Node ids of the points, empty if the file has none. The id of a crossing without connection begins with
+    #: `CROSSING`.
     nodes: tuple[str, ...] = ()
 
 

@@ -255,8 +255,8 @@ def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> F
 def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
     """Return chainages of the body's middle at which the antenna's path is computed [m].
 
-    These are the chainages of the track's points, and further chainages where the path deviates from a chord by more
-    than `PATH_TOLERANCE_M`.
+    The result has the chainages of the track's points, and further chainages where the path deviates from a chord by
+    more than `PATH_TOLERANCE_M`.
     """
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
@@ -309,8 +309,8 @@ def antenna_trajectory(
     Both bogie centres are on the centreline, with the bogie distance as chord. At each bogie, the track rolls by
     ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean of both rolls (P1
     3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the vertical rotated by the roll. The
-    path begins and ends where a bogie reaches the end of the track. On a closed track it begins and ends where the
-    body's middle reaches the end of the map, so that the path is closed, too.
+    path begins and ends where a bogie reaches the end of the track. On a closed track, the path begins and ends where
+    the body's middle reaches the end of the map, so that the path is also closed.
 
     Parameters
     ----------

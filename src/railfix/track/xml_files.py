@@ -40,7 +40,7 @@ class Relation:
 
 
 def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a LandXML or railML 3 file as segments; raise InputFileError if there are none."""
+    """Read the lines of a LandXML or railML 3 file as segments; raise InputFileError without a line."""
     root = read_root(path)
     kind = tag(root)
     if kind == "LandXML":
@@ -130,7 +130,7 @@ _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the linear elements of a RINF file that have a geometry as segments; raise InputFileError without any."""
+    """Read the linear elements with a geometry of a RINF file as segments; raise InputFileError if there is none."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [

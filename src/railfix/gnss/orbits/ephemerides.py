@@ -129,7 +129,7 @@ def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats
 def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
     """Compute satellite states at times since toe, shape (n,) [s] (IS-GPS-200, tables 20-IV and 30-II).
 
-    Harmonic corrections of latitude and inclination are small angles (at most 1.3e-4 rad). Returns position [m] and
+    Harmonic corrections of latitude and inclination are small angles (at most 1.3e-4 rad). Return position [m] and
     velocity [m/s] in the Earth-fixed frame of the same time, and the relativistic clock correction F e sqrt(A) sin E
     [s], which equals -2 r.v / c^2.
     """
@@ -193,7 +193,7 @@ def _out_of_tilted_frame(
 
 
 STEP_S: Final = 60.0  #: Step of the integration [s]; the ICD states the accuracy for 60 s.
-_BLOCK: Final = 8192  #: Rows integrated at once, so that the arrays stay in the cache.
+_BLOCK: Final = 8192  #: Number of rows integrated at once, so that the arrays stay in the cache.
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
@@ -266,10 +266,10 @@ class GlonassStates:
         return position, velocity
 
 
-#: Points of the interpolation polynomial (order 12). With positions every 15 minutes, the error is within 3 mm for the
-#: two Galileo satellites in elliptic orbits, where the usual 11 points cause errors of 17 mm near perigee, and within a
-#: micrometre for other satellites. In the first and last interval of a file, the error is up to 0.7 m for these two
-#: satellites, and 0.05 mm for others.
+#: Number of points of the interpolation polynomial (order 12). With positions every 15 minutes, the error is within 3
+#: mm for the two Galileo satellites in elliptic orbits, where the usual 11 points cause errors of 17 mm near perigee,
+#: and within a micrometre for other satellites. In the first and last interval of a file, the error is up to 0.7 m for
+#: these two satellites, and 0.05 mm for others.
 POINTS: Final = 13
 #: An interval longer than this multiple of the usual interval is a gap, within which there are no states.
 _GAP: Final = 1.5

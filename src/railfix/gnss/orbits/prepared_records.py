@@ -59,8 +59,8 @@ class Lookup:
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
         """Return the record of each satellite at each time, its validity, and whether it was sent later, shapes (M, T).
 
-        The record is a row of the record table, -1 without records. It is valid if toe is within `limit`, given by row,
-        of the epoch.
+        The record is a row of the record table, -1 without records. The record is valid if its toe differs from the
+        epoch by at most `limit`, which has one value per row of the table.
         """
         shape = (len(number), len(time))
         if not len(self.sent_key):
@@ -185,8 +185,8 @@ QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
 }  # fmt: skip
-#: Largest accuracy of a healthy record [m]. URA indices of 8 and more exceed it (15 means no prediction; IS-GPS-200,
-#: 20.3.3.3.1.3); such a signal is marginal by the GPS performance standard.
+#: Largest accuracy of a healthy record [m]. URA indices of 8 and more exceed this accuracy (15 means no prediction;
+#: IS-GPS-200, 20.3.3.3.1.3); such a signal is marginal by the GPS performance standard.
 LARGEST_ACCURACY_M: Final = 48.0
 #: Columns of `KeplerRecords.inter_signal_s` by GPS and QZSS signal; the mean is used for combined data and pilot codes.
 _ISC: Final[Mapping[str, list[int]]] = {
@@ -207,8 +207,8 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
     """Return whether each record flags a signal as unhealthy, shape (n,).
 
     A signal is flagged by any of the six health bits of GPS LNAV, by the bits of the signal of QZSS and Galileo, by the
-    bit of the band of CNAV, and by SatH1 or HS of BeiDou. It is also unhealthy if a Galileo record predicts no accuracy
-    (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
+    bit of the band of CNAV, and by SatH1 or HS of BeiDou. A signal is also unhealthy if a Galileo record predicts no
+    accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
     `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")

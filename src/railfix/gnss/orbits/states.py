@@ -19,7 +19,7 @@ from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords
 #: Chunks of fewer epochs are computed with all channels together, longer chunks channel by channel, with the same
 #: arithmetic on every element. Both single live epochs and complete logs are then fast.
 _SHORT: Final = 96
-_BLOCK: Final = 4096  #: Epochs of a channel computed at once, so that the arrays stay in the cache.
+_BLOCK: Final = 4096  #: Number of epochs of a channel computed at once, so that the arrays stay in the cache.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +141,7 @@ def _fill_kepler(
     rows, valid, future = table.lookup.find(plan.preferred, time, limit)
     if plan.any_other:
         others, other_valid, other_future = table.lookup.find(plan.other, time, limit)
-        # A record transmitted before the epoch takes precedence over one transmitted later.
+        # A record transmitted before the epoch takes precedence over a record transmitted later.
         better = other_valid & (~valid | (future & ~other_future))
         rows, future, valid = np.where(better, others, rows), np.where(better, other_future, future), valid | better
     channels, newest = plan.kepler, rows

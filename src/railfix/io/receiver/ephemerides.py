@@ -58,8 +58,8 @@ class Unfinished:
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     #: Issue of the last record by satellite and message, which identifies repetitions.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    #: First epoch after the last string, NaT if not yet received, by GLONASS satellite. Its four strings are complete,
-    #: but may be of different frames.
+    #: First epoch after the last string, NaT if not yet received, by GLONASS satellite of which all four strings are
+    #: complete, but perhaps of different frames.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 

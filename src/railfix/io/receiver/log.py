@@ -214,13 +214,13 @@ class StreamState:
     rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch; at first, a date.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch, at first a date.
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
     observed: bool = False  #: Whether UBX or SBF measurements with a time have been decoded.
     kind: str = ""  #: Kind of observation messages used, blank before the first epoch.
-    clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last time of any message.
+    clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Latest time in any message.
     indicators: Indicators = field(default_factory=Indicators)
-    station: tuple[float, float, float] | None = None  #: As in `LogPiece`.
+    station: tuple[float, float, float] | None = None  #: `LogPiece.station`.
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:

@@ -196,7 +196,7 @@ _MOSCOW_S: Final = 3 * 3600.0
 
 
 def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Return the record of GPS or QZSS (LNAV 1 to 3, RTCM 1019, 1044); `time` of reception resolves the week."""
+    """Return the record of GPS or QZSS (LNAV 1 to 3, RTCM 1019, 1044); `time` (of reception) resolves the week."""
     week, epoch = _week_and_toc(values, _near_week(values["week"], time), time)
     numbers = {
         **values,

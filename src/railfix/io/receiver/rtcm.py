@@ -376,7 +376,7 @@ _FIRST_MSM_WEEK: Final = 1642
 
 
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
-    """Return the median time of the ephemerides in a log, which resolves the week of observations; NaT without any.
+    """Return the median time of a log's ephemerides, which resolves the week of observations; NaT without ephemerides.
 
     Galileo is used if available, then BeiDou, whose weeks are unambiguous, then GPS and QZSS. The GPS week, modulo
     1024, is resolved to the week nearest to `near`; without `near`, to a week from July 2011, when MSM were introduced,

@@ -266,7 +266,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
             path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
-    lettered = version >= 3.0 or first[:1].isalpha()  # in RINEX 2.12 a letter shifts all columns by one
+    lettered = version >= 3.0 or first[:1].isalpha()  # in RINEX 2.12, a letter shifts all columns by one
     try:
         epoch = _instant(first[4:], 4) if version >= 3.0 else _instant(first[2 + lettered :], 3)
     except ValueError:

@@ -273,7 +273,7 @@ LONGEST_GAP: Final = np.timedelta64(7, "D")
 
 
 def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None:
-    """Raise MismatchError where the first epochs of consecutive files are more than a week apart."""
+    """Raise MismatchError if the first epochs of consecutive files are more than a week apart."""
     order = np.argsort(np.array(firsts), kind="stable")
     for before, after in pairwise(order.tolist()):
         if firsts[after] - firsts[before] > LONGEST_GAP:
@@ -291,9 +291,7 @@ def first_time(path: str) -> np.datetime64:
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
-    """Return `run` with `break_before` set at its first epoch, unless this follows `last` within 1.5 intervals of the
-    log.
-    """
+    """Return `run` with `break_before` set at its first epoch, unless it follows `last` within 1.5 intervals."""
     if last is None:
         return run
     interval = run.header.interval_s

@@ -112,7 +112,7 @@ def program_line(created: np.datetime64 | None) -> str:
     return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")
 
 
-_BLOCK_EPOCHS: Final = 1024  #: Epochs formatted at once.
+_BLOCK_EPOCHS: Final = 1024  #: Number of epochs formatted at once.
 #: Bytes of an epoch line with its line end, and of an observation (F14.3, LLI, SSI).
 _EPOCH_WIDTH: Final = 36
 _FIELD_WIDTH: Final = 16

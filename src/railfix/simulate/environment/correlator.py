@@ -190,7 +190,7 @@ def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: Antenn
 def cross_polar_gain(sine_elevation: Floats | float, antenna: AntennaSettings) -> Floats:
     """Return the ratio of the received amplitudes of left-handed and right-handed signals.
 
-    Its value in dB is linear in the sine of the elevation.
+    The ratio in dB is linear in the sine of the elevation.
     """
     horizon_db, zenith_db = antenna.cross_polar_horizon_db, antenna.cross_polar_zenith_db
     return np.asarray(10.0 ** (-(horizon_db + sine_elevation * (zenith_db - horizon_db)) / 20.0))

@@ -70,7 +70,7 @@ class RowSettings(ScenarioSettings):
     length_m: Between = (10.0, 30.0)  #: Length along the line.
     gap_m: Between = (2.0, 10.0)  #: Gap to the next wall.
     share: Share = 1.0  #: Fraction of the plots that have a wall.
-    #: Amplitude reflection coefficient, from 0 to 1; without `AntennaSettings` it includes the effect of polarisation.
+    #: Amplitude reflection coefficient, from 0 to 1; without `AntennaSettings`, including the effect of polarisation.
     reflection: Between = (0.2, 0.7)
     roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
     yaw_deg: AngleBetween = (-4.0, 4.0)  #: Yaw of the wall relative to the direction of the line.
@@ -134,8 +134,8 @@ class AntennaSettings(ScenarioSettings):
     cross_polar_zenith_db: NotNegative = 15.0  #: Loss of left-handed relative to right-handed signals at the zenith.
     cross_polar_horizon_db: NotNegative = 4.0  #: Loss of left-handed relative to right-handed signals at the horizon.
     wall_permittivity: float = Field(default=6.0, gt=1.0)  #: Relative permittivity, about 6 for concrete and glass.
-    #: Standard deviation of the gain over azimuth at the horizon; at other elevations it is proportional to the cosine
-    #: of the elevation. The ripples of the two antennas are independent.
+    #: Standard deviation of the gain over azimuth at the horizon; at other elevations, the deviation is proportional to
+    #: the cosine of the elevation. The ripples of the two antennas are independent.
     ripple_sigma_db: NotNegative = 0.0
 
 
@@ -192,7 +192,7 @@ class EnvironmentSettings(ScenarioSettings):
     """Structures along the line that block, reflect and scatter signals; by default none."""
 
     electrification: ElectrificationSettings | None = None
-    sections: tuple[SectionSettings, ...] = ()  #: Sections by rising chainage; between them the line is open.
+    sections: tuple[SectionSettings, ...] = ()  #: Sections by rising chainage; between sections, the line is open.
     #: Fraction of the length of the line by kind of section, instead of `sections`, which are then drawn at random.
     shares: dict[Kind, Share] = Field(default_factory=dict)
     section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Range of the lengths of drawn sections.

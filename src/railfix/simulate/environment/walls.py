@@ -97,7 +97,7 @@ def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | fl
 class Reflections:
     """Reflections of N rays by one row of walls, shapes (N,)."""
 
-    amplitude: Floats  #: Amplitude; nearly 0 where there is no wall or it is too small.
+    amplitude: Floats  #: Amplitude; nearly 0 without a wall, or where the wall is too small.
     extra_m: Floats  #: Extra path compared with the direct signal.
     rate: Floats  #: Growth of the extra path with the chainage of the antenna [m/m].
     x_m: Floats  #: Coordinate x of the mirror image of the antenna, relative to the antenna.

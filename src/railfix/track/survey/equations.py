@@ -154,7 +154,7 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Return the median of the group of each value; it approximates the clock, so that the estimated clock is small."""
+    """Return the median of the group of each value: an approximate clock, so that the estimated clock is small."""
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
     middle = np.minimum((first[:-1] + first[1:]) // 2, len(value) - 1)

@@ -210,7 +210,7 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 _ROUNDS: Final = 3  #: Number of adjustments with the line; passes are searched before each of them.
 #: Distance between the passes of both directions, in standard deviations of a run's offset, beyond which they are on
-#: separate tracks. It is three standard deviations of the difference of two offsets.
+#: separate tracks. The value is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
 _TURN_M: Final = 40.0  #: Distance over which a reversal is searched for [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
@@ -356,7 +356,7 @@ def _points_ahead(plan_m: Floats) -> Indices:
 
 
 def _points_of_line(course: Course, ties: Ties) -> tuple[Indices, Integers]:
-    """Return the indices of the line's points with at least one pass, and the number of passes at each.
+    """Return the indices of the line's points with at least one pass, and the number of passes at these points.
 
     The first point of a closed line is repeated at the end. Raise ValueError if fewer than three points are left.
     """

@@ -135,7 +135,7 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
 
 
 def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
-    """Return whether a run continues in its direction over the gap before point `after`, of `BRIDGED_M` at most."""
+    """Return whether a run continues in its direction over the gap of at most `BRIDGED_M` before point `after`."""
     if not 0 < after < len(plan_m) - 1:
         return False
     gap = plan_m[after] - plan_m[after - 1]

@@ -22,7 +22,7 @@ COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxy
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
-#: Standard deviation of the change of vertical velocity in one second [m/s]; it is 0.02 to 0.07 for road vehicles.
+#: Standard deviation of the change of vertical velocity in one second [m/s]; road vehicles have 0.02 to 0.07.
 CLIMB_MPS2: Final = 0.05
 
 
