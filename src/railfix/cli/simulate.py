@@ -102,7 +102,7 @@ def _simulate(
     folders: dict[int, Path],
     options: SimulateOptions,
 ) -> None:
-    from railfix.simulate.run import write_run  # scipy.signal takes 0.4 s to load
+    from railfix.simulate.run import write_run  # imported here because scipy.signal takes 0.4 s to load
 
     done = 0
     files: dict[str, Path] = {}

@@ -65,7 +65,7 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     index = nearest_rows(time, found[known], within_ns=near_ns)
     near = np.flatnonzero(index >= 0)
     away = np.abs(found[known[near]] - time[index[near]])
-    nearest = near[np.argsort(-away, kind="stable")]  # the nearest is written last
+    nearest = near[np.argsort(-away, kind="stable")]  # sorted, so that the nearest row is written last
     rows[index[nearest]] = known[nearest]
     return rows
 

@@ -69,7 +69,7 @@ class Authority(Message):
         if len(values) != len(model.model_fields):
             raise MessageError(f"has {len(values)} fields, {len(model.model_fields)} were expected")
         message = validate_message(model, dict(zip(model.model_fields, values, strict=True)))
-        if message.encode() != data:  # trailing bytes, a boolean for a number, or another order
+        if message.encode() != data:  # not canonical, such as trailing bytes or a boolean in place of a number
             raise MessageError("is not an authority in canonical form")
         return message
 

@@ -35,7 +35,7 @@ _CAUSE = "cause of the stop"
 def _severity(verdict: TriangleVerdict) -> int:
     """Return the rank of a verdict; of the verdicts between two steps, one of the highest rank is used."""
     if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
-        return 2  # an absent fix stops trains only once it is late
+        return 2  # absent fixes stop trains only once they are late
     return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
 
 

@@ -264,5 +264,5 @@ class OrderDesk:
             "divide-train": changing("divide", "the train is divided there, and both parts are at rest"),
         }
         return {name: partial(self.given, name, order) for name, order in orders.items()} | {
-            "detect-section": self.detect  # repeated every few seconds
+            "detect-section": self.detect  # this order is repeated every few seconds
         }

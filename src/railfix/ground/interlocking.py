@@ -257,7 +257,7 @@ def due_commands(
         if point.lies:
             points[name] = replace(point, commanded=True)
         elif not under_interval(state, name, layout, nearby):
-            points[name] = replace(point, commanded=True, detected=None)  # until the field answers
+            points[name] = replace(point, commanded=True, detected=None)  # undetected until the field answers
             given[name] = point.wanted
     return replace(state, points=points), given
 
@@ -319,7 +319,7 @@ def _limit_m(
         near, far = along(layout.zone_m(name), direction)
         if far <= direction * train.rear_m or near >= end:
             continue
-        # points under the train, locked by its passage, do not limit it
+        # points under the train are locked by its passage, and do not limit its authority
         if not leads(state.points[name], train, name[0]):
             end = min(end, near)
     first_m, last_m = sorted((train.rear_m, direction * end))

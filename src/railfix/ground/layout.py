@@ -233,7 +233,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
         far = fars.pop()
         lines = [_points_m(network, track, backward=ends[track][0] != node) for track in ahead]
         if len(ahead) == 2:
-            # positive: the second track is to the right of the first
+            # positive if the second track is to the right of the first
             if (_side(*lines) > 0.0) != (drive == "left"):
                 ahead, names, lines = ahead[::-1], names[::-1], lines[::-1]
             stations.append(_station(names, [float(network.length_m[track]) for track in ahead], lines, here))

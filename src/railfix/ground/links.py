@@ -277,7 +277,7 @@ class TrainLinks:
                         async with asyncio.timeout(protocol.peer.valid_s):
                             await protocol.wait_silent(idle_s)
             except (ConnectionError, TimeoutError, OSError):
-                pass  # retried after a time; the meter counts unanswered frames
+                pass  # opened again after `RETRY_S`; the meter counts unanswered frames
             self.protocols.pop(name, None)
             await asyncio.sleep(RETRY_S)
 

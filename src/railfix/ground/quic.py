@@ -310,7 +310,7 @@ class LinkServer(QuicServer):
 
     def _sort(self, data: bytes, addr: Any, now_s: float) -> None:
         """Queue a packet of a peer that is not connected; other data than QUIC packets are dropped."""
-        with suppress(ValueError):  # not a QUIC packet
+        with suppress(ValueError):  # the bytes are not a QUIC packet
             header = pull_quic_header(Buffer(data=data), host_cid_length=self._configuration.connection_id_length)
             first = header.packet_type == QuicPacketType.INITIAL and header.destination_cid not in self._protocols
             if not first or header.token:

@@ -106,9 +106,9 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     points = dict(state.points)
     for name in under:
         points[name] = replace(points[name], locked={**points[name].locked, train: None})
-    direction = known.direction  # the authority of a train that ran too far ends at its front
+    direction = known.direction  # if the train ran too far, its authority ends at its front
     end = direction * max(direction * known.end_m, direction * known.front_m)
-    station = known.station  # after a wrong change of ends a station behind the train
+    station = known.station  # a station behind the train after a wrong change of ends
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
         station += direction
     moved = replace(known, stop=None, end_m=end, line=None, station=station)

@@ -141,7 +141,7 @@ class Store:
         ]  # fmt: skip
         with self._connection.begin():
             if self._token is not None:
-                # written before it is read, so that the row stays locked until the commit
+                # the row is written before it is read, so that it stays locked until the commit
                 mine = (DOCUMENTS.c.name == _IN_CHARGE) & (DOCUMENTS.c.text == self._token)
                 if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
                     raise InputFileError(

@@ -288,7 +288,7 @@ def _stop(
     if state.stopped and state.cause is not None:
         if state.cause is TriangleVerdict.GROUND_LOST and now_s - state.since_s <= _SETTLE_S:
             return replace(state, cause=cause, receiver=receiver), ()
-        return state, ()  # latched with its cause
+        return state, ()  # the stop is latched with its cause
     return replace(state, stopped=True, cause=cause, receiver=receiver, since_s=now_s), (Order.SUSPEND, Order.STOP)
 
 

@@ -100,7 +100,7 @@ class TwoChannels(LiveEngine):
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
-        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []  # sent with the next poll
+        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []  # calls that are sent with the next poll
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)

@@ -244,7 +244,7 @@ def _hooks(
         for observer in tuple(observers):
             try:
                 observer(output)
-            except OutputError as error:  # raised again when the outlet is closed
+            except OutputError as error:  # the error is raised again when the outlet is closed
                 observers.remove(observer)
                 log.say(f"{error}; this output has ended, the others continue")
 

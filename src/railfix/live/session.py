@@ -185,7 +185,7 @@ class _Session:
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
                     self.in_idle_time(outputs)
-            if not replay:  # epochs that still wait for their pair or for their period
+            if not replay:  # process epochs that still wait for their pair or period
                 self.emit(END_NS, self.clock())
         except asyncio.CancelledError:
             self.save()

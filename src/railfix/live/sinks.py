@@ -309,7 +309,7 @@ async def open_sink(
     parts, shown = urlsplit(target), f"{name}@{hidden(target)}"
     opened: Any
     if target == "-":
-        opened = ByteTarget(form, getattr(sys.stdout.buffer, "raw", sys.stdout.buffer))  # no buffer
+        opened = ByteTarget(form, getattr(sys.stdout.buffer, "raw", sys.stdout.buffer))  # raw stream, without a buffer
     elif parts.scheme in ("udp", "tcp-server", "mqtt"):
         try:
             host, port = parts.hostname, parts.port

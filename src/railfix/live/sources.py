@@ -249,8 +249,8 @@ class _Answer:
             import h11
         self._h11, self._source = h11, source
         self._client: Any = h11.Connection(our_role=h11.CLIENT, max_incomplete_event_size=_HEADER_BYTES)
-        self._first: bytes | None = b""  # up to the end of the first line; None once the line is known
-        self._content = b""  # the first bytes of the content
+        self._first: bytes | None = b""  # bytes up to the end of the first line; None once the line is complete
+        self._content = b""  # first bytes of the content
         self._broken: InputFileError | None = None
         self._plain = self.begun = self.ended = False
 

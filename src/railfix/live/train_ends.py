@@ -151,7 +151,7 @@ class RunningEnd:
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # a gap, or one lap of a closed line
+        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # after a gap, or at the end of a lap of a closed line
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction
         if moving > 0 and direction != 1 and reference_m - bound_m - low > CHANGED_ENDS_M:

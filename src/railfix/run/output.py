@@ -66,7 +66,7 @@ def make_staging(folder: Path) -> Staging:
             if _try_lock(lock) and Path(lock.name).exists():
                 name.mkdir()
                 return staging
-        except BaseException as error:  # including a signal that ends the program, also while the file is opened
+        except BaseException as error:  # also KeyboardInterrupt and SystemExit, even while the file is opened
             if staging is not None:
                 staging.remove()
             elif not isinstance(error, FileExistsError):
@@ -248,7 +248,7 @@ class OutputFolder:
             try:
                 self._make()
                 self._staging = make_staging(path)
-            except BaseException:  # including a signal that ends the program
+            except BaseException:  # also KeyboardInterrupt and SystemExit
                 self._unmake()
                 raise
 
@@ -281,7 +281,7 @@ class OutputFolder:
         for handle in self._csv.values():
             handle.close()
         for file in self._parquet.values():
-            with suppress(Exception):  # the file is removed anyway
+            with suppress(Exception):  # an error has no effect, as the file is removed
                 file.end()
         self._staging.remove()
         if kind is not None:

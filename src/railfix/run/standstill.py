@@ -117,7 +117,7 @@ def standstill_codes(
     residual = residual[:, kept]
     for letter in np.unique(system):
         rows = system == letter
-        received = np.isfinite(residual[:, rows]).sum(axis=1, keepdims=True)  # 0 in a tunnel
+        received = np.isfinite(residual[:, rows]).sum(axis=1, keepdims=True)  # the number is 0 in a tunnel
         residual[:, rows] -= np.nansum(residual[:, rows], axis=1, keepdims=True) / np.maximum(received, 1)
     elevation, azimuth = seen.corrected.elevation_deg[:, columns[kept]], seen.corrected.azimuth_deg[:, columns[kept]]
     turn = np.radians(azimuth)
