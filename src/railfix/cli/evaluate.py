@@ -96,7 +96,7 @@ def evaluate(
     r"""Compute the errors of runs along the line against references, and their statistics.
 
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
-    either direction of travel. The tables describe the positions on the map, of the positions with status ok, and of
+    either direction of travel. The tables describe the positions on the map, the positions with status ok, and the
     conventional positions (3-D single point, moved to the nearest point of the line), over the epochs of each kind of
     position and over the common epochs. Errors are grouped by antenna, section, environment, speed, number of
     satellites used, presence of satellites, and status; with several runs also by configuration and line.

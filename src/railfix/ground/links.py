@@ -396,7 +396,7 @@ class CentreLinks:
                 protocol.send(data)
 
     async def _watch(self) -> None:
-        """End connections whose certificate has since expired or been revoked."""
+        """Read the revoked certificates repeatedly, and end connections with revoked or expired certificates."""
         while True:
             try:
                 self._revoked, self.alarm = read_revoked(self._keys), None

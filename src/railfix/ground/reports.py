@@ -186,7 +186,7 @@ def older_place(report: PlacedReport) -> str | None:
 
 
 def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
-    """Return the longest distance that a train can have run in a time, by its speeds at both ends where known [m]."""
+    """Return the longest distance [m] that a train can have run in a time, by its speeds at both ends if known."""
     top = limits.speed_mps
     if before is not None and now is not None:
         # highest speed between the two reports: errors of the reported speeds, and acceleration until the middle

@@ -346,7 +346,7 @@ class LiveEngine:
         return max(int((a.time[-1] - GPS_EPOCH).astype(np.int64)) for a in output.result.antennas.values())
 
     def wait_s(self, *, now_ns: int) -> float:
-        """Return the time until the next call of `poll`, if nothing arrives before [s]."""
+        """Return the time [s] after which `poll` must be called if nothing arrives earlier."""
         times = [self.settings.period_s]
         if self._due_ns is not None:
             longest = self._patience_ns() if self._pending is None else self._period_ns
