@@ -166,7 +166,7 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
         return state, "one of the trains is not stopped, or not at rest"
     d = first.direction
     if second.direction != d or d * (first.front_m - second.front_m) < 0.0:
-        return state, f"train {other} is not behind train {lead}, in its direction"
+        return state, f"train {other} is not behind train {lead} with the same direction"
     if d * (first.rear_m - second.interval_m[1]) > APART_M:
         return state, f"the intervals of the trains are more than {APART_M:g} m apart"
     if any(first.tracks[k] != track for k, track in second.tracks.items() if k in first.tracks):

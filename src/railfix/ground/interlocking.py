@@ -30,7 +30,7 @@ class NearbyTrains:
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
         self._blocks: dict[int, set[int]] = defaultdict(set)
-        self._located: dict[int, tuple[TrainInterval, range]] = {}  #: Records when they were located, and their blocks.
+        self._located: dict[int, tuple[TrainInterval, range]] = {}  #: Records at the last update, and their blocks.
         self.update(state)
 
     def update(self, state: Interlocking) -> None:

@@ -104,7 +104,7 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
 def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
     """Write keys and certificates of a certificate authority, of ``centre`` and of each ``train-N``; return the files.
 
-    In a folder with an authority only missing files are written, which adds trains. ``authority.key`` stays in this
+    If the folder has an authority, only missing files are written, to add trains. ``authority.key`` stays in this
     folder and is never given to a train or a centre. Key files can be read only by their owner. Raise OutputError if
     there is nothing to write, or a file cannot be written. Raise InputFileError if a file of the authority cannot be
     read.

@@ -200,7 +200,7 @@ class LinkProtocol(QuicConnectionProtocol):
             self._waiting = self._loop.call_later(self._wait_s, self.transmit)
 
     def answer(self, made: Callable[[], bytes]) -> None:
-        """Send the result of `made` with the next packet."""
+        """Send the bytes that `made` returns with the next packet; `made` is called when that packet is sent."""
         self._answers.append(made)
 
     def transmit(self) -> None:

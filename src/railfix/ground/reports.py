@@ -26,7 +26,7 @@ STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
 #: Largest sum of over- and under-reading amount of an accepted report [m].
 WIDEST_M: Final = 1000.0
-#: Minimum time between two positions in the extension of intervals, the largest age of a position when it is sent [s].
+#: Shortest time between two positions that extensions of intervals assume, and largest age of a sent position [s].
 INSTANT_S: Final = 5.0
 
 

@@ -112,7 +112,7 @@ class CentreFile(Settings):
     #: Time in which simulated points move; railfix has no interface to real points.
     points_s: float = Field(default=5.0, ge=0)
     #: Reference triangle that monitors satellite positioning; the first start is then a stop, to be released by hand.
-    #: Without it satellite positioning is not monitored.
+    #: Without a triangle, satellite positioning is not monitored.
     triangle: TriangleInputs | None = None
     #: Limits of reports, of the interlocking and of the monitor.
     centre: CentreLimits = CentreLimits()

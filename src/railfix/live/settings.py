@@ -23,7 +23,7 @@ class LiveSettings(Settings):
     #: Longest wait for on-board sensor samples up to an epoch; the epoch is then processed without the sensor.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"  #: Whether a period without input has a message.
-    #: Number of consecutive epochs with tags earlier than the last after which a receiver is considered restarted.
+    #: Number of consecutive epochs with tags before the last epoch's, after which a receiver is considered restarted.
     restart_epochs: int = Field(default=3, ge=1)
     #: Whether a connection that broke is opened again, with waits that double from `reconnect_first_s` to
     #: `reconnect_longest_s`; otherwise the session ends when its sources end. The first connection must always succeed.

@@ -221,7 +221,7 @@ def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
     )
 
 
-#: Label and column of each part of the protection level, of the RAIM level, and of the protection level.
+#: Labels and columns of the parts of the protection level, of the RAIM level, and of the protection level itself.
 _PARTS: Final = (
     ("fault-free part", "protection_fault_free_m"),
     ("one-fault part", "protection_one_fault_m"),
