@@ -357,7 +357,7 @@ class Sections:
 
     path: Path
     from_m: Floats  #: Chainage of the start, shape (S,) [m].
-    to_m: Floats  #: Chainage of the end, shape (S,) [m]; the end is not part of the stretch, except for the last one.
+    to_m: Floats  #: Chainage of the end, shape (S,) [m]; the end is part of the last stretch only.
     environment: tuple[str, ...]
 
     def at(self, chainage_m: Floats) -> Strings:

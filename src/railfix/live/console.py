@@ -387,7 +387,7 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
 class PlaceWatch:
     """Check that 3-D positions lie on the line, once an antenna has `ENOUGH_TO_STOP` positions.
 
-    If they lie elsewhere, `say` is called with the message with which `railfix run` ends in this case.
+    If the positions lie off the line, `say` is called with the message of the error that ends `railfix run`.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
