@@ -34,7 +34,7 @@ def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(source)
     except zipfile.BadZipFile as error:
-        raise InputFileError(path, f"the zip archive is damaged ({error}); download it again") from None
+        raise InputFileError(path, f"the zip archive is damaged ({error}); download the archive again") from None
 
 
 def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
@@ -51,7 +51,7 @@ def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
     if len(names) == 1 or len(maps) == 1:
         return maps[0] if maps else names[0]
     if {"[Content_Types].xml", "mimetype"} & {*names}:
-        raise InputFileError(path, "is a spreadsheet or another document; save it as CSV, and give that")
+        raise InputFileError(path, "is a spreadsheet or another document; save it as CSV, and give the CSV file")
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     raise InputFileError(path, f"is a zip archive of {len(names)} files ({shown}); unpack it, and give the files")
 

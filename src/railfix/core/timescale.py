@@ -39,7 +39,7 @@ def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
     """Parse a GPS time; raise ValueError if it is not a time, or has a time zone, which numpy would convert to UTC."""
     text = str(value).strip().replace(" ", "T")
     if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
-        raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind it by the leap seconds")
+        raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind GPS time by the leap seconds")
     return np.datetime64(text, "ns")
 
 

@@ -136,7 +136,7 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
             return []
         there = f"{height:.0f} m (EGM96)"
     return [
-        f"{path}: the geoid separation is 0 in every fix, but the geoid is {there} from the ellipsoid: the heights are "
+        f"{path}: the geoid separation is 0 in every fix, but the geoid is {there} from the ellipsoid; the heights are "
         "taken as ellipsoidal, and are wrong by this distance if the receiver wrote heights above sea level"
     ]
 

@@ -57,7 +57,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     wrong = ~plausible_radius(satellites, position * 1e3)  # including zeros, which represent missing values
     if known.any() and wrong[known].all():
         radius = float(np.median(np.linalg.norm(position[known], axis=-1)))
-        what = f"its satellites are {radius:,.0f} km from the Earth's centre; are the positions in metres? SP3 has km"
+        what = f"its satellites are {radius:,.0f} km from the Earth's centre; check whether its positions are in km"
         raise InputFileError(source, what)
     zeros = (clock == 0.0) & known
     counts = {"positions at an implausible radius": int((wrong & known).sum()), "clocks of 0": int(zeros.sum())}
@@ -93,7 +93,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
             what = f"{line.strip()!r} has an invalid satellite, time or number"
             raise InputFileError(path, what, line=number) from None
     if not states:
-        raise InputFileError(path, "has no satellite position; the file is cut short, give the complete one")
+        raise InputFileError(path, "has no satellite position; the file is cut short, give the complete file")
     return states
 
 

@@ -206,7 +206,7 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
     for k, (element, following) in enumerate(pairwise(elements)):
         both = {element.kind, following.kind}
         if both == {"transition"}:
-            raise SettingsError(f"line.elements {k + 1} and {k + 2} are both transitions; make them one")
+            raise SettingsError(f"line.elements {k + 1} and {k + 2} are both transitions; join them to one transition")
         if "transition" not in both and (element.radius_m, element.cant_m) != (following.radius_m, following.cant_m):
             raise SettingsError(
                 f"line.elements {k + 1} ({element.kind}) and {k + 2} ({following.kind}) need a transition between them"
@@ -236,7 +236,7 @@ def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, F
         if item.from_m - half < reached - 1e-9 or item.from_m + half > length_m:
             raise SettingsError(
                 f"line.gradients {k + 1} at {item.from_m} m: its vertical curve of {2.0 * half:.1f} m "
-                "overlaps the one before or an end of the line"
+                "overlaps the previous vertical curve or an end of the line"
             )
         if half > 0.0:
             places += [item.from_m - half, item.from_m + half]

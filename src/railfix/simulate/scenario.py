@@ -134,7 +134,7 @@ class SkySettings(ScenarioSettings):
     @model_validator(mode="after")
     def _healthy_file(self) -> SkySettings:
         if self.nav is not None and self.unhealthy:
-            raise ValueError("unhealthy is for simulated satellites; with a navigation file give an empty list")
+            raise ValueError("unhealthy is for simulated satellites; with a navigation file, give an empty list")
         return self
 
 

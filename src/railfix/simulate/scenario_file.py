@@ -97,7 +97,9 @@ def find_scenario(name: FilePath) -> Path:
     if path.is_file() or (path.suffix and str(name) not in shipped):
         return path
     if str(name) not in shipped:
-        raise InputFileError(name, f"is neither a scenario file nor a shipped one; shipped are {', '.join(shipped)}")
+        raise InputFileError(
+            name, f"is neither a scenario file nor the name of a shipped scenario; shipped are {', '.join(shipped)}"
+        )
     return shipped[str(name)]
 
 

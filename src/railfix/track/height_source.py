@@ -223,7 +223,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
         )
     note = (
         f"heights of the antenna positions {log.path}, sigma {spread:.2f} m: use the map without a vehicle file, or "
-        "lower it by the height of that antenna"
+        "lower its heights by the height of that antenna"
     )
     return _replace(track, EllipsoidalHeights(height_m=fitted, datum="ellipsoidal"), spread, note)
 

@@ -216,8 +216,8 @@ def own_height_datum(
         )
     if geoid is not None and not _is_geoid_of(geoid, vertical):
         raise SettingsError(
-            f"{path}: geoid {geoid!r} contradicts the file's own CRS, whose heights are {vertical.name}; leave it out, "
-            "or give the grid file of that height datum"
+            f"{path}: geoid {geoid!r} contradicts the file's own CRS, whose heights are {vertical.name}; "
+            "leave the geoid out, or give the grid file of that height datum"
         )
     return "orthometric", geoid or vertical
 
@@ -256,7 +256,7 @@ def ellipsoidal_heights(
         return EllipsoidalHeights(
             height_m=heights_m,
             datum=datum,
-            notes=("map: its heights are taken as those above the ellipsoid of WGS 84",) if place.operation else (),
+            notes=("map: its heights are taken as heights above the ellipsoid of WGS 84",) if place.operation else (),
         )
     if geoid_m is not None:
         if geoid is not None:

@@ -233,7 +233,9 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
             directions = [None, directions[0]]
         axis, towards = directions
         if axis is not None and not np.allclose(axis[:2], 0.0, atol=1e-9):
-            raise InputFileError(step.path, "an alignment is placed on axes that are not vertical: not supported")
+            raise InputFileError(
+                step.path, "an alignment is placed on axes that are not vertical, which is not supported"
+            )
         turn = 0.0 if towards is None else float(np.arctan2(towards[1], towards[0]))
         at = at.then(x * scale, y * scale, z * scale, turn)
     return at

@@ -174,7 +174,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             raise InputFileError(
                 path,
                 f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the opposite side "
-                f"of rot; with {orders[1 - chosen]} it is the reverse; correct the order of the coordinates",
+                f"of rot; with {orders[1 - chosen]} the reverse is true; correct the order of the coordinates",
             )
     else:
         chosen = int(broken[1] < broken[0])

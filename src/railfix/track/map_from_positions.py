@@ -310,7 +310,7 @@ def create_track(
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
         dropped = f" ({dropped})" if dropped else ""
-        raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions left, a track needs two{dropped}")
+        raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions are left, but a track needs two{dropped}")
     notes = [ANTENNA_PATH, *([accuracy] if accuracy else [])]
     if thinned.jump_m.max(initial=0.0) > gap_m:
         raise ValueError(

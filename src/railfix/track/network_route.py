@@ -189,7 +189,8 @@ def _beside(network: Network, matched: Matched) -> str:
     most = int(np.bincount(track[near]).argmax())
     away = float(np.median(offset[track == most]))
     side = "right" if away > 0.0 else "left"
-    return f": they lie {abs(away):.1f} m {side} of {network.names[most]}; the map lacks their track, or is displaced"
+    where = f"{abs(away):.1f} m {side} of {network.names[most]}"
+    return f": the positions lie {where}; the map lacks their track, or is displaced"
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:

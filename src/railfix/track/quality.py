@@ -155,8 +155,8 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     ),
     "cant side": (
         "error",
-        "cant of {value:.3f} m is negative in curves; it is the height of the outer rail above the inner one, positive "
-        "in curves to either side",
+        "cant of {value:.3f} m is negative in curves; it is the height of the outer rail above the inner rail, "
+        "positive in curves to either side",
     ),
     "radius": ("error", "radius of {value:.1f} m (limit {limit:g} m)"),
     "radius side": (

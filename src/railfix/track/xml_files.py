@@ -67,7 +67,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
         name, used = str(element.get("id")), {place.get("positioningSystemRef") for _, place in found}
         if len(used) > 1:
             raise InputFileError(
-                path, f"netElement {name!r} has coordinates in {len(used)} systems; give it in one system"
+                path, f"netElement {name!r} has coordinates in {len(used)} systems; give all coordinates in one system"
             )
         try:
             rows = [

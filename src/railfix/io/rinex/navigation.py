@@ -175,7 +175,7 @@ def _read_file(path: FilePath, content: NavigationContent) -> None:
     lines = read_text_lines(path)
     version, kind, begin = read_header(path, lines, content)
     if not any(line.strip() for line in lines[begin:]):
-        raise InputFileError(path, "has a header but no record; the file is cut short, give the complete file")
+        raise InputFileError(path, "has a header but no record; the file is cut short; give the complete file")
     blocks = _blocks_4(path, lines, begin, content) if version >= 4.0 else _blocks(path, lines, begin, version, kind)
     for block in blocks:
         try:
