@@ -180,8 +180,8 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 def unpacked_file(path: FilePath) -> Iterator[Path]:
     """Yield the path of a file with the decompressed content, for programs that open files themselves.
 
-    For a file that is not compressed, this is the given path. All files of a zip archive are extracted into one folder.
-    The temporary files are removed at the end of the block.
+    The path of a file that is not compressed is the given path. All files of a zip archive are extracted into one
+    folder. The temporary files are removed at the end of the block.
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)

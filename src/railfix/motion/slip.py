@@ -1,10 +1,10 @@
 r"""Slip, slide, low speed and rolling away, detected from the vehicle's pitch (P2 2.1) and bridged by inertia.
 
 While the wheel rolls, ``sin(theta_T) = (f_x - a_T) / g`` from accelerometer and tachometer is the sine of the pitch.
-During a slip, it exceeds the gradient of any line. There are two rules:
+During a slip, this sine exceeds the gradient of any line. There are two rules:
 
-* ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient and the pitching of the body. It only
-  detects a change of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
+* ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient and the pitching of the body. The rule
+  only detects a change of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
 * ``"map"`` compares the pitch with the gradient of the line at the present position, and has a latch: a slip ends only
   when the wheel has returned to the inertial speed and the pitch agrees, or when wheel and train are at rest.
 

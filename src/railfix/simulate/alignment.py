@@ -1,6 +1,6 @@
 """Continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
 
-The curve is the ground truth. The track map consists of points of the curve, with the offset `MapError` where set.
+The curve is the ground truth. The track map consists of points of the curve, displaced by the offset `MapError`.
 Chainage is the arc length in three dimensions. Curvature and cant change linearly in transitions (clothoids and cant
 ramps), and the gradient changes linearly in vertical curves. The curve is integrated on the WGS 84 ellipsoid.
 """

@@ -1,8 +1,8 @@
 """Chainage and speed of the train over time, and true positions of its antennas.
 
 The motion is a shuttle between two points, or a run curve with stops at stations and the highest speed that line,
-curves and train permit. Antennas are on a rigid body with both bogie centres on the continuous line; they are computed
-by Newton's method and Rodrigues' rotation, independently of `railfix.track.vehicle`.
+curves and train permit. Antennas are on a rigid body with both bogie centres on the continuous line; their positions
+are computed by Newton's method and Rodrigues' rotation, independently of `railfix.track.vehicle`.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ _RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelse
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
-    """Return the motion of the middle of the vehicle: a shuttle, or a run curve if its settings are not the defaults.
+    """Return the motion of the middle of the vehicle: a shuttle, or a run curve if settings of the run curve are given.
 
     The motion covers `duration_s`, by default the duration of the scenario; with a duration of 0, the motion ends at
     the last stop of the first leg. Raise SettingsError if the train does not fit on the line.

@@ -95,11 +95,11 @@ class VehicleSettings(ScenarioSettings):
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
     length_m: Positive = 23.2  #: Overall length; the ends are equally far from the middle between the bogies.
-    #: Standard deviation of the random roll at 20 m/s and more; at lower speeds it is proportional to the speed. The
+    #: Standard deviation of the random roll at 20 m/s and more; below this speed, proportional to the speed. The
     #: vehicle file does not have it, because it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
     sway_period_s: Positive = 1.5  #: Mean period of the roll.
-    #: Standard deviation of the random pitch at 20 m/s and more; at lower speeds it is proportional to the speed.
+    #: Standard deviation of the random pitch at 20 m/s and more; below this speed, proportional to the speed.
     pitch_sigma_deg: NotNegative = 0.0
     pitch_period_s: Positive = 1.0  #: Mean period of the random pitch, and period of the suspension.
     #: Pitch under constant acceleration, positive if the front rises when the train accelerates toward rising chainage.

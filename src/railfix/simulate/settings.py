@@ -291,8 +291,8 @@ class InertialSettings(ScenarioSettings):
     misalignment_rad: Three = (0.0, 0.0, 0.0)  #: Rotation of the unit relative to the body, as a rotation vector.
     accel_resolution_mps2: NotNegative = 0.0  #: Quantisation step of the accelerometers; 0 for no quantisation.
     gyro_resolution_radps: NotNegative = 0.0  #: Quantisation step of the gyroscopes; 0 for no quantisation.
-    #: Standard deviation of the vibration of each accelerometer axis at 20 m/s and more; at lower speeds it is
-    #: proportional to the speed.
+    #: Standard deviation of the vibration of each accelerometer axis at 20 m/s and more; below this speed, proportional
+    #: to the speed.
     vibration_sigma_mps2: NotNegative = 0.0
     vibration_sigma_radps: NotNegative = 0.0  #: Standard deviation of the vibration of each gyroscope axis.
     #: Mean frequency of the vibration, with a relative bandwidth of 15 %. Frequencies above half of `rate_hz` are

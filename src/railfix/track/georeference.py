@@ -1,7 +1,7 @@
 """Transformation of map coordinates to latitude and longitude in a modern frame, with its accuracy.
 
-Of the operations of PROJ (https://proj.org), only those are used whose area of use contains the map and whose grids are
-installed. Ballpark operations, which do not change the datum, are not used.
+Of the operations of PROJ (https://proj.org), only operations are used whose area of use contains the map and whose
+grids are installed. Ballpark operations, which do not change the datum, are not used.
 """
 
 from __future__ import annotations

@@ -320,8 +320,8 @@ def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement]
     """Return the elements between cant stations, and notes.
 
     The outer rail is raised unless the file has another rotation point. Cant is in millimetres, or in inches if lengths
-    are imperial (LandXML 1.2). If all values are below 1, they are assumed to be in the unit of length of the file, as
-    in InfraModel, with a note.
+    are imperial (LandXML 1.2). If all values are below 1, the values are assumed to be in the unit of length of the
+    file, as in InfraModel, with a note.
     """
     if cant is None:
         return [], ()

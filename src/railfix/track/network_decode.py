@@ -1,10 +1,10 @@
 """Probability of each track at each position of a log, with a common error of all positions.
 
-The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). Its state is a track near the
-position, or an unmapped track, together with the common error of the positions. The common error is a first-order
-Gauss-Markov process east, north and up on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining
-error of each position has heavy tails (Student's t) and a correlation time `correlation_s`; the likelihood of a
-position is weighted with the fraction of this time that the position represents. An unmapped track is either parallel
+The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). The state of the model is a track
+near the position, or an unmapped track, together with the common error of the positions. The common error is a
+first-order Gauss-Markov process east, north and up on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The
+remaining error of each position has heavy tails (Student's t) and a correlation time `correlation_s`; the likelihood of
+a position is weighted with the fraction of this time that the position represents. An unmapped track is either parallel
 to the nearest track at a constant distance (`SHIFTS_M`) and clear of all other tracks, or anywhere else.
 """
 
@@ -283,7 +283,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
     length = _BLOCK // len(lattice.up_m)
-    # for a long log the first position of each block is stored, and each block is recomputed on the backward pass
+    # for a long log, the first position of each block is stored, and each block is recomputed on the backward pass
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}

@@ -66,7 +66,7 @@ class Track(NotebookTable):
     latitude_deg: Floats  #: Geodetic coordinates in `Provenance.frame`, shape (V,).
     longitude_deg: Floats
     height_m: Floats  #: Ellipsoidal height of the middle between the rail tops, shape (V,).
-    #: Kilometrage of the line, shape (V,); it may jump or decrease, and is NaN where the map has none.
+    #: Kilometrage of the line, shape (V,); may jump or decrease; NaN where the map has none.
     kilometrage_m: Floats
     cant_m: Floats  #: Height of the outer above the inner rail, shape (V,); NaN where the map has none.
     #: Horizontal radius, positive in a curve to the right in the direction of rising chainage, infinite on straight

@@ -5,8 +5,8 @@ at the curved end:
 
 - The cubic parabola ``y = x^3 / (6 R X)`` is used by many railways. IFC defines ``y = x^3 / (6 R L)`` with the length L
   of the curve.
-- The corrected parabola of Japanese railways is ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``. Its curvature at the end is
-  1/R within half a percent.
+- The corrected parabola of Japanese railways is ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``. The curvature at the end of
+  this parabola is 1/R within half a percent.
 - The half-sine of the Shinkansen is ``y = X^2 / R ((x/X)^2 / 4 - (1 - cos(pi x/X)) / (2 pi^2))``.
 """
 

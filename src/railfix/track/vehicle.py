@@ -160,8 +160,8 @@ class _VehicleLine:
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
     """Return the cant, positive for roll to the right, shape (V,) [m], and notes.
 
-    The sign follows from the radius, or from the bend of the points where the map has no radius. On straight track, it
-    follows from the nearest curve. Raise MismatchError if there is cant but no curve.
+    The sign follows from the radius, or from the bend of the points where the map has no radius. On straight track, the
+    sign follows from the nearest curve. Raise MismatchError if there is cant but no curve.
     """
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
     canted = cant != 0.0

@@ -179,7 +179,7 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
 }
 BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 known to begin with the health.
 #: Subframe, first bit and end of the data bits in each of the three pages into which a B-CNAV1 frame is divided. In a
-#: page, they follow PRN, page number and SOW.
+#: page, these bits follow PRN, page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
 BCNAV1: Final = _with_head(BCNAV1_HEAD, {
@@ -304,8 +304,9 @@ def sisa_m(index: Floats) -> Floats:
 
 def glonass_hamming(bits: Bytes) -> Masks:
     """Return whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
-    # Bit 85 of the ICD is sent first. Its data bits 9 to 85 have the positions of a Hamming code that are not powers of
-    # two, in this order; check bit k covers the positions with bit k set. Check bits are the ICD's bits 1 to 7.
+    # Bit 85 of the ICD is sent first. The data bits, 9 to 85 in the ICD, have the positions of a Hamming code that are
+    # not powers of two, in this order; check bit k covers the positions with bit k set. Check bits are the ICD's bits 1
+    # to 7.
     value = bits[:, 84::-1].astype(np.int64)
     places = np.array([place for place in range(1, 86) if place & (place - 1)])[:77]
     checks = [(value[:, 8:][:, places >> k & 1 == 1].sum(axis=1) + value[:, k]) & 1 for k in range(7)]

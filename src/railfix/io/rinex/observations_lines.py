@@ -2,8 +2,9 @@
 
 In RINEX 3 and 4, a type contains the signal ("C1C" is the code of "1C"). In RINEX 2, a type contains the band (RINEX
 2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 have the signal of C1 if it is declared, otherwise of P1; L2,
-D2 and S2 have the signal of P2 if it is declared, otherwise of C2. Without these codes, they have the signals of C1 and
-P2. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because RINEX 3.02 has B1 as band 1.
+D2 and S2 have the signal of P2 if it is declared, otherwise of C2. If these codes are not declared, the signals of C1
+and P2 are used. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because RINEX 3.02 has
+B1 as band 1.
 """
 
 from __future__ import annotations

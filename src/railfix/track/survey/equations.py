@@ -14,8 +14,9 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the second difference of the line relative to the reference line [m]. Across the line, it is
-#: larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends the line.
+#: Standard deviation of the second difference of the line relative to the reference line [m]. Across the line, the
+#: standard deviation is larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends
+#: the line.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 

@@ -85,7 +85,8 @@ class SurveyRun(FrozenArrays):
     time: Datetimes  #: Times of the rows, strictly rising, shape (n,).
     ecef_m: Floats  #: Positions, shape (n, 3); NaN without a position.
     sigma_m: Floats  #: Standard deviations east, north and up, shape (n, 3).
-    #: Observations from which the positions were computed; if given, they are adjusted instead of the positions.
+    #: Observations from which the positions were computed; if given, the observations are adjusted instead of the
+    #: positions.
     signals: RunSignals | None = None
     #: Standard deviations of the common error of all positions, in plan and height.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
