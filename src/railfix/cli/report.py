@@ -102,7 +102,7 @@ def report(
 
 
 def _free_arrays_at_once() -> None:
-    """Set the GNU C library to return the memory of a freed array to the system at once; no effect elsewhere.
+    """Set the GNU C library, where it is used, to return the memory of freed arrays to the system at once.
 
     By default malloc keeps freed arrays of up to 32 MB for reuse, which costs 50 MB of memory in a long run.
     """

@@ -211,7 +211,7 @@ class ControlCentre:
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
         """Process a verdict on satellite positioning from fixes of a given age; each step uses the worst new verdict.
 
-        Fixes older than `MonitorLimits.late_s`, or further in the future than this, give no verdict.
+        Fixes older than `MonitorLimits.late_s`, or farther in the future than this time, give no verdict.
         """
         if abs(age_s) > self.times.late_s:
             self.rejected["fixes of the triangle with a wrong age"] += 1

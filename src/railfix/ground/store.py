@@ -78,7 +78,7 @@ class Store:
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
-        """Make this process the only writer, so that an earlier centre cannot commit any more.
+        """Make this process the only writer, so that an earlier centre can no longer commit.
 
         Raise InputFileError if another process on this machine uses the SQLite database.
         """

@@ -169,7 +169,7 @@ class Supervision:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
         Nothing is granted until every train has sent a report that names an order of this start: the report includes
-        authorities unknown to the database, and the train accepts no late authority of the earlier centre any more. The
+        authorities unknown to the database, and the train no longer accepts late authorities of the earlier centre. The
         stored detection of points is dropped.
 
         Numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers of every

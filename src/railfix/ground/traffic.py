@@ -70,7 +70,7 @@ class SimulatedTrain:
         )
 
     def message(self, now_s: float) -> TrainMessage:
-        """Return the position message at a time [s], without a position while the train is blind."""
+        """Return the position message at a time [s], without a position before `blind_until_s`."""
         self.sequence += 1
         self.on_board.note_report(self.sequence, now_s)
         time = 1_400_000_000_000_000_000 + round(now_s * 1e9)

@@ -122,7 +122,7 @@ def _look_beyond() -> None:
 
 
 def _first_epochs(log: Path, count: int) -> Observations:
-    """Read the first epochs of a compact RINEX 3 log; without compiled kernels the whole file would take long."""
+    """Read the first epochs of a compact RINEX 3 log; without compiled kernels, the whole file would take too long."""
     lines = hatanaka.decompress(log).decode("ascii").splitlines(keepends=True)
     begins = [number for number, line in enumerate(lines) if line.startswith(">")]
     with TemporaryDirectory() as folder:

@@ -139,8 +139,8 @@ _FEET: Final = 0.3048
 def likely_cause(observations: Observations, received: Received, config: Config, line: Trajectory) -> str:
     """Return a clause on the likely reason for positions off the line; "" if no cause was found.
 
-    Conventional positions of a few epochs are compared with the line in plan and height. If they do not lie on the
-    line, the comparison is repeated with time tags shifted by leap seconds and whole hours.
+    Conventional positions of a few epochs are compared with the line in plan and height. If these positions do not lie
+    on the line, the comparison is repeated with time tags shifted by leap seconds and whole hours.
     """
     step = max(len(observations) // _EPOCHS, 1)
     few = observations[: step * _EPOCHS : step]
