@@ -323,7 +323,7 @@ def error_model_from_runs(
 
 
 def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
-    """Compute the range errors of one run by processing it again, chunk by chunk; `number` makes its blocks unique."""
+    """Compute the range errors of one run by processing it again, chunk by chunk; block numbers depend on `number`."""
     past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)

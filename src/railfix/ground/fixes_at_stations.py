@@ -283,7 +283,7 @@ async def stream_fixes(
 ) -> AsyncIterator[StationFixes]:
     """Yield the fixes of single epochs until every source has ended.
 
-    The sources are those of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files and
+    Sources are written as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files and
     RINEX files). Raise InputFileError if a source cannot be opened, or breaks and is not opened again.
     """
     stations = StationStreams(points_ecef_m, navigation=navigation)

@@ -66,8 +66,8 @@ class TrainInterval:
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
-    #: Number of the newest authority by which the train may run, sent or named by a report; None before the first, and
-    #: once a report names an order to brake of this or a later number, which no authority in transit can end.
+    #: Number of the newest authority by which the train may run, sent or named by a report. None before the first, and
+    #: after a report that names an order to brake with this or a later number, which no authority in transit can end.
     runs_by: int | None = None
     stop: str | None = None  #: Reason of the stop, until the train is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.

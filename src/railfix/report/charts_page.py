@@ -92,7 +92,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 
 def _cells(layer: Cells) -> dict[str, Any]:
-    """Return the edges of the grid, and index and count of each occupied cell; all cells must have the same size."""
+    """Return the ends of the grid, and index and count of each occupied cell; the cells must have equal sizes."""
     column, row = np.nonzero(layer.counts)
     return {
         "x0": float(layer.x_edges[0]),

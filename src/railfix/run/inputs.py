@@ -169,7 +169,7 @@ class RunInputs(InputFiles):
     @model_validator(mode="before")
     @classmethod
     def _with_mate(cls, values: Any) -> Any:
-        """Return the inputs from the tables in the folder `mate`, replaced by inputs that are given explicitly."""
+        """Return the inputs with the tables in the folder `mate`; inputs that are given explicitly take precedence."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
@@ -183,7 +183,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Return the checked inputs with the files that settings name, and settings with the logs for "stream"."""
+        """Return the checked inputs with the files of the settings, and the settings with the logs for "stream"."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)

@@ -344,7 +344,7 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Return the track weights, by interlocking times by last position, and the prior of an unmapped track."""
+    """Return the product of each track's weights (`--last`, `--prior`), and the prior of an unmapped track."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(
