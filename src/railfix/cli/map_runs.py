@@ -46,7 +46,7 @@ def service(
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit for the protection level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Report by chainage the number of satellites, reflections, the fraction of ok epochs, and the protection levels.
+    """Report, by chainage, numbers of satellites, signs of reflections, fractions of ok epochs, and protection levels.
 
     The distance of the 3-D position from the line indicates reflections, because this position is computed without the
     map. Several runs at different times of the day are more representative than one run.

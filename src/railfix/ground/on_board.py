@@ -196,9 +196,9 @@ class OnBoard:
         return not self._granted
 
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
-        """Return whether an authority may be accepted; a shorter end only if `agrees`, or after an earlier authority.
+        """Return whether an authority may be accepted; a shorter end requires `agrees` or an earlier authority.
 
-        Without an earlier authority since its start the train brakes until it can accept the shorter end.
+        A train without an earlier authority since its start brakes until it can accept the shorter end.
         """
         return not authority.shortens or agrees or self._granted
 

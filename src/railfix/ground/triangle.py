@@ -92,6 +92,7 @@ def limits_for_false_stops(
         Standard deviation per axis of the part of the error that is not common to all receivers; the error of a side
         contains this part of both receivers.
     stops_per_year : float
+        Accepted number of false stops per year.
     independent_s : float [s]
         Time after which the errors of a fix are independent of earlier errors.
 

@@ -113,7 +113,7 @@ class LiveEngine:
         Reference point and ends of the train.
     reports : deque of str
         Sentences for the log: replacements of requested data and their end, restarts, skipped epochs, the train's
-        direction, use of a saved state. The caller removes them.
+        direction, use of a saved state. The caller removes the sentences.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
