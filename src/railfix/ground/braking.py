@@ -178,7 +178,7 @@ def supervise(
 def _supervised(
     front_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, release: float = 0.0
 ) -> Supervised:
-    """Return the supervised speeds for a target; before the target position they are at least `release` [m/s]."""
+    """Return the supervised speeds for a target, at least the target speed and, up to the target, `release` [m/s]."""
     aimed = target if target.speed_mps == 0.0 else target._replace(speed_mps=target.speed_mps + brakes.over_mps)
     brake, warn = (intervention_mps(front_m, aimed, steps, brakes, before_s=s) for s in (0.0, brakes.warning_s))
     permitted = intervention_mps(front_m, target, steps, brakes, before_s=brakes.reaction_s)

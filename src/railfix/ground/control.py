@@ -261,7 +261,7 @@ class ControlCentre:
         self._alarm = alarm
 
     def _order(self, order: BrakeOrder, now: float) -> None:
-        """Send an order to brake."""
+        """Send an order to brake, and record the time of sending if the order is new."""
         first = self.supervision.ordered[order.train][1]
         if (known := self.stops.get(order.train)) is None or known.number != first:
             self.stops[order.train] = StopOrder(number=first, sent_s=now)

@@ -211,7 +211,7 @@ def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str,
 
 
 def comes_the_other_way(other: TrainInterval, direction: int, section: int, layout: Layout) -> bool:
-    """Return whether a train in the opposite direction has its route or interval between a station and the next.
+    """Return whether a train in the opposite direction has its route or interval between `section` and `section` + 1.
 
     The points of both stations are not considered.
     """

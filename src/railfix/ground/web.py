@@ -226,7 +226,7 @@ class _TimedProtocol(H11Protocol):
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to check the connection every `REQUEST_S`."""
+        """Begin to check the connection every `REQUEST_S`, and close the peer's idle connections beyond `MOST_IDLE`."""
         super().connection_made(transport)
         peer = id(self.server_state), self.client[0] if self.client else ""
         mine = self.waiting.setdefault(peer, {})

@@ -268,7 +268,7 @@ class TcpServerSink:
             writer.close()
 
     def send(self, output: LiveOutput) -> None:
-        """Send an output to all clients."""
+        """Send an output to all clients, and disconnect clients that read too slowly."""
         data = self.form(output) if wants(self.form, output) else b""
         for writer in list(self._readers):
             if writer.transport.get_write_buffer_size() > _LARGEST_BACKLOG:
