@@ -29,7 +29,7 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Bracket:
-    """Neighbouring instants of a reference of R instants for each of T times."""
+    """Neighbouring instants of a reference, which has R instants, for each of T times."""
 
     #: Indices of the instants before and after each time, equal if an instant is at the time itself; shape (T,).
     left: Indices

@@ -200,7 +200,7 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
-    """Return the slope of measured over expected values; NaN if they are too few, or the expected rms is below `least`."""
+    """Return the slope of measured over expected values; NaN for too few values or an expected rms below `least`."""
     known = np.isfinite(expected) & np.isfinite(measured)
     x, y = expected[known], measured[known]
     if len(x) < _LEAST_CELLS or np.sqrt(np.mean(x * x)) < least:
