@@ -248,10 +248,10 @@ def ablate(
     available source (codes, phases, Dopplers, and the sensors given), and a row without each source except codes.
 
     For each choice the table shows the fractions of epochs with coordinates and of epochs of status ok, the number of
-    satellites used, and the median standard deviation along the line. With `--truth` it also shows the errors along the
-    line (an error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs without
-    satellites, and the 95th percentile of the ratio of error to stated sigma. `ablation.csv` in DIR has all figures,
-    including the figures of the conventional position; `ablation.json` has the versions, inputs and settings.
+    satellites used, and the median standard deviation along the line. With `--truth` the table also shows the errors
+    along the line (an error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs
+    without satellites, and the 95th percentile of the ratio of error to stated sigma. `ablation.csv` in DIR has all
+    figures, including the figures of the conventional position; `ablation.json` has the versions, inputs and settings.
 
     Example:
 

@@ -222,10 +222,10 @@ def error_model(
 ) -> None:
     """Model the errors of corrected pseudoranges, which are multipath on the line and receiver noise.
 
-    Each RUN is positioned again with its own settings. The error of a pseudorange is its residual after subtraction of
-    the distance from the reference position and of the receiver clock; with `--base` the residual of a nearby reference
-    station to the same satellite is subtracted too. Without `--base` the model includes the orbit, clock and
-    atmospheric errors of the days recorded, so that it is wider and valid only for days with similar errors.
+    Each RUN is positioned again with its own settings. The error of a pseudorange is the pseudorange less the distance
+    from the reference position and the receiver clock; with `--base`, also less the error of the same satellite at a
+    nearby reference station. Without `--base` the model includes the orbit, clock and atmospheric errors of the
+    recorded days, so that it is wider, and valid only for days with similar errors.
 
     The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, azimuth relative
     to the front of the car and C/N0, before and after the screens. `railfix run --error-model MODEL.toml` derives the

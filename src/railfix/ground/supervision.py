@@ -168,7 +168,7 @@ class Supervision:
     def begin_again(self, now_s: float, *, wall_us: int) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
-        Nothing is granted until every train has sent a report that names an order of this start: the report includes
+        Nothing is granted until every train has sent a report that names an order of this start. Such a report includes
         authorities unknown to the database, and the train no longer accepts late authorities of the earlier centre. The
         stored detection of points is dropped.
 

@@ -134,9 +134,9 @@ class TrainFrame:
 class RunningEnd:
     """Direction of the train's leading end along the chainage, from the vehicle file and from motion.
 
-    The train has changed ends, or an unknown leading end is determined, once the reference point is more than
-    `CHANGED_ENDS_M` and both bounds from the farthest position in the opposite direction, and the train moves away from
-    this position.
+    The train has changed ends, or an unknown leading end is determined, when the train moves away from its farthest
+    position in the opposite direction, and the distance of the reference point from this position exceeds
+    `CHANGED_ENDS_M` plus both bounds.
     """
 
     direction: int  #: 1 toward rising chainage, -1 toward falling, 0 if unknown.

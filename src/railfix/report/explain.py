@@ -1,8 +1,8 @@
 """Explanation of one epoch of a run: position, outcome of each satellite, contributions to sigma and protection level.
 
 Everything is read from the tables of the run. The effect of a satellite is the change of the single-epoch position if
-the satellite is omitted. It is computed from the residuals by weighted least squares along, across and above the line,
-linearised at the position, with the map error as a prior and one free clock per clock group (P1 2.2(3)).
+the satellite is omitted. This change is computed from the residuals by weighted least squares along, across and above
+the line, linearised at the position, with the map error as a prior and one free clock per clock group (P1 2.2(3)).
 """
 
 from __future__ import annotations

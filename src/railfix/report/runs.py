@@ -110,10 +110,10 @@ def read_runs(
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
     """Read runs, and evaluate them if there are references; without references the evaluation is None.
 
-    `references` has no reference, one for all runs, or one for each run in order. `conventional` is empty, or has for
-    each run in order another run on the same log, whose conventional positions are shown; a run with only the elevation
-    and C/N0 screens gives the unscreened positions of P1. The evaluation is returned with an empty table of epochs,
-    because the returned runs have the columns of the report.
+    `references` has no reference, one for all runs, or one for each run in order. `conventional` may have, for each run
+    in order, another run on the same log, whose conventional positions are shown; a run with only the elevation and
+    C/N0 screens gives the unscreened positions of P1. The evaluation is returned with an empty table of epochs, because
+    the returned runs have the columns of the report.
 
     Raise InputFileError or MismatchError if a file is missing or malformed, or a reference does not match the run.
     Raise SettingsError if there is no run, the number of references or conventional runs is wrong, or a run is given
