@@ -146,8 +146,8 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
 def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
     """Return the index of one node per layer for which the sum of node and step costs is smallest (Viterbi algorithm).
 
-    `costs` has the node costs of each layer, shape (n,). `steps` has the step costs to each layer but the first from
-    the layer before it with m nodes, shape (n, m).
+    `costs` has the node costs of each layer, shape (n,). `steps` has the step costs to the n nodes of each layer except
+    the first, from the m nodes of the layer before, shape (n, m).
     """
     total, came = costs[0], list[Indices]()
     for cost, step in zip(costs[1:], steps, strict=True):

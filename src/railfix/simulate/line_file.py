@@ -265,7 +265,8 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
         straight, curve = (float(np.round(rng.uniform(*r))) for r in (here.straight_m, here.curve_m))
         to_right = rng.random() < 0.5 if abs(heading) < _FAR_RAD else heading < 0.0
         side = 1.0 if to_right else -1.0
-        # Equilibrium cant. The transition is at least 20 m, 400 cant, and 8 cant times the speed in km/h long.
+        # Equilibrium cant. The transition has a length of at least 20 m, 400 times the cant, and 8 times the product of
+        # cant and speed in km/h.
         cant = min(limits.speed_mps**2 / (GRAVITY_MPS2 * radius) * _CONTACT_M, limits.largest_cant_m)
         cant = float(np.round(np.round(cant / _CANT_STEP_M) * _CANT_STEP_M, 3))
         speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(GRAVITY_MPS2 * radius * (cant + 0.06) / _CONTACT_M))

@@ -1,4 +1,4 @@
-"""Reader of IFC 4.3 alignments, whose segments in plan, profile and cant become `railfix.track.elements`."""
+"""Reader of IFC 4.3 alignments, whose plan, profile and cant become elements of `railfix.track.elements`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reader of LandXML 1.2 alignments, whose elements in plan, profile and cant become `railfix.track.elements`."""
+"""Reader of LandXML 1.2 alignments, whose plan, profile and cant become elements of `railfix.track.elements`."""
 
 from __future__ import annotations
 

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 UNMAPPED_PRIOR: Final = 0.05  #: Prior probability that the train is on an unmapped track.
 CLEARANCE_M: Final = 3.0  #: Minimum distance between the centrelines of two tracks [m].
-#: Assumed height of an antenna above the rails, and its standard deviation [m]; antennas are on bogies to roofs.
+#: Assumed height of an antenna above the rails, and its standard deviation [m]; some antennas are on bogies, others on
+#: roofs.
 ANTENNA_UP_M: Final = 2.5
 ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].

@@ -40,7 +40,7 @@ class Relation:
 
 
 def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a LandXML or railML 3 file as segments; raise InputFileError without a line."""
+    """Read the lines of a LandXML or railML 3 file as segments; raise InputFileError if there is no line."""
     root = read_root(path)
     kind = tag(root)
     if kind == "LandXML":

@@ -1,7 +1,7 @@
 """Multipath and blockage by structures along the line, such as masts, beams, buildings, slopes, roofs and tunnels.
 
-`EnvironmentSettings` describes the structures. `Environment` draws them from a seed and computes the disturbances of
-the signals. The physical models are described in docs/simulator.md.
+`EnvironmentSettings` describes the structures. `Environment` draws the structures from a seed and computes the
+disturbances of the signals. The physical models are described in docs/simulator.md.
 """
 
 from railfix.simulate.environment.model import Environment
