@@ -57,10 +57,7 @@ def test_origins_of_other_scales() -> None:
     assert timescale.from_week(1024, 0.0) == instant("1999-08-22T00:00:00")
 
 
-@given(
-    week=st.integers(0, 4000),
-    ns=st.integers(0, WEEK * 1_000_000_000 - 1),
-)
+@given(week=st.integers(0, 4000), ns=st.integers(0, WEEK * 1_000_000_000 - 1))
 def test_weeks_there_and_back_to_the_nanosecond(week: int, ns: int) -> None:
     time = timescale.from_week(week, 0.0) + np.timedelta64(ns, "ns")
     found, sow = timescale.to_week(time)

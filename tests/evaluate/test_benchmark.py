@@ -149,11 +149,7 @@ def _rewritten(old: str, new: str) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        (
-            _add_line,
-            InputFileError,
-            r"truth.csv: has the SHA-256 \w{12}..., case.toml states .*; fetch it again",
-        ),
+        (_add_line, InputFileError, r"truth.csv: has the SHA-256 \w{12}..., case.toml states .*; fetch it again"),
         (lambda case: (case / "other.pos").unlink(), InputFileError, "other.pos: there is no such file; fetch it"),
         (lambda case: (case / "case.toml").unlink(), InputFileError, "no folder in it has a case.toml"),
         (_rewritten('"other.pos" =', '"another.pos" ='), SettingsError, "sha256 has no entry for other.pos; add its"),

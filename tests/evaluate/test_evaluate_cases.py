@@ -576,11 +576,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
         (["--reference", "{late}"], 5, "no time in common"),
         (["--reference", "{reference}", "--speed-classes", "20,x"], 4, "--speed-classes"),
         (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "--speed-classes: rising numbers expected"),
-        (
-            ["--reference", "{reference}", "--section-length", "0"],
-            4,
-            "--section-length: Input should be greater",
-        ),
+        (["--reference", "{reference}", "--section-length", "0"], 4, "--section-length: Input should be greater"),
         (["--reference", "{reference}", "--sections", "absent.csv"], 3, "absent.csv"),
         (["--reference", "{reference}", "--method", "trajectory"], 3, "names no track"),
         (["--reference", "auto"], 3, "names no log of the front antenna"),

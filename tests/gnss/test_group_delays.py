@@ -105,12 +105,7 @@ def version_4(recordings: Path) -> Navigation:
 
 @pytest.mark.parametrize(
     ("message", "other", "position_m", "clock_m"),
-    [
-        ("CNAV", "LNAV", 1.0, 1.5),
-        ("FNAV", "INAV", 0.01, 0.5),
-        ("CNV3", "CNV1", 0.1, 1.0),
-        ("CNV2", "CNV1", 0.01, 0.01),
-    ],
+    [("CNAV", "LNAV", 1.0, 1.5), ("FNAV", "INAV", 0.01, 0.5), ("CNV3", "CNV1", 0.1, 1.0), ("CNV2", "CNV1", 0.01, 0.01)],
 )
 def test_messages_of_one_satellite_agree(
     version_4: Navigation, message: str, other: str, position_m: float, clock_m: float

@@ -129,10 +129,7 @@ def test_glonass_is_the_solution_of_the_equations_of_motion() -> None:
         return np.concatenate([v, gravity + turn.T @ fixed])
 
     start = np.concatenate(
-        [
-            records.position_ecef_m[0],
-            records.velocity_ecef_mps[0] + np.cross(omega, records.position_ecef_m[0]),
-        ]
+        [records.position_ecef_m[0], records.velocity_ecef_mps[0] + np.cross(omega, records.position_ecef_m[0])]
     )
     nav = navigation({"satellite": "R07", "clock_bias_s": 0.0, "relative_frequency": 0.0})
     for t in (-1750.0, -30.0, 61.0, 900.0, 1750.0):

@@ -80,12 +80,7 @@ class Bench:
 
     def arguments(self, **changes: Any) -> list[str]:
         """Command line of the run; `changes` replace options, None drops one."""
-        options: dict[str, Any] = {
-            "front": self.front,
-            "nav": self.nav,
-            "track": self.track,
-            "out": self.out,
-        }
+        options: dict[str, Any] = {"front": self.front, "nav": self.nav, "track": self.track, "out": self.out}
         options |= changes
         words = ["run"]
         for name, value in options.items():

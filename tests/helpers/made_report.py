@@ -24,13 +24,7 @@ def _figures(epochs: int, positions: int, sigma_m: float, level_m: float | None)
         "level": level_m
         and {"p50_m": level_m, "p95_m": 2.0 * level_m, "max_m": 3.0 * level_m, "within_20_m": 40, "within_50_m": 60},
         "protection_level": level_m
-        and {
-            "p50_m": level_m,
-            "p95_m": 2.0 * level_m,
-            "max_m": 3.0 * level_m,
-            "available": 70,
-            "alarm": 2,
-        },
+        and {"p50_m": level_m, "p95_m": 2.0 * level_m, "max_m": 3.0 * level_m, "available": 70, "alarm": 2},
     }
 
 

@@ -87,12 +87,7 @@ def japan_truth(recordings: Path) -> Truth:
 
 
 #: Every recording with a reference, by a short name.
-TRUTHS: Final = {
-    "urbannav": urbannav_truth,
-    "gsdc": gsdc_truth,
-    "smartloc": smartloc_truth,
-    "japan": japan_truth,
-}
+TRUTHS: Final = {"urbannav": urbannav_truth, "gsdc": gsdc_truth, "smartloc": smartloc_truth, "japan": japan_truth}
 
 
 def write_truth_csv(truth: Truth, path: Path) -> Path:

@@ -11,12 +11,7 @@ from scipy.signal import lfilter
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.positioning.standstill_phase import MeanPhases
-from railfix.positioning.track_choice import (
-    StandstillErrors,
-    YardTrack,
-    standstill_fix,
-    track_posterior,
-)
+from railfix.positioning.track_choice import StandstillErrors, YardTrack, standstill_fix, track_posterior
 
 SPACING_M = 3.6
 #: Times at which the posterior is computed [s].

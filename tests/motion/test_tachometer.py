@@ -7,13 +7,7 @@ import pytest
 
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import TachometerPulses
-from railfix.motion.tachometer import (
-    TachometerLimits,
-    check_speeds,
-    pulse_acceleration,
-    pulse_speeds,
-    tooth_faults,
-)
+from railfix.motion.tachometer import TachometerLimits, check_speeds, pulse_acceleration, pulse_speeds, tooth_faults
 
 START = np.datetime64("2026-03-01T06:00:00", "ns")
 LIMITS = TachometerLimits()

@@ -24,10 +24,7 @@ from railfix.simulate import (
     SkySettings,
 )
 from railfix.simulate.constellation import links
-from railfix.simulate.errors import (
-    CommonErrors,
-    GaussMarkov,
-)
+from railfix.simulate.errors import CommonErrors, GaussMarkov
 from railfix.simulate.receiver import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
 from railfix.simulate.settings import (
     ClockWalkSettings,
@@ -69,10 +66,7 @@ def added_m(on: Piece, off: Piece) -> tuple[np.ndarray, np.ndarray]:
     """What the errors have added to code and phase, shapes (T, M) [m]."""
     observed = on.observations
     length = SPEED_OF_LIGHT / carrier_frequency_hz(observed.satellite, observed.signal)
-    return (
-        observed.code_m - off.observations.code_m,
-        (observed.phase_cycles - off.observations.phase_cycles) * length,
-    )
+    return (observed.code_m - off.observations.code_m, (observed.phase_cycles - off.observations.phase_cycles) * length)
 
 
 def correlation(series: np.ndarray, lag: int) -> float:

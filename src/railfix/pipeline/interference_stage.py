@@ -117,7 +117,9 @@ def _motion_inputs(
         arc, offset = index.trajectory.nearest(near[part])
         inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1]) & np.isfinite(consistent[part, 0])
         off_line[part] = np.where(inside, offset, np.nan)
-    usable, named = (reason & ~_CONTRADICTED) == 0, _named_as_wrong(reason, corrected.channels.groups)
+    usable = (reason & ~_CONTRADICTED) == 0
+    # errors that cannot be identified may be those of a spoofer or of the time tags
+    named = _named_as_wrong(reason, corrected.channels.groups) & ~corrected.unsure[rows, None]
     return MotionInputs(
         time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
         group=corrected.channels.clock_number,

@@ -9,7 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Masks, patch_rows
 from railfix.positioning.antenna_rows import AntennaRows, Line
-from railfix.positioning.gross_errors import gross_errors
+from railfix.positioning.gross_errors import gross_alone, gross_errors
 from railfix.positioning.normal_equations import SinglePointLimits, point_position
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.section_search import SectionLimits, find_section
@@ -59,6 +59,7 @@ def approximate_position(
         ranges = without(ranges, wrong.gross)
         retried = point_position(ranges.take(again), middle[again], limits=_rough(limits or SinglePointLimits()))
         point = patch_rows(point, again, retried)
+    alone = gross_alone(ranges.weight, ranges.groups, point.clock_m)
     near = point.ecef_m.copy()
     arc, solved = np.full(len(near), np.nan), np.isfinite(near[:, 0])
     for index, found in antennas.split(solved.nonzero()[0]):
@@ -74,7 +75,7 @@ def approximate_position(
     of_line = np.isfinite(wrong.unsure_arc_m)
     arc = np.where(of_line, wrong.unsure_arc_m, arc)
     near = np.where(of_line[:, None], antennas.at_arc(arc), near)
-    return ApproximatePosition(near, arc, wrong.gross, wrong.unsure)
+    return ApproximatePosition(near, arc, wrong.gross | alone, wrong.unsure)
 
 
 @lru_cache

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks, kernel_array
+from railfix.core.arrays import Floats, Integers, Masks, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.positioning.antenna_rows import AntennaRows
@@ -162,6 +162,10 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 #: Spacing of line points in the coarse scan, and of the points around its best point in the fine scan [m].
 _COARSE_M: Final = 100.0
 _FINE_M: Final = 12.5
+#: Clocks of constellations are usually nearer to each other than the first value [m]: they differ by up to 71 m in the
+#: recordings. A clock with one or two ranges that is farther from the others than the second value is not used.
+_CLOCKS_APART_M: Final = 200.0
+_CLOCK_AWAY_M: Final = 600.0
 #: Largest product of points, epochs and channels that are computed together.
 _BLOCK: Final = 2_000_000
 #: The cost of every other exclusion must be larger by this fraction of `GROSS_M`.
@@ -175,7 +179,8 @@ class LineScan(NamedTuple):
 
     arc_m: Floats  #: Point with the least cost, shape (T,).
     gross: Masks  #: Ranges whose residuals at the point exceed `GROSS_M`, shape (T, M).
-    agreed: Masks  #: Epochs at which enough redundant ranges agree with the point, shape (T,).
+    #: Redundancy of the ranges without gross errors; 0 where they do not agree with the point; shape (T,).
+    agreeing: Integers
     clear: Masks  #: Epochs at which all points that imply other gross errors have a clearly larger cost, shape (T,).
 
 
@@ -207,26 +212,48 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
         rival = np.where(others, cost, np.inf).min(axis=1)
         clear[rows] = rival - own[each, best] > _CLEAR * GROSS_M
     rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
-    agreed = (rest.redundancy >= _LEFT_ON_LINE) & (_median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M)
-    return LineScan(arc, gross, agreed, clear)
+    agree = _median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M
+    return LineScan(arc, gross, np.where(agree, rest.redundancy, 0), clear)
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, N, 3), less the median residual of each clock, (T, N, M) [m]; NaN if unused."""
+    """Return residuals at positions (T, N, 3), less the median residual of each clock, (T, N, M) [m]; NaN if unused.
+
+    The lower or the upper median is used where it has a clearly smaller `_capped_cost` than their mean, which fits no
+    range if half of an even number of ranges has a gross error. If some residuals of a clock agree with the median of
+    all residuals to `_CLOCKS_APART_M`, the median of this clock is the median of these residuals alone.
+    """
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
     square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
     turn = satellite[:, None, :, 0] * place_ecef_m[..., 1, None] - satellite[:, None, :, 1] * place_ecef_m[..., 0, None]
     value = ranges.code_m[:, None] - np.sqrt(square) - EARTH_ROTATION_RATE / SPEED_OF_LIGHT * turn
     value = np.where(used[:, None], value, np.inf)
+    near = np.zeros(value.shape, dtype=np.bool_)
+    for middle in _medians(value):
+        near |= np.abs(value - middle) < _CLOCKS_APART_M
     for group in ranges.groups:
-        n = used[:, group].sum(axis=1)
-        ordered = np.sort(value[..., group], axis=2)
-        middle = [np.maximum(k, 0)[:, None, None] for k in ((n - 1) // 2, n // 2)]
-        low, high = (np.take_along_axis(ordered, np.minimum(k, max(ordered.shape[2] - 1, 0)), axis=2) for k in middle)
-        some = (n > 0)[:, None, None]
-        value[..., group] -= np.where(some, 0.5 * (np.where(some, low, 0.0) + np.where(some, high, 0.0)), 0.0)
+        some = near[..., group].any(axis=2, keepdims=True)
+        counted = np.where(near[..., group] | ~some, value[..., group], np.inf)
+        low, high = _medians(counted)
+        best = value[..., group] - 0.5 * (low + high)
+        for clock in (low, high):
+            other = value[..., group] - clock
+            better = _capped_cost(other) < _capped_cost(best) - _CLEAR * GROSS_M
+            best = np.where(better[..., None], other, best)
+        value[..., group] = best
     return np.asarray(np.where(used[:, None], value, np.nan))
+
+
+def _medians(value: Floats) -> tuple[Floats, Floats]:
+    """Return the lower and the upper median of the finite values along the last axis, which is kept with length 1.
+
+    0 where there is none.
+    """
+    ordered = np.sort(value, axis=-1)
+    n = np.isfinite(value).sum(axis=-1, keepdims=True)
+    low, high = (np.take_along_axis(ordered, np.maximum(k, 0), axis=-1) for k in ((n - 1) // 2, n // 2))
+    return np.where(n > 0, low, 0.0), np.where(n > 0, high, 0.0)
 
 
 def _capped_cost(residual_m: Floats) -> Floats:
@@ -258,13 +285,16 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
     best point of the line (`scan_line`), if redundant ranges agree with it and the cost of every other exclusion is
     clearly larger. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
-    (`gross_in_space`).
+    (`gross_in_space`). Where neither identifies them, the epoch is unsure. The ranges with gross errors at the best
+    point of the line are then returned, so that they do not move the position, if they are at most half of the ranges
+    and redundant ranges agree with the point.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
     located = np.isfinite(point.ecef_m[:, 0])
     residual = np.where(ranges.weight > 0, point.residual_m, 0.0)
-    suspect = ~located | ~(np.sqrt((residual**2).sum(axis=1)) < _QUIET_M)
+    loud = ~located | ~(np.sqrt((residual**2).sum(axis=1)) < _QUIET_M)
+    suspect = loud.copy()
     for index, rows in antennas.split(np.flatnonzero(located)):
         suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
     # ranges that agree in space have no gross error, even if the map is wrong
@@ -276,39 +306,46 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     for index, rows in antennas.split(np.flatnonzero(suspect)):
         part = ranges.take(rows)
         scan = scan_line(part, index.trajectory)
-        sure = scan.agreed & scan.clear
-        gross[rows[sure]] = scan.gross[sure]
-        open_arc = ~sure & (scan.agreed | nowhere[rows])
-        arc[rows[open_arc]] = scan.arc_m[open_arc]
-        # ranges that agree with a point of the line, but not clearly, are not rejected
-        unsure[rows[open_arc]] = scan.gross[open_arc].any(axis=1)
-        left = np.flatnonzero(~scan.agreed)
+        agreed = scan.agreeing >= _LEFT_ON_LINE
+        sure, left, found = agreed & scan.clear, np.flatnonzero(~agreed), np.zeros_like(scan.gross)
         if len(left):
-            found = gross_in_space(part.take(left), np.repeat(index.middle_ecef_m[None], len(left), axis=0))
-            gross[rows[left]] = found
-            arc[rows[left[found.any(axis=1)]]] = np.nan
-    return GrossErrors(gross, arc, unsure & np.isfinite(arc))
+            found[left] = gross_in_space(part.take(left), np.repeat(index.middle_ecef_m[None], len(left), axis=0))
+        open_ = ~sure & ~found.any(axis=1)
+        doubt = open_ & scan.gross.any(axis=1) & (agreed | loud[rows] | nowhere[rows])
+        open_ &= agreed | nowhere[rows] | doubt
+        arc[rows[open_]], unsure[rows] = scan.arc_m[open_], doubt
+        half = 2 * scan.gross.sum(axis=1) <= part.n_used
+        likely = sure | (doubt & (scan.agreeing > 0) & half)
+        gross[rows] = np.where(likely[:, None], scan.gross, found)
+    return GrossErrors(gross, arc, unsure)
 
 
-def gross_alone(weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases) -> Masks:
-    """Find sole ranges of a clock that contradict the known biases by more than `GROSS_M`, shape (T, M).
+def gross_alone(
+    weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases | None = None
+) -> Masks:
+    """Find the ranges of clocks with few ranges that contradict the clocks of more ranges, shape (T, M).
 
-    No other range tests the sole range of a clock while this clock is estimated freely. `clock_m`, shape (T, G), are
-    clocks estimated without ties. The common clock is the median of the clocks less their biases, weighted by
-    satellites.
+    No other range tests the sole range of a clock while this clock is estimated freely; the known biases `ties` test it
+    to `GROSS_M`. Without `ties`, one or two ranges are found whose clock differs from the common clock by more than
+    `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks estimated without ties. The common clock is the median of the
+    clocks less their biases, weighted by satellites.
     """
     found = np.zeros(weight.shape, dtype=np.bool_)
     count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)
-    known = (ties.sigma_m < UNTIED_M) & np.isfinite(clock_m)
-    rows = np.flatnonzero((known & (count == 1)).any(axis=1) & (known & (count > 1)).any(axis=1))
+    known, offset = np.isfinite(clock_m), np.zeros(clock_m.shape)
+    most, limit_m = 2, _CLOCK_AWAY_M
+    if ties is not None:
+        known, offset, most, limit_m = known & (ties.sigma_m < UNTIED_M), ties.offset_m, 1, GROSS_M
+    few = known & (count >= 1) & (count <= most)
+    rows = np.flatnonzero(few.any(axis=1) & (known & (count > most)).any(axis=1))
     if not len(rows):
         return found
-    common = np.where(known, clock_m - ties.offset_m, np.inf)[rows]
+    common = np.where(known, clock_m - offset, np.inf)[rows]
     order = np.argsort(common, axis=1)
     satellites = np.take_along_axis(np.where(known, count, 0)[rows], order, axis=1).cumsum(axis=1)
     middle = (2 * satellites >= satellites[:, -1:]).argmax(axis=1)
     median = np.take_along_axis(common, order, axis=1)[np.arange(len(rows)), middle]
-    wrong = known[rows] & (count[rows] == 1) & (np.abs(common - median[:, None]) > GROSS_M)
+    wrong = few[rows] & (np.abs(common - median[:, None]) > limit_m)
     for g, group in enumerate(groups):
         found[rows, group] = wrong[:, g, None] & (weight[rows, group] > 0)
     return found
