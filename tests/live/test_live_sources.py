@@ -190,10 +190,7 @@ def test_a_caster(log: bytes, tags: list[np.datetime64], version: int, chunked: 
 
 @pytest.mark.parametrize(
     ("place", "says"),
-    [
-        ("train:wrong@{at}/ROOF", "check user and password"),
-        ("train:pa%3Ass@{at}/NOWHERE", "check the mount point"),
-    ],
+    [("train:wrong@{at}/ROOF", "check user and password"), ("train:pa%3Ass@{at}/NOWHERE", "check the mount point")],
 )
 def test_what_a_caster_refuses_ends_the_session(log: bytes, place: str, says: str) -> None:
     """Also with reconnecting on: the first connection must succeed. The password is not shown."""

@@ -190,14 +190,7 @@ def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: 
 
         return locked
 
-    stages = (
-        "correct_ranges",
-        "pair_antennas",
-        "screen_antennas",
-        "position_stage",
-        "antenna_results",
-        "along_track",
-    )
+    stages = ("correct_ranges", "pair_antennas", "screen_antennas", "position_stage", "antenna_results", "along_track")
     for name in stages:
         monkeypatch.setattr(processing, name, locking(getattr(processing, name)))
     found, state = make.process({n: p[:30] for n, p in parts.items()})

@@ -67,10 +67,7 @@ def test_a_mosaic_in_the_open():
 
 
 @pytest.mark.requirement("A5")
-@pytest.mark.parametrize(
-    ("name", "p50"),
-    [("F9P", 0.95), ("M8T", 0.75), ("Pixel", 0.9)],
-)
+@pytest.mark.parametrize(("name", "p50"), [("F9P", 0.95), ("M8T", 0.75), ("Pixel", 0.9)])
 @pytest.mark.slow
 @pytest.mark.usefixtures("recordings")
 def test_in_towns_it_does_no_harm(name: str, p50: float):

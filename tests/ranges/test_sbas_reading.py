@@ -19,10 +19,7 @@ from sbas_account import DECODED, account, type_name
 
 pytestmark = pytest.mark.requirement("C1")
 
-LOGS = {
-    "2008": "msas_20080526_crescent/cres_20080526.bin.sbs",
-    "2025": "msas_20250215/046r_sbas_prn137.txt",
-}
+LOGS = {"2008": "msas_20080526_crescent/cres_20080526.bin.sbs", "2025": "msas_20250215/046r_sbas_prn137.txt"}
 
 
 def parity_by_division(bits: np.ndarray) -> int:

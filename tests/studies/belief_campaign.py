@@ -902,6 +902,24 @@ def first_levels(label: str, parts: list[Judged]) -> str:
     return row
 
 
+def medians_aside(case: Case, args: argparse.Namespace) -> str:
+    """Return how far medians of 3-D single-epoch positions lie across the line, and how many beyond half of the lane.
+
+    Over the window of each cold start, without a filter.
+    """
+    config = parse_config({"filter": "off", "elevation": {"mask_deg": args.mask[0]}})
+    processor = make_processor(config, case.navigation, {"front": case.trajectory})
+    found = processor.process({"front": case.observations})[0].antennas["front"]
+    along = Line(case.trajectory).at(np.nan_to_num(case.reference_arc_m))[1][:, 0]
+    right = np.cross(along, case.reference_ecef_m)
+    away = ((found.point.ecef_m - case.reference_ecef_m) * right).sum(axis=1) / np.linalg.norm(right, axis=1)
+    ends = [(since, len(part.observations.time)) for since, part in starts(case, args.every, args.length)]
+    first = np.searchsorted(seconds(case.observations.time - case.observations.time[0]), [since for since, _ in ends])
+    median = np.abs([np.nanmedian(away[k : k + count]) for k, (_, count) in zip(first, ends, strict=True)])
+    beyond = int((median > args.lane / 2.0).sum())
+    return f"{beyond} of {len(median)} medians beyond half of {args.lane:g} m, largest {median.max():.1f} m"
+
+
 def show_starts(case: Case, args: argparse.Namespace) -> None:
     """Print a row for each mask, and the calibration of the branches."""
     for mask in args.mask:
@@ -918,6 +936,8 @@ def show_starts(case: Case, args: argparse.Namespace) -> None:
         print(f"    {FIRST_HEAD}\n    {first_levels(f'{case.name} {mask:g}', parts)}", flush=True)
         if args.calibration:
             print("\n".join(calibration(joined(parts))), flush=True)
+    if args.lane is not None:
+        print(f"    {case.name}: positions across the line: {medians_aside(case, args)}", flush=True)
 
 
 def show_whole(case: Case, args: argparse.Namespace) -> None:
