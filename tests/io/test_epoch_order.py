@@ -7,7 +7,7 @@ import pytest
 
 from railfix.core.errors import InputFileError
 from railfix.gnss.observations import Observations
-from railfix.io.epoch_order import MOST_PASSED, EpochOrder, Run
+from railfix.io.epoch_order import MOST_PASSED, EpochOrder
 
 pytestmark = pytest.mark.requirement("G5")
 
@@ -29,7 +29,7 @@ def observations(seconds: list[int], *, system: str = "G") -> Observations:
 
 def in_order(seconds: list[int], size: int) -> tuple[list[float], Observations]:
     runs = [
-        Run(path="log", epochs=observations(seconds[k : k + size]), line=np.arange(len(seconds))[k : k + size] + 1)
+        ("log", observations(seconds[k : k + size]), np.arange(len(seconds))[k : k + size] + 1)
         for k in range(0, len(seconds), size)
     ]
     parts = list(EpochOrder("count").ordered(runs))
@@ -64,11 +64,7 @@ def test_nothing_is_lost_and_runs_of_any_length_give_the_same(seed: int) -> None
 
 def test_epochs_of_one_time_in_two_records_are_one() -> None:
     """Programs write one record for each constellation: the satellites of both are kept."""
-    runs = [
-        Run(path="log", epochs=observations([second], system=system), line=np.array([1]))
-        for second in range(50)
-        for system in "GE"
-    ]
+    runs = [("log", observations([second], system=system), np.array([1])) for second in range(50) for system in "GE"]
     parts = [part for part in EpochOrder("stop").ordered(runs) if len(part)]
     assert sum(len(part) for part in parts) == 50
     for part in parts:
@@ -78,7 +74,7 @@ def test_epochs_of_one_time_in_two_records_are_one() -> None:
 
 def test_a_tag_far_from_its_place_names_its_line_and_the_way_on() -> None:
     seconds = [*range(100), 50 - MOST_PASSED - 100, *range(100, 150)]
-    run = Run(path="log", epochs=observations(seconds), line=np.arange(len(seconds)) + 1)
+    run = ("log", observations(seconds), np.arange(len(seconds)) + 1)
     with pytest.raises(InputFileError, match=r"log, line 101: the time tag .* --lenient"):
         list(EpochOrder("stop").ordered([run]))
     *_, notes = EpochOrder("count").ordered([run])

@@ -131,7 +131,7 @@ def test_a_break_is_kept_where_a_block_ends_after_the_event(tmp_path: Path, flag
     expected = [False, False, True, False, True, False, True, False]
     assert read_observations(path).break_before.tolist() == expected
     for block_bytes in range(60, 160, 7):
-        runs = (run.epochs for run in BlockReader(path, Selection(), block_bytes=block_bytes).blocks())
+        runs = (run for _, run, _ in BlockReader(path, Selection(), block_bytes=block_bytes).blocks())
         found = [bool(broken) for run in runs for broken in run.break_before]
         assert found == expected, block_bytes
 

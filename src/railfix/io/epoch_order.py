@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import replace
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -25,13 +25,9 @@ _LONE: Final = np.timedelta64(3600, "s")
 _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """Consecutive epochs of a file in file order."""
-
-    path: str
-    epochs: Observations
-    line: Integers  #: Line number of each epoch, 0 in binary files.
+#: Consecutive epochs of a file in file order: the path of the file, the epochs, and the line number of each epoch,
+#: shape (T,), 0 in binary files.
+FileEpochs: TypeAlias = tuple[str, Observations, Integers]
 
 
 class EpochOrder:
@@ -39,7 +35,6 @@ class EpochOrder:
 
     def __init__(self, broken_lines: BrokenLines) -> None:
         self._broken_lines = broken_lines
-        self._held: list[Run] = []
         self._times: list[Datetimes] = []  # of all epochs returned so far
         self._counts = {DUPLICATES: 0, "sorted": 0}
         self._first: dict[str, tuple[str, int]] = {}
@@ -47,24 +42,31 @@ class EpochOrder:
         self._rejected = 0
         self._break = False
 
-    def ordered(self, runs: Iterable[Run]) -> Iterator[Observations]:
+    def ordered(self, runs: Iterable[FileEpochs]) -> Iterator[Observations]:
         """Yield the epochs in rising order of time; the last part has no epochs, only notes and counts.
 
         Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """
+        waiting: list[FileEpochs] = []  # for later epochs, which may precede them
         for run in runs:
-            self._held.append(run)
-            if _rise([*(time[-1:] for time in self._times[-1:]), *(held.epochs.time for held in self._held)]):
-                while sum(len(held.epochs) for held in self._held[1:]) >= _HELD:
-                    yield self._hand_on(self._held.pop(0).epochs)
+            waiting.append(run)
+            if self._rise_to(waiting):
+                while sum(len(epochs) for _, epochs, _ in waiting[1:]) >= _HELD:
+                    yield self._hand_on(waiting.pop(0)[1])
             else:
-                yield self._sort(final=False)
-        if _rise([*(time[-1:] for time in self._times[-1:]), *(held.epochs.time for held in self._held)]):
-            yield from (self._hand_on(run.epochs) for run in self._held)
+                ready, waiting = self._sort(waiting, final=False)
+                yield ready
+        if self._rise_to(waiting):
+            yield from (self._hand_on(epochs) for _, epochs, _ in waiting)
         else:
-            yield self._sort(final=True)
-        self._held = []
+            yield self._sort(waiting, final=True)[0]
         yield self._summary()
+
+    def _rise_to(self, waiting: Sequence[FileEpochs]) -> bool:
+        """Return whether the times of the last part returned and of the waiting epochs rise strictly."""
+        times = [*(time[-1:] for time in self._times[-1:]), *(epochs.time for _, epochs, _ in waiting)]
+        time = np.concatenate([*times, np.empty(0, "datetime64[ns]")])
+        return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
 
     def _hand_on(self, part: Observations) -> Observations:
         if not len(part):
@@ -77,11 +79,13 @@ class EpochOrder:
         self._break = False
         return part
 
-    def _sort(self, *, final: bool) -> Observations:
-        """Sort and check the waiting epochs; return the epochs that no later epoch can precede, and keep the others."""
-        joined = stack_parts([run.epochs for run in self._held])
-        line = np.concatenate([run.line for run in self._held])
-        path = np.repeat([run.path for run in self._held], [len(run.epochs) for run in self._held])
+    def _sort(self, runs: Sequence[FileEpochs], *, final: bool) -> tuple[Observations, list[FileEpochs]]:
+        """Sort and check the waiting epochs; return the epochs that no later epoch can precede, and the other epochs
+        one by one.
+        """
+        paths, epochs, lines = zip(*runs, strict=True)
+        joined, line = stack_parts(list(epochs)), np.concatenate(lines)
+        path = np.repeat(paths, [len(each) for each in epochs])
         time = joined.time
         decided = len(time) if final else max(len(time) - _HELD, 0)
         equal = self._handed_on(time)
@@ -109,10 +113,8 @@ class EpochOrder:
         ready = len(order) if final else max(len(order) - MOST_PASSED, 0)
         waiting = stack_parts([merged[ready:], take_epochs(joined, rest)])
         where = np.concatenate([order[ready:], rest])
-        self._held = [
-            Run(path=str(path[k]), epochs=waiting[i : i + 1], line=line[k : k + 1]) for i, k in enumerate(where)
-        ]
-        return self._hand_on(replace(merged[:ready], **_carried(joined)))
+        rest_of_runs = [(str(path[k]), waiting[i : i + 1], line[k : k + 1]) for i, k in enumerate(where)]
+        return self._hand_on(replace(merged[:ready], **_carried(joined))), rest_of_runs
 
     @property
     def _last(self) -> np.datetime64:
@@ -221,9 +223,3 @@ def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observation
             target[row] = np.where(blank, source[k], target[row])
     kept = take_epochs(ordered, first)
     return replace(kept, **values)
-
-
-def _rise(times: Sequence[Datetimes]) -> bool:
-    """Return whether the times of consecutive parts rise strictly."""
-    time = np.concatenate([*times, np.empty(0, "datetime64[ns]")])
-    return bool((np.diff(time) > np.timedelta64(0, "ns")).all())

@@ -19,7 +19,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.io import rinex
-from railfix.io.epoch_order import EpochOrder, Run
+from railfix.io.epoch_order import EpochOrder, FileEpochs
 from railfix.io.file_kind import find_kind
 from railfix.io.mate import mate_table, read_mate_observations
 from railfix.io.rinex.observations import (
@@ -187,7 +187,7 @@ def _receiver_runs(
     ordered = _in_order(paths, date)
     found = 0
 
-    def of_files() -> Iterator[Run]:
+    def of_files() -> Iterator[FileEpochs]:
         last: Observations | None = None
         for k, path in enumerate(ordered):
 
@@ -201,7 +201,7 @@ def _receiver_runs(
                 if joint and len(part):
                     part, joint = with_break_at_gap(last, part), False
                 last = part if len(part) else last
-                yield Run(path=path, epochs=part, line=np.zeros(len(part), dtype=np.int64))
+                yield path, part, np.zeros(len(part), dtype=np.int64)
 
     for part in EpochOrder("count").ordered(of_files()):
         found += len(part)

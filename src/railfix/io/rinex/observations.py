@@ -21,7 +21,7 @@ from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import LENIENT, BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
 from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
-from railfix.io.epoch_order import EpochOrder, Run
+from railfix.io.epoch_order import EpochOrder, FileEpochs
 from railfix.io.rinex.header import VERSION, RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import PADDING, decode, lines_per_satellite
 from railfix.io.rinex.observations_epochs import (
@@ -69,7 +69,7 @@ class BlockReader:
         self._log = FaultLog(self.path, broken_lines=selection.broken_lines)
         self._break = False
 
-    def blocks(self) -> Generator[Run]:
+    def blocks(self) -> Generator[FileEpochs]:
         """Yield runs of epochs in the order of the file; a run may be empty."""
         with open_stream(self.path) as stream:
             head, rest = read_header_bytes(stream)
@@ -109,7 +109,7 @@ class BlockReader:
             return b"", True
         return block, not block
 
-    def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[Run, RinexHeader, int]:
+    def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[FileEpochs, RinexHeader, int]:
         """Read the epochs up to the end of the lines or a change of the observation types.
 
         Return the epochs, the header after them, and the number of lines read.
@@ -149,7 +149,7 @@ class BlockReader:
             return further
         return apply_records(self.path, header, records, first_line=number, log=self._log)
 
-    def _observations(self, lines: Lines, table: EpochHeads, header: RinexHeader) -> Run:
+    def _observations(self, lines: Lines, table: EpochHeads, header: RinexHeader) -> FileEpochs:
         self._log.count(CYCLE_SLIPS, int((table.flag == 6).sum()))
         breaks = np.cumsum((table.flag >= 1) & (table.flag <= 3)) + int(self._break)
         seen = (table.flag == 0) | (table.flag == 1)
@@ -177,7 +177,7 @@ class BlockReader:
             problem_count=problem_count,
             skipped=skipped,
         )
-        return Run(path=self.path, epochs=observations, line=lines.number[epochs.line])
+        return self.path, observations, lines.number[epochs.line]
 
 
 #: Default number of epochs of a piece.
@@ -251,19 +251,18 @@ def _runs(
 
 def _of_files(
     readers: list[BlockReader], selection: Selection, progress: Callable[[float], None] | None
-) -> Iterator[Run]:
+) -> Iterator[FileEpochs]:
     """Yield the runs of consecutive files, with `break_before` where there is a gap between two files."""
     last: Observations | None = None
     for k, reader in enumerate(readers):
         joint = last is not None
-        for run in reader.blocks():
-            if joint and len(run.epochs):
-                run = replace(run, epochs=with_break_at_gap(last, run.epochs))
-                joint = False
-            last = run.epochs if len(run.epochs) else last
+        for path, epochs, line in reader.blocks():
+            if joint and len(epochs):
+                epochs, joint = with_break_at_gap(last, epochs), False
+            last = epochs if len(epochs) else last
             if progress is not None:
                 progress((k + reader.share) / len(readers))
-            yield run
+            yield path, epochs, line
         if not reader.epochs and (selection.broken_lines == "stop" or len(readers) == 1):
             raise InputFileError(reader.path, "has a header but no epochs; the recording is empty or cut short")
 
@@ -287,7 +286,7 @@ def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None
 def first_time(path: str) -> np.datetime64:
     """Return the time of the first epoch of a file, NaT if it has none."""
     with closing(BlockReader(path, Selection(broken_lines="count"), block_bytes=_PEEK_BYTES).blocks()) as runs:
-        return next((run.epochs.time[0] for run in runs if len(run.epochs)), np.datetime64("NaT", "ns"))
+        return next((epochs.time[0] for _, epochs, _ in runs if len(epochs)), np.datetime64("NaT", "ns"))
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
