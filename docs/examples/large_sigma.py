@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import Field
 
-from railfix.core.reasons import screen_reason
+from railfix.core.reason_names import screen_reason
 from railfix.core.settings import Settings
 from railfix.screens.base import (
     AntennaRanges,

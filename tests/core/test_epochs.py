@@ -9,8 +9,10 @@ import pytest
 
 from railfix.core import errors
 from railfix.core.arrays import read_only
-from railfix.core.reasons import POSITIONED, Reason, Status, first_reason, reason_text
-from railfix.gnss.observations import MAX_PROBLEMS, ObservationHeader, Observations, concatenate, first_problems
+from railfix.core.reason_names import first_reason, reason_text
+from railfix.core.reasons import POSITIONED, Reason, Status
+from railfix.gnss import concatenate
+from railfix.gnss.observations import MAX_PROBLEMS, ObservationHeader, Observations, first_problems
 
 START = np.datetime64("2024-03-13T08:00:00", "ns")
 

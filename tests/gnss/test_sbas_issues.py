@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import orbit_cases as cases
-from railfix.gnss.orbits.prepared_records import issue_records
+from railfix.gnss.orbits.issues import issue_records
 from railfix.gnss.orbits.states import satellite_states
 
 pytestmark = pytest.mark.requirement("C1")

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import static_fixes
 from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss import Observations, concatenate
 from railfix.ground.demo import PLAN_M, TIME, draw_fixes, points_ecef_m
 from railfix.ground.fixes_at_stations import StationStreams, station_fixes
 from railfix.ground.triangle import (

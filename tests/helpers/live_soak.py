@@ -115,7 +115,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False, chan
         "epochs": round(hours * 3600 * rate_hz),
         "records": len(saved.state.received.navigation.kepler),
         "records_of_the_day": len(navigation.kepler),
-        "sbas_messages": 0 if saved.state.received.messages is None else len(saved.state.received.messages.messages),
+        "sbas_messages": 0 if (held := saved.state.received.corrections) is None else len(held.messages),
         "state_bytes": counts["saved"],
         "counts": dict(engine.counts),
         "tracking": float(np.mean([m.chainage_cm is not None for m in _messages(folder)])),

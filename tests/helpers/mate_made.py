@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.timescale import gpst_to_utc, to_week
-from railfix.gnss.observations import concatenate
+from railfix.gnss import concatenate
 from railfix.io.mate import READ
 from railfix.simulate.sensor_columns import sensor_tables
 from railfix.simulate.signals import Simulation

@@ -18,7 +18,7 @@ from pipeline_cases import demo_observations
 from railfix.core.checksums import crc24q
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss import Observations, concatenate
 from railfix.io import rinex
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, decode

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from railfix.core import files
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss import Observations, concatenate
 from railfix.io import read_observations
 from railfix.io.epoch_order import EpochOrder
 from railfix.io.rinex import observations_decode, scan_observations

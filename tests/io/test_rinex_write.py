@@ -15,8 +15,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from railfix.core.errors import OutputError
+from railfix.gnss import ObservationHeader, Observations, concatenate
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.gnss.observations import ObservationHeader, Observations, concatenate
 from railfix.io import read_navigation, read_observations, write_navigation, write_observations
 from railfix.io.rinex.write import RinexVersion, _format_f14_3, detect_packing
 from railfix.simulate import Scenario, SkySettings, simulate_navigation

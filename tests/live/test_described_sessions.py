@@ -366,7 +366,7 @@ def epoch_at(milliseconds: float) -> Observations:
 
 def _engine(*antennas: str, sensors: tuple[str, ...] = (), **settings: Any) -> LiveEngine:
     processor = Processor(
-        notes=("a note",), received=SimpleNamespace(notes=(), navigation=no_navigation()), antenna_order=lambda: None,
+        notes=("a note",), received=SimpleNamespace(notes=(), navigation=no_navigation()),
         trajectories={name: clean_trajectories()[name] for name in antennas}, balises=None, units=None, given=[],
         notes_later=[],
         config=SimpleNamespace(antenna_pair=SimpleNamespace(tag_tolerance_s=0.01)),

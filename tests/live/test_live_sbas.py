@@ -20,6 +20,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.messages import with_parity
+from railfix.run.processor_setup import make_processor
 from ubx_made import log_of
 
 pytestmark = [pytest.mark.requirement("A8"), pytest.mark.requirement("C1")]
@@ -109,19 +110,18 @@ def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> 
     observations = railfix.read_observations(log["log"])[:3]
     line = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([log["line"]]))}
     config = railfix.Config(sbas="stream", sbas_prn=137)
-    result, _ = railfix.EpochProcessor(config, line, navigation=railfix.read_navigation(log["nav"])).process(
-        {"front": observations}
-    )
+    processor = make_processor(config, railfix.read_navigation(log["nav"]), line)
+    result, _ = processor.process({"front": observations})
     assert np.isnan(result.antennas["front"].chainage_m).all()
     with pytest.raises(SettingsError, match="give its PRN"):
-        railfix.EpochProcessor(railfix.Config(sbas="stream"), line)
+        make_processor(railfix.Config(sbas="stream"), railfix.read_navigation(log["nav"]), line)
 
 
 def test_a_stored_state_has_the_sbas_messages(log: dict[str, Path]) -> None:
     observations, messages = railfix.read_observations(log["log"])[:EPOCHS], read_sbas(log["log"])
     line = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([log["line"]]))}
     config = parse_config({"sbas": "stream", "sbas_prn": 137, "elevation": {"mask_deg": 10}, "filter": "off"})
-    processor = railfix.EpochProcessor(config, line, navigation=railfix.read_navigation(log["nav"]))
+    processor = make_processor(config, railfix.read_navigation(log["nav"]), line)
     _, state = processor.process({"front": observations[:150]}, messages=messages)
     (one, _), (other, _) = (processor.process({"front": observations[150:]}, s) for s in (state, decode(encode(state))))
     assert np.array_equal(one.antennas["front"].chainage_m, other.antennas["front"].chainage_m, equal_nan=True)

@@ -14,6 +14,7 @@ import pytest
 
 from pipeline_cases import NO_EPOCHS, members
 from railfix.core.epoch_rows import EVERY, join_epochs, take_epochs
+from railfix.gnss.joined_observations import stack_observations
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
@@ -24,7 +25,7 @@ from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import Models, correct_ranges
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.screen_stage import screen_filtered, screen_positions
-from railfix.positioning.antenna_rows import AntennaRows, stack_observations
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor_setup import make_processor

@@ -27,12 +27,13 @@ from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, Navigation
 from railfix.gnss.orbits.prepared_records import validity_s
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.config import parse_config
+from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import known_from_start, receive
 from railfix.pipeline.results import AntennaResult
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, thin_shell_obliquity
-from railfix.ranges.sbas import read_sbas
+from railfix.ranges.sbas import SbasState, read_sbas
+from railfix.run.processor_setup import make_processor
 from recordings_score import straight_line
 
 
@@ -99,10 +100,11 @@ def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordi
     navigation = read_navigation([folder / "cres_20080526.bin.nav"])
     messages = read_sbas(folder / "cres_20080526.bin.sbs")
     log = read_observations(folder / "cres_20080526.bin.obs")[:360]
-    config = parse_config({"filter": "off", "sbas_prn": 137, "elevation": {"mask_deg": 10.0}})
+    config = parse_config({"filter": "off", "sbas": "stream", "sbas_prn": 137, "elevation": {"mask_deg": 10.0}})
     line = {"front": straight_line(log.header.approximate_ecef_m, 45.0)}
-    whole, _ = EpochProcessor(config, line, navigation=navigation, messages=messages).process({"front": log})
-    live, state, statuses, taken = EpochProcessor(config, line, navigation=navigation), None, [], 0
+    first = EpochProcessor(config, line, navigation=navigation, corrections=SbasState.from_log(messages, prn=137))
+    whole, _ = first.process({"front": log})
+    live, state, statuses, taken = make_processor(config, navigation, line), None, [], 0
     reasons = []
     for first in range(0, len(log), 60):
         piece = log[first : first + 60]
@@ -116,10 +118,12 @@ def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordi
     np.testing.assert_array_equal(np.concatenate(reasons), expected.reason)
     np.testing.assert_allclose(np.concatenate(statuses), expected.chainage_m, rtol=0, atol=1e-6)
     assert np.isfinite(expected.chainage_m).any()
-    with pytest.raises(SettingsError, match="give its PRN"):
-        EpochProcessor(parse_config({"filter": "off"}), line, navigation=navigation).process(
-            {"front": log[:1]}, messages=messages
-        )
+    with pytest.raises(SettingsError, match="messages were given, but SBAS is off"):
+        EpochProcessor(Config(filter="off"), line, navigation=navigation).process({"front": log[:1]}, messages=messages)
+    with pytest.raises(SettingsError, match=r"SBAS is on in the settings .* were not given; give both"):
+        EpochProcessor(config, line, navigation=navigation)
+    with pytest.raises(SettingsError, match="sbas_band = L1, but the corrections are of SBAS on L5"):
+        EpochProcessor(config, line, navigation=navigation, corrections=SbasState(prn=137, band="L5"))
 
 
 def test_nothing_new_is_the_same_value() -> None:

@@ -15,7 +15,7 @@ from railfix.cli import app
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
-from railfix.gnss.observations import concatenate
+from railfix.gnss import concatenate
 from railfix.gnss.orbits import satellite_states
 from railfix.pipeline.base_station_stage import BaseStation
 from railfix.pipeline.channel_book import ChannelBook

@@ -15,9 +15,10 @@ from railfix.motion.features import LineSeries, map_features
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.pipeline.along_track import _find_fix, _gated_ranges, _restart_state
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.feature_fixes import FeatureState, LineFeatures, RateSeries, feature_fixes
+from railfix.pipeline.feature_fixes import LineFeatures, feature_fixes
 from railfix.pipeline.filter_result import FilterFix, FilterState
 from railfix.pipeline.outage_gate import ReturnState
+from railfix.pipeline.passed_features import FeatureState, RateSeries
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, ranging_lever_m, sensor_epochs
 from railfix.run.sensors import read_sensors, read_units, units_of_ranges
 from railfix.tracking import Line, RangeEpochs, Tracked, TrackStatus

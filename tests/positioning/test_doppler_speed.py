@@ -11,7 +11,7 @@ import pytest
 import reference_gaps
 from railfix.core.errors import SettingsError
 from railfix.core.timescale import seconds
-from railfix.gnss.observations import concatenate
+from railfix.gnss import concatenate
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import (
     Dopplers,

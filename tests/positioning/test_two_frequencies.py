@@ -27,7 +27,8 @@ from railfix.positioning.two_frequencies import (
     combine_codes,
     share_of_second,
 )
-from railfix.ranges.second_codes import SecondCodes, signal_delays
+from railfix.ranges.corrected import SecondCodes
+from railfix.ranges.second_codes import signal_delays
 from railfix.run.processor_setup import make_processor
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory

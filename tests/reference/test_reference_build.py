@@ -11,7 +11,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import seconds, timedelta
-from railfix.gnss.observations import concatenate
+from railfix.gnss import concatenate
 from railfix.io.position_log import PositionLog
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log

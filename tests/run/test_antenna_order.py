@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from railfix import Config, EpochProcessor, antenna_trajectory, read_track, read_vehicle
+from railfix import antenna_trajectory, read_track, read_vehicle
 from railfix.cli import app
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.simulate.demonstration import demo_files
@@ -101,10 +101,10 @@ def test_the_sigma_grows_with_the_scatter_of_the_stretches() -> None:
 
 def test_there_is_no_order_of_one_antenna_or_without_a_vehicle() -> None:
     front, rear = paths()
-    assert EpochProcessor(Config(filter="off"), {"front": front}).antenna_order() is None
+    assert AntennaOrder.between({"front": front}, tolerance_s=0.01) is None
     track = Trajectory.from_antenna_path(read_track(demo_files()["track"]))
-    assert EpochProcessor(Config(filter="off"), {"front": track, "rear": track}).antenna_order() is None
-    assert EpochProcessor(Config(filter="off"), {"front": front, "rear": rear}).antenna_order() is not None
+    assert AntennaOrder.between({"front": track, "rear": track}, tolerance_s=0.01) is None
+    assert AntennaOrder.between({"front": front, "rear": rear}, tolerance_s=0.01) is not None
 
 
 @pytest.mark.parametrize("exchanged", [False, True])

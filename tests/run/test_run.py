@@ -16,7 +16,8 @@ from polars.testing import assert_frame_equal
 from broken_bench import EPOCHS, Bench, bench_in
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.files import source_commit
-from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reason_text
+from railfix.core.reason_names import reason_text
+from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.evaluate import evaluate_run
 from railfix.io import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config

@@ -19,7 +19,8 @@ import pytest
 from conftest import ROOT
 from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, processor
 from railfix.core.errors import NoPositionError
-from railfix.core.reasons import Reason, Status, reason_names, reason_text, screen_reason
+from railfix.core.reason_names import reason_names, reason_text, screen_reason
+from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
 from railfix.io import read_observations, write_observations
 from railfix.pipeline.config import SCREEN_NAMES, Config, parse_config

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.core.arrays import Floats
-from railfix.gnss.observations import concatenate
+from railfix.gnss import concatenate
 from railfix.simulate import ReceiverSettings, Scenario, Simulation, SkySettings
 from railfix.simulate.environment import Environment, EnvironmentSettings
 from railfix.simulate.environment.correlator import circular_reflection, reflection_amplitude

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.gnss.observations import carrier_frequency_hz, concatenate
+from railfix.gnss import carrier_frequency_hz, concatenate
 from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.simulate import (
     Disturbance,

@@ -19,7 +19,7 @@ from conftest import ROOT
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.settings import validate
 from railfix.core.settings_files import write_toml
-from railfix.gnss.observations import concatenate
+from railfix.gnss import concatenate
 from railfix.io.rinex import read_navigation, write_navigation, write_observations
 from railfix.simulate import (
     Element,

@@ -13,7 +13,7 @@ import pytest
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.gnss.observations import Observations, carrier_frequency_hz, concatenate
+from railfix.gnss import Observations, carrier_frequency_hz, concatenate
 from railfix.gnss.orbits import satellite_states
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate import (

@@ -16,9 +16,10 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import timedelta
 from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
+from railfix.pipeline.filter_result import Replay
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensor_epochs import SensorLimits
-from railfix.pipeline.smoothed_track import Replay, smooth
+from railfix.pipeline.smoothed_track import smooth
 from railfix.positioning.normal_equations import point_position, position_on_line
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.section_search import SectionLimits, find_section

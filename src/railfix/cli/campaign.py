@@ -26,7 +26,8 @@ from railfix.cli.console import (
     show_verdict,
 )
 from railfix.cli.options import Choices, JsonOption, OutOption, Without, from_models, resolve_settings
-from railfix.core.errors import MismatchError, NoPositionError, SettingsError, needs_extra
+from railfix.core.errors import MismatchError, NoPositionError, SettingsError
+from railfix.core.extras import needs_extra
 from railfix.core.tables import number, percent, plain_table
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files

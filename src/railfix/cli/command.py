@@ -20,7 +20,8 @@ from typing import Any, ClassVar, Final, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from railfix.core.errors import InputFileError, OutputError, RailfixError, RailfixWarning, SettingsError, needs_extra
+from railfix.core.errors import InputFileError, OutputError, RailfixError, RailfixWarning, SettingsError
+from railfix.core.extras import needs_extra
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")

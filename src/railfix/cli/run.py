@@ -20,7 +20,7 @@ from railfix.cli.options import (
     resolve_settings,
     set_value,
 )
-from railfix.core.errors import needs_extra
+from railfix.core.extras import needs_extra
 from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files

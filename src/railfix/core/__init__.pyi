@@ -11,7 +11,8 @@ from .errors import (
     SettingsError,
 )
 from .files import file_sha256
-from .reasons import Reason, Status, reason_text
+from .reason_names import reason_text
+from .reasons import Reason, Status
 from .settings import Settings
 from .settings_files import load_settings, read_toml, write_toml
 from .staged_files import FilePath, write_whole

@@ -52,16 +52,6 @@ def kernel_array(array: NDArray[Any]) -> Floats:
     return read_only(np.ascontiguousarray(array, dtype=np.float64))
 
 
-def masked_median(values: Floats, known: Masks) -> Floats:
-    """Return the median of the known values of each row, shape (T,); NaN for a row without known values."""
-    if not values.shape[1]:
-        return np.full(len(values), np.nan)
-    ordered, count = np.sort(np.where(known, values, np.inf), axis=1), known.sum(axis=1)
-    rows = np.arange(len(values))
-    low, high = ordered[rows, np.maximum(count - 1, 0) // 2], ordered[rows, np.minimum(count // 2, values.shape[1] - 1)]
-    return np.where(count > 0, 0.5 * (low + high), np.nan)
-
-
 def freeze_arrays(instance: DataclassInstance) -> None:
     """Replace the array fields of a dataclass by read-only views; called in its `__post_init__`."""
     vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})
@@ -143,23 +133,6 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
     return group, np.arange(len(group)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
-    """Return the index of one node per layer for which the sum of node and step costs is smallest (Viterbi algorithm).
-
-    `costs` has the node costs of each layer, shape (n,). `steps` has the step costs to the n nodes of each layer except
-    the first, from the m nodes of the layer before, shape (n, m).
-    """
-    total, came = costs[0], list[Indices]()
-    for cost, step in zip(costs[1:], steps, strict=True):
-        reached = total + step
-        came.append(reached.argmin(axis=1))
-        total = reached.min(axis=1) + cost
-    path = [int(total.argmin())]
-    for before in reversed(came):
-        path.append(int(before[path[-1]]))
-    return path[::-1]
-
-
 def channel_sums(values: Floats) -> Floats:
     """Return sums over the channels, axis 1, added in the order of the channels.
 
@@ -167,18 +140,6 @@ def channel_sums(values: Floats) -> Floats:
     only its own channels or the channels of the whole log.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
-
-
-def medians(values: Floats) -> Floats:
-    """Return the medians along the last axis, ignoring NaN; NaN if all values are NaN."""
-    *shape, width = values.shape
-    if not width:
-        return np.full(shape, np.nan)
-    rows = values.reshape(-1, width).copy()
-    rows.sort()  # NaN last
-    count, row = (rows == rows).sum(axis=1), np.arange(len(rows))
-    low, high = rows[row, np.maximum(count - 1, 0) // 2], rows[row, np.minimum(count // 2, width - 1)]
-    return np.asarray((low + high) / 2.0).reshape(shape)
 
 
 def over_blocks(function: Callable[[Indices], None], blocks: Iterable[Indices]) -> None:

@@ -22,8 +22,7 @@ code meaning
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from os import PathLike
 from typing import ClassVar, Final
 
@@ -86,33 +85,6 @@ def check_type(value: object, expected: type, what: str) -> None:
     if not isinstance(value, expected):
         maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")
-
-
-#: Extra of railfix that installs each optional package.
-_EXTRAS: Final = {
-    **dict.fromkeys(("cbor2", "serial", "h11"), "live"),
-    "paho": "mqtt",
-    **dict.fromkeys(("aioquic", "cryptography", "starlette", "uvicorn", "sqlalchemy"), "ground"),
-    "distributed": "cluster",
-    "mcap_ros2": "mcap",
-    **dict.fromkeys(("pyogrio", "shapely", "rasterio", "jgdtrans", "rdflib"), "maps"),
-}
-
-
-@contextmanager
-def needs_extra(what: object = "this") -> Iterator[None]:
-    """Raise SettingsError if an optional package imported in the block is not installed.
-
-    The message states that `what` needs the package, and names the extra of railfix that installs it.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        extra = _EXTRAS.get(str(error.name).partition(".")[0])
-        if extra is None:
-            raise
-        needed = f"{what} needs {error.name}, which is not installed; pip install 'railfix[{extra}]'"
-        raise SettingsError(needed) from None
 
 
 class MismatchError(RailfixError):

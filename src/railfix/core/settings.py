@@ -6,9 +6,9 @@ import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from railfix.core.errors import SettingsError
 from railfix.core.notebook import html_table
@@ -94,26 +94,6 @@ class Settings(Checked):
         elif get_origin(kind) is tuple:
             return (value,) if isinstance(value, Path) else tuple(filter(None, map(str.strip, value.split(","))))
         return value
-
-
-class Message(Checked):
-    """Base of messages between programs, validated in one pass over all values because they are numerous."""
-
-    _numbers: ClassVar[frozenset[str]] = frozenset()
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Store the names of the fields that are numbers."""
-        cls._numbers = frozenset(name for name, field in cls.model_fields.items() if is_number(field.annotation))
-
-    @model_validator(mode="before")
-    @classmethod
-    def _truth_for_a_number(cls, values: Any) -> Any:
-        """Reject a truth value for a number, which pydantic accepts as 1 or 0."""
-        for name, value in values.items() if isinstance(values, dict) else ():
-            if (value is True or value is False) and name in cls._numbers:
-                raise ValueError(f"{name}: a number was expected")
-        return values
 
 
 def is_number(kind: Any) -> bool:

@@ -22,9 +22,10 @@ from railfix.core.arrays import Datetimes, Indices
 from railfix.core.errors import MismatchError, RailfixError
 from railfix.core.files import fingerprint, read_bytes
 from railfix.core.geodesy import sigma_along
+from railfix.core.nearest_times import nearest_rows
 from railfix.core.reasons import Status
 from railfix.core.staged_files import write_whole
-from railfix.core.timescale import nearest_rows, seconds
+from railfix.core.timescale import seconds
 from railfix.evaluate.accuracy import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs

@@ -22,8 +22,9 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.evaluation_inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
+from railfix.track.passes import find_segments_near
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory, find_segments_near, short_distance_m
+from railfix.track.trajectory import Trajectory, short_distance_m
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 

@@ -22,7 +22,8 @@ import polars as pl
 from railfix.core.errors import InputFileError, OutputError
 from railfix.core.files import file_sha256
 from railfix.core.geodesy import axes_at, ecef_from_geodetic
-from railfix.core.timescale import from_week, nearest_rows
+from railfix.core.nearest_times import nearest_rows
+from railfix.core.timescale import from_week
 from railfix.evaluate.benchmark import RTKLIB_PROGRAM
 from railfix.evaluate.cases import write_case
 from railfix.io.position_log import SIGMA_COLUMNS, PositionLog

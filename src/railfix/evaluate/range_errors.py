@@ -33,7 +33,8 @@ from railfix.pipeline.range_stage import collect_conditions
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.receiver_noise import RobustClock, robust_clock
 from railfix.ranges.channels import clock_groups
-from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences
+from railfix.ranges.error_conditions import Conditions, condition_differences
+from railfix.ranges.error_model import ErrorModel, ErrorModelSource
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins
 from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option

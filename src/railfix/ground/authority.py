@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field
 
-from railfix.core.settings import Message
+from railfix.core.messages import Message
 from railfix.ground.layout import MOST_PARTS
 from railfix.io.train_message import MessageError, cbor, validate_message
 

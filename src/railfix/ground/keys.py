@@ -12,7 +12,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from railfix.core.errors import InputFileError, OutputError, needs_extra
+from railfix.core.errors import InputFileError, OutputError
+from railfix.core.extras import needs_extra
 
 with needs_extra():
     from cryptography import x509

@@ -17,7 +17,7 @@ from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, cast
 
-from railfix.core.errors import needs_extra
+from railfix.core.extras import needs_extra
 from railfix.ground.keys import Peer
 
 with needs_extra():

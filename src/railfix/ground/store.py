@@ -13,7 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
-from railfix.core.errors import InputFileError, OutputError, needs_extra
+from railfix.core.errors import InputFileError, OutputError
+from railfix.core.extras import needs_extra
 from railfix.ground.centre import TrainRecord
 from railfix.io.train_message import decode, encode
 

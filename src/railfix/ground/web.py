@@ -18,7 +18,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from railfix.core.errors import needs_extra
+from railfix.core.extras import needs_extra
 from railfix.ground.quic import address_errors
 
 with needs_extra():

@@ -15,8 +15,9 @@ from railfix.core.arrays import join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, Reader, path_names
 from railfix.core.timescale import gps_time
+from railfix.gnss.joined_observations import concatenate
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.observations import Observations
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.io import rinex
 from railfix.io.epoch_order import EpochOrder, FileEpochs

@@ -20,7 +20,8 @@ import polars as pl
 import polars.selectors as cs
 from pyproj import CRS
 
-from railfix.core.errors import NoPositionError, needs_extra
+from railfix.core.errors import NoPositionError
+from railfix.core.extras import needs_extra
 from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 

@@ -15,8 +15,10 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from railfix.core.errors import InputFileError, needs_extra
-from railfix.core.settings import Message, Model
+from railfix.core.errors import InputFileError
+from railfix.core.extras import needs_extra
+from railfix.core.messages import Message
+from railfix.core.settings import Model
 
 VERSION: Final = 1  #: Version of the schema; a receiver rejects other versions.
 LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected without decoding.

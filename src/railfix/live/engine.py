@@ -15,8 +15,9 @@ from typing import Final, Literal
 import numpy as np
 
 from railfix.core.timescale import GPS_EPOCH
+from railfix.gnss.joined_observations import concatenate
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.observations import Observations
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
 from railfix.live.message import TrainPlace, create_message, locate_train, no_input_message
@@ -24,6 +25,7 @@ from railfix.live.settings import LiveSettings
 from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import SensorSamples
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.received import merge_navigation
@@ -123,7 +125,9 @@ class LiveEngine:
         self.counts: Counter[str] = Counter()
         self.reports: deque[str] = deque(processor.notes, maxlen=100)
         self._notes = processor.received.notes
-        self._order, self._ordered_at_m = processor.antenna_order(), float("-inf")
+        tolerance_s = processor.config.antenna_pair.tag_tolerance_s
+        self._order = AntennaOrder.between(processor.trajectories, tolerance_s=tolerance_s)
+        self._ordered_at_m = float("-inf")
         self._antennas = tuple(processor.trajectories)
         self._waiting: dict[str, deque[_Waiting]] = {name: deque() for name in self._antennas}
         self._last_tag: dict[str, int] = {}
@@ -144,7 +148,7 @@ class LiveEngine:
         self._pending: LiveOutput | None = None
         self._silent = False
         self._period_ns = round(settings.period_s * 1e9)
-        self._tolerance_ns = round(processor.config.antenna_pair.tag_tolerance_s * 1e9)
+        self._tolerance_ns = round(tolerance_s * 1e9)
 
     def add_navigation(self, navigation: Navigation) -> None:
         """Add navigation records; they are used from the next epoch on."""

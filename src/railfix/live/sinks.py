@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import IO, Any, Final, Generic, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
 
-from railfix.core.errors import OutputError, SettingsError, needs_extra
+from railfix.core.errors import OutputError, SettingsError
+from railfix.core.extras import needs_extra
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import Form, forms, wants, whole_message
 from railfix.live.settings import LiveSettings

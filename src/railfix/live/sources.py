@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from railfix.core.errors import InputFileError, SettingsError, needs_extra
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.extras import needs_extra
 from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 

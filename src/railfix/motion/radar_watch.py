@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.timescale import nearest_rows
+from railfix.core.nearest_times import nearest_rows
 from railfix.motion.samples import RadarSpeeds
 
 _WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].

@@ -17,12 +17,11 @@ from railfix.integrity.interference import Suspicion, WheelSigns, WheelState, wh
 from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
-from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, SingleEpochs
+from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, Replay, SingleEpochs, SmoothedTrack
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
-from railfix.pipeline.smoothed_track import Replay, SmoothedTrack
 from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.positioning.carrier import CycleSlipState, Slips, corrected_phase_m, find_slips
 from railfix.positioning.map_offset import beyond_threshold

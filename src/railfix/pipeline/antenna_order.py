@@ -7,6 +7,7 @@ ahead.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -47,6 +48,13 @@ class AntennaOrder:
         self._tolerance_s = tolerance_s
         #: For each stretch: number of pairs, sum of distances [m], sum of variances [m^2].
         self._stretches: dict[int, tuple[float, float, float]] = {}
+
+    @classmethod
+    def between(cls, trajectories: Mapping[str, Trajectory], *, tolerance_s: float) -> AntennaOrder | None:
+        """Return a new test for trajectories by antenna; None without two antennas of one vehicle."""
+        if len(trajectories) < 2 or any(t.body_chainage_m is None for t in trajectories.values()):
+            return None
+        return cls(trajectories["front"], trajectories["rear"], tolerance_s=tolerance_s)
 
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
         """Add the positions of more epochs; return whether the train is on a new stretch.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -16,6 +18,7 @@ from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.carrier_stage import CarrierState, find_antenna_slips, smooth_ranges
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
+from railfix.pipeline.passed_features import FeatureSearch
 from railfix.pipeline.range_stage import correct_ranges
 from railfix.pipeline.received import Received, correction_source
 from railfix.positioning.antenna_rows import AntennaRows
@@ -34,11 +37,14 @@ _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed positions: units of two-way ranges, a base station ("stream": by its headers), balises."""
+    """Surveyed positions: units of two-way ranges, a base station ("stream": by its headers), balises, and the features
+    of the line by antenna.
+    """
 
     units: GroundUnits | None = None
     base_ecef_m: Floats | Literal["stream"] | None = None
     balises: ListedBalises | None = None
+    features: Mapping[str, FeatureSearch] = MappingProxyType({})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from railfix.gnss.observations import Observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
 from railfix.ranges.channels import DFMC_SIGNALS, SECOND_SIGNALS, Channels, select_channels
-from railfix.ranges.second_codes import SecondCodes
+from railfix.ranges.corrected import SecondCodes
 
 
 def missing_notes(received: Received, config: Config, second: SecondCodes | None) -> tuple[str, ...]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
-from railfix.core.timescale import seconds
+from railfix.core.arrays import Floats, Integers
 from railfix.motion.features import (
     HALF_LENGTH_M,
+    SCALE_SIGMA,
     Feature,
     LineSeries,
     LocatedFeature,
@@ -18,13 +19,12 @@ from railfix.motion.features import (
     locate,
     map_features,
 )
+from railfix.pipeline.passed_features import SLOWEST_MPS, FeatureState, PassedFeature, RateSeries
 from railfix.track import Track
 from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Below this speed the rates are not used [m/s].
-SLOWEST_MPS: Final = 1.0
 #: Least number of whole metres, passed without a break, for a comparison with a feature.
 _LEAST_POINTS: Final = 30
 
@@ -58,49 +58,34 @@ class LineFeatures:
         return np.interp(antenna_m, self.antenna_m, self.body_m)
 
 
-def ahead_m(trajectory: Trajectory) -> float:
-    """Return the distance of an antenna ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
-    if trajectory.body_chainage_m is None:
-        return 0.0
-    return float(np.median(trajectory.chainage_m - trajectory.body_chainage_m))
+#: Minimum standard deviation of a feature's position: the map's, and the body's on its bogies [m].
+_FEATURE_SIGMA_M: Final = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class RateSeries:
-    """Changes of the body's heading and pitch, wheel distances and speeds at K ticks."""
+@dataclass(frozen=True)
+class TrackFeatures:
+    """Features of a track for the vehicle body with an antenna, computed when the first rates are given."""
 
-    #: Times of validity, and times at which the rates became known; shape (K,).
-    time: Datetimes
-    known: Datetimes
-    distance_m: Floats  #: Wheel distance since the tick before the first, in rising arc length; shape (K,).
-    arc_m: Floats  #: Antenna position by the wheel; NaN if unknown; shape (K,).
-    #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
-    turned_rad: Floats
-    climbed_rad: Floats
-    speed_mps: Floats  #: Speed in rising arc length, shape (K,).
-    rolls: Masks  #: True where the wheel rolls, shape (K,).
+    track: Track
+    trajectory: Trajectory
 
-    def arc_at(self, time: Datetimes) -> Floats:
-        """Return positions at times after the first tick, from the preceding tick [m]."""
-        last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
-        since = seconds(time - self.time[last])
-        return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
+    @cached_property
+    def line(self) -> LineFeatures:
+        """Features of the track."""
+        return LineFeatures.of(self.track, self.trajectory)
 
-
-@dataclass(frozen=True, kw_only=True)
-class FeatureState:
-    """State of the feature search after a chunk."""
-
-    distance_m: float = 0.0  #: Wheel distance at the last tick.
-    angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch at the last tick, from an arbitrary origin [rad].
-    #: Whole metres passed without a break, in the order of travel; shape (M,).
-    metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    #: Heading and pitch at each metre, shape (M,).
-    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
-    pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
-    #: Position of the last accepted feature, its standard deviation, and the wheel distance at the feature [m].
-    last: tuple[float, float, float] | None = None
-    done_m: float = float("nan")  #: Position up to which features have been compared; NaN before the first.
+    def locate(
+        self, rates: RateSeries, facing: float, sigma_m: float, state: FeatureState, *, noise: tuple[float, float]
+    ) -> tuple[tuple[PassedFeature, ...], FeatureState]:
+        """Return the accepted features that the train has passed, and the state (`feature_fixes`)."""
+        fixes, after = feature_fixes(rates, self.line, facing, sigma_m, state, noise=noise)
+        least = (SCALE_SIGMA * HALF_LENGTH_M) ** 2 + _FEATURE_SIGMA_M**2
+        found = (
+            PassedFeature(fix.tick, fix.correction_m, float(np.sqrt(fix.located.sigma_m**2 + least)))
+            for fix in fixes
+            if fix.located.verdict == "accepted"
+        )
+        return tuple(found), after
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from railfix.pipeline.sensor_epochs import SensorState
 from railfix.positioning.carrier import CycleSlipState
 from railfix.screens import FilteredMotion
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import Tracked, TrackState
+from railfix.tracking import GnssEpochs, SensorEpochs, Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
 
@@ -131,3 +131,23 @@ class AlongTrack(LineCoordinates, NotebookTable):
         """Return the medians of sigma and level in metres, as texts."""
         tracked = self.tracked
         return {"median sigma [m]": median_text(tracked.sigma_m), "median level [m]": median_text(tracked.level_m)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """Filter input for a piece of the run."""
+
+    epochs: GnssEpochs
+    sensors: SensorEpochs
+    before: TrackState | None  #: Filter state before these epochs.
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SmoothedTrack(NotebookTable):
+    """Positions of T epochs from all measurements before and after them."""
+
+    time: Datetimes  #: Shape (T,).
+    #: Shape (T,).
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats  #: Shape (T,).

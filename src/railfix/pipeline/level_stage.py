@@ -21,7 +21,7 @@ from railfix.integrity.protection import (
     availability,
     protection_level,
 )
-from railfix.integrity.protection.araim import AraimGeometry, AraimResult, IntegritySupport, araim_levels
+from railfix.integrity.protection.araim import AraimGeometry, AraimResult, SatelliteSupport, araim_levels
 from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
@@ -235,7 +235,7 @@ def compute_araim(
     corrected: CorrectedRanges,
     solution: Solution,
     antennas: AntennaRows,
-    support: IntegritySupport,
+    support: SatelliteSupport,
     config: Config,
 ) -> AraimResult:
     """Compute ARAIM levels of positions on the line, shape (T,).

@@ -12,7 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, copy_with, masked_median
+from railfix.core.array_functions import masked_median
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, copy_with
 from railfix.core.channel_state import join_channels
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds

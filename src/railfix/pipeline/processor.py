@@ -19,31 +19,33 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, copy_with
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.errors import SettingsError, check_type, warn_of
+from railfix.gnss.joined_observations import stack_observations
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import along_track, apply_spacing_verdict, single_epochs, with_passings
-from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.base_station_stage import BaseStation, Stations, check_base
 from railfix.pipeline.channel_book import ChannelBook, missing_notes
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import SCREEN_NAMES, Config
-from railfix.pipeline.feature_fixes import LineFeatures
-from railfix.pipeline.filter_result import AlongTrack, FilterState
+from railfix.pipeline.filter_result import AlongTrack, FilterState, Replay
 from railfix.pipeline.interference_stage import judge_interference, with_statuses
 from railfix.pipeline.level_stage import compute_araim
 from railfix.pipeline.position_stage import position_stage
 from railfix.pipeline.processor_state import AntennaState, State
-from railfix.pipeline.range_stage import Models, collect_conditions, correct_ranges
-from railfix.pipeline.received import correction_source, known_from_start, receive
+from railfix.pipeline.range_stage import Models, correct_ranges, error_model_notes
+from railfix.pipeline.received import (
+    MessageCorrections,
+    check_corrections,
+    correction_source,
+    known_from_start,
+    receive,
+)
 from railfix.pipeline.results import Result, antenna_results
 from railfix.pipeline.screen_stage import screen_antennas, screen_filtered, screen_pairs, screen_positions
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
-from railfix.pipeline.smoothed_track import Replay
-from railfix.positioning.antenna_rows import AntennaRows, stack_observations
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
-from railfix.ranges.error_model import condition_differences
-from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
     ObservationScreen,
@@ -55,7 +57,6 @@ from railfix.screens import (
     in_order,
 )
 from railfix.screens.pairs import pair_antennas
-from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
@@ -72,11 +73,10 @@ class EpochProcessor:
     navigation : Navigation, optional
         Navigation records known from the start; others may be given with each chunk. Without any, the first chunk must
         have some, otherwise `process` raises.
-    messages : SbasMessages, optional
-        SBAS messages known from the start. SBAS corrections are used once messages are given, here or with a chunk.
+    corrections : MessageCorrections, optional
+        SBAS corrections (`railfix.ranges.sbas.SbasState`) from the messages known from the start, required if and only
+        if ``config.sbas`` requests SBAS. Further messages may be given with each chunk.
     models : Models, optional
-    track : Track, optional
-        The line itself, for positions from its changes of gradient and curvature in the filter along the track.
     stations : Stations, optional
     screens : sequence of Screen, optional
         User-defined screens, used with their limits in addition to those of `config`; their verdicts are in
@@ -98,8 +98,8 @@ class EpochProcessor:
     Raises
     ------
     SettingsError
-        SBAS and precise ephemerides are combined, there is no SBAS message of the requested GEO, or an argument has a
-        wrong type.
+        SBAS is combined with precise ephemerides, or requested without `corrections` or the reverse, or an argument has
+        a wrong type.
     """
 
     def __init__(
@@ -108,9 +108,8 @@ class EpochProcessor:
         trajectories: Mapping[str, Trajectory],
         *,
         navigation: Navigation | None = None,
-        messages: SbasMessages | None = None,
+        corrections: MessageCorrections | None = None,
         models: Models | None = None,
-        track: Track | None = None,
         stations: Stations | None = None,
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
@@ -124,11 +123,11 @@ class EpochProcessor:
             check_type(trajectory, Trajectory, f"trajectory of antenna {name}")
         check_type(models, Models, "models")
         check_type(stations, Stations, "stations")
-        if track is not None:
-            check_type(track, Track, "track")
         for screen in screens:
             check_type(screen, Screen, "screens")
-        _check_received(navigation, messages)
+        if navigation is not None:
+            check_type(navigation, Navigation, "navigation")
+        check_corrections(config, corrections)
         if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
             raise ValueError("the antennas' trajectories have different map sigmas; they must be on one map")
         self.config = config
@@ -141,7 +140,7 @@ class EpochProcessor:
             )
             for name, trajectory in trajectories.items()
         }
-        self.received = known_from_start(config, navigation=navigation, messages=messages)
+        self.received = known_from_start(config, navigation=navigation, corrections=corrections)
         self._navigation_given = navigation is not None
         self._channels = ChannelBook(config)
         self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
@@ -159,8 +158,7 @@ class EpochProcessor:
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
             cn0_curve=models.cn0_curve,
         )
-        self._track, self.units, self.balises = track, stations.units, stations.balises
-        self._features: dict[str, LineFeatures] = {}
+        self.units, self.balises, self._features = stations.units, stations.balises, stations.features
         self._unasked: list[str] = []
         self._lacking = self._inactive_notes()
 
@@ -196,25 +194,10 @@ class EpochProcessor:
             if "screens" not in asked and screen.name not in asked:
                 self._unasked += inactive
         check_base(self.config, self._base)
-        conditions = None if self._error_model is None else self._error_model.conditions
-        if conditions and (differences := condition_differences(conditions, collect_conditions(self.config))):
-            notes.append(f"error model: its conditions differ from this run's: {'; '.join(differences)}")
-        faults = None if self._error_model is None else self._error_model.faults
-        if faults is not None and "side_upper" not in faults.model_fields_set:
-            notes.append(
-                "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is "
-                "missing; the file is of an earlier version, so make it again with railfix error-model"
-            )
+        notes += error_model_notes(self._error_model, self.config)
         if self.config.protection == "on" and self.config.carrier in ("float", "fixed"):
             notes.append("protection level: requested, but not available for positions from code and phase together")
         return tuple(notes)
-
-    def antenna_order(self) -> AntennaOrder | None:
-        """Return a new test of the order of two antennas; None without two antennas of one vehicle."""
-        if len(self.trajectories) < 2 or not self.setup.spacing_known:
-            return None
-        tolerance = self.config.antenna_pair.tag_tolerance_s
-        return AntennaOrder(self.trajectories["front"], self.trajectories["rear"], tolerance_s=tolerance)
 
     def process(
         self,
@@ -222,7 +205,7 @@ class EpochProcessor:
         state: State | None = None,
         *,
         navigation: Navigation | None = None,
-        messages: SbasMessages | None = None,
+        messages: Any = None,
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Result, State]:
@@ -240,7 +223,7 @@ class EpochProcessor:
             Records received since the previous chunk. If each record is given before the first epoch that uses it, the
             results equal those with all records given at the start.
         messages : SbasMessages, optional
-            SBAS messages received since the previous chunk.
+            SBAS messages received since the previous chunk, for processors with `corrections`.
         sensors : SensorSamples, optional
             On-board sensor samples since the previous chunk, for the filter along the track. For an antenna without
             observations in this chunk they are used with its next one.
@@ -270,7 +253,7 @@ class EpochProcessor:
         state: State | None = None,
         *,
         navigation: Navigation | None = None,
-        messages: SbasMessages | None = None,
+        messages: Any = None,
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Chunk, State]:
@@ -285,8 +268,9 @@ class EpochProcessor:
             raise SettingsError(f"no trajectory for antenna {', '.join(unknown)}")
         state = State() if state is None else state
         check_type(state, State, "state")
-        _check_received(navigation, messages)
-        for value, expected, what in ((sensors, SensorSamples, "sensors"), (base, Observations, "base")):
+        for value, expected, what in (
+            (navigation, Navigation, "navigation"), (sensors, SensorSamples, "sensors"), (base, Observations, "base"),
+        ):  # fmt: skip
             if value is not None:
                 check_type(value, expected, what)
         for name, part in observations.items():
@@ -391,7 +375,7 @@ class EpochProcessor:
                 take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
                 single_epochs(take_epochs(solution, rows), interference[name], self.config), self.lines[name],
                 self.config, state.fusion.get(name) or FilterState(), samples=sensors,
-                references=self._line_references(name, sensors),
+                references=self._line_references(name),
             )  # fmt: skip
 
         over_antennas = self._threads.map if len(chunk.names) > 1 else map
@@ -403,14 +387,10 @@ class EpochProcessor:
             for name, header in headers.items():
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))
 
-    def _line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
-        """Return ground units, balises, and features of the line; the features are computed if there is an inertial
-        unit.
-        """
-        wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
-        if wanted and self._track is not None and name not in self._features:
-            self._features[name] = LineFeatures.of(self._track, self.trajectories[name])
-        return LineReferences(features=self._features.get(name), units=self.units, balises=self.balises)
+    def _line_references(self, name: str) -> LineReferences:
+        """Return ground units, balises, and the features of the line where these are a source of the filter."""
+        features = self._features.get(name) if "feature" in self.config.filter_sources else None
+        return LineReferences(features=features, units=self.units, balises=self.balises)
 
     def _pair(self, time: Datetimes, near_arc_m: Floats, rows: Mapping[str, slice]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None without such antennas."""
@@ -421,13 +401,6 @@ class EpochProcessor:
             time[front], time[rear], near_arc_m[front], self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )  # fmt: skip
-
-
-def _check_received(navigation: Navigation | None, messages: SbasMessages | None) -> None:
-    """Raise SettingsError if navigation records or SBAS messages have a wrong type."""
-    for value, expected, what in ((navigation, Navigation, "navigation"), (messages, SbasMessages, "messages")):
-        if value is not None:
-            check_type(value, expected, what)
 
 
 def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> None:

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks, copy_with
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
-from railfix.integrity.protection.araim import IntegritySupport
+from railfix.integrity.protection.araim import SatelliteSupport
 from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.approximate import ANCHOR_SIGMA_M, ApproximatePosition, approximate_position
 from railfix.positioning.range_arrays import Ranges, weighted_ranges
 from railfix.ranges.channels import Channels
-from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
-from railfix.ranges.error_model import Conditions, ErrorModel
+from railfix.ranges.error_conditions import Conditions, condition_differences
+from railfix.ranges.second_codes import find_second_codes
 from railfix.ranges.sources import CorrectionSource
 from railfix.screens import Verdict, suspicion_sigma_m
+from railfix.screens.base import OpenSkyCn0
+
+
+class RangeErrorModel(Protocol):
+    """Overbound of range errors by direction and C/N0 (`railfix.ranges.error_model.ErrorModel`)."""
+
+    @property
+    def covers(self) -> Literal["local", "satellite_and_atmosphere"]:
+        """Whether the model covers local errors alone, or satellite and atmospheric errors as well."""
+
+    @property
+    def conditions(self) -> Conditions | None:
+        """Settings under which the model is valid; None if unknown."""
+
+    def at(self, elevation_deg: Floats, relative_azimuth_deg: Floats, cn0_dbhz: Floats) -> tuple[Floats, Floats]:
+        """Return the overbounding sigma and bias of observations, shape (T, K) [m]; NaN without a value."""
+
+    def missing_parts(self) -> tuple[str, ...]:
+        """Return one sentence for each part that the file of an earlier version lacks."""
 
 
 class Models(NamedTuple):
     """Measured models: error model, C/N0 curve, and integrity support message of ARAIM levels."""
 
-    error_model: ErrorModel | None = None
-    cn0_curve: Cn0Curve | None = None
-    support: IntegritySupport | None = None
+    error_model: RangeErrorModel | None = None
+    cn0_curve: OpenSkyCn0 | None = None
+    support: SatelliteSupport | None = None
 
 
 def correct_ranges(
@@ -37,7 +56,7 @@ def correct_ranges(
     source: CorrectionSource,
     antennas: AntennaRows,
     *,
-    error_model: ErrorModel | None = None,
+    error_model: RangeErrorModel | None = None,
 ) -> tuple[CorrectedRanges, ApproximatePosition]:
     """Return corrected ranges of a chunk, and approximate antenna positions.
 
@@ -48,7 +67,7 @@ def correct_ranges(
         raw_ranges(obs, channels, satellites), antennas, limits=config.single_point, section=config.section
     )
     corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, gross=near.gross, noise=config.noise)
-    corrected = copy_with(corrected, unsure=near.unsure)
+    corrected = find_second_codes(copy_with(corrected, unsure=near.unsure), source, config.noise)
     if error_model is not None:
         corrected = _apply_error_model(error_model, corrected, antennas, near.arc_m, config)
     return corrected, near
@@ -87,7 +106,7 @@ def apply_verdict(corrected: CorrectedRanges, verdict: Verdict) -> CorrectedRang
 
 
 def _apply_error_model(
-    model: ErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
+    model: RangeErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
 ) -> CorrectedRanges:
     """Return the ranges with overbounding sigma and bias by an error model; unbounded ranges are rejected."""
     front_deg = antennas.each(lambda index, rows: index.trajectory.body_azimuth_deg(arc_m[rows]))
@@ -99,6 +118,16 @@ def _apply_error_model(
         corrected, bound_sigma_m=bound, bias_m=np.nan_to_num(bias),
         reason=np.where(unbounded, int(Reason.NO_CORRECTION), corrected.reason),
     )  # fmt: skip
+
+
+def error_model_notes(model: RangeErrorModel | None, config: Config) -> tuple[str, ...]:
+    """Return sentences on an error model whose conditions differ from the run's, or that lacks a part."""
+    if model is None:
+        return ()
+    notes, own = model.missing_parts(), collect_conditions(config)
+    if model.conditions is not None and (differences := condition_differences(model.conditions, own)):
+        return (f"error model: its conditions differ from this run's: {'; '.join(differences)}", *notes)
+    return notes
 
 
 def collect_conditions(config: Config) -> Conditions:

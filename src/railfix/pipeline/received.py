@@ -1,9 +1,9 @@
-"""Navigation records and SBAS messages received so far, and their corrections."""
+"""Navigation records and corrections received so far."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -15,8 +15,6 @@ from railfix.gnss.orbits.prepared_records import VALIDITY_S, validity_s
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.pipeline.config import Config
 from railfix.ranges.base_station import BaseErrors, BaseStationSource
-from railfix.ranges.sbas import DfmcService, SbasCorrections, SbasMessages, SbasState
-from railfix.ranges.sbas.sbas_sources import DfmcSource, SbasSource
 from railfix.ranges.sources import BroadcastSource, CorrectionSource, choose_ionosphere
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
@@ -51,23 +49,46 @@ def no_navigation() -> Navigation:
     return Navigation(kepler=_no_records(KeplerRecords), glonass=_no_records(GlonassRecords))
 
 
+class MessageCorrections(Protocol):
+    """Corrections from messages that are received during a run, as SBAS messages are; a value, which never changes.
+
+    `railfix.ranges.sbas.SbasState` is the one of SBAS.
+    """
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One sentence on each correction that was requested and used, and on the messages of a recorded log."""
+
+    @property
+    def dual_frequency(self) -> bool:
+        """Whether ionosphere-free codes are corrected; otherwise codes on one frequency are."""
+
+    @property
+    def span(self) -> tuple[np.datetime64, np.datetime64]:
+        """Reception of the first and the last message; NaT without messages."""
+
+    def add_messages(self, messages: Any) -> Self:
+        """Return the corrections with further messages; TypeError or SettingsError if they are of another kind."""
+
+    def drop_before(self, time: np.datetime64) -> Self:
+        """Return the corrections without the messages that no epoch from `time` on can use."""
+
+    def source(self, models: BroadcastSource) -> CorrectionSource:
+        """Return the source of corrections from the messages and from the navigation records of `models`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Received:
     """Data received in addition to the observations, up to the current epoch."""
 
     navigation: Navigation = field(default_factory=no_navigation)
-    messages: SbasState | None = None  #: SBAS messages of the GEO in use; None without SBAS.
+    corrections: MessageCorrections | None = None  #: Corrections from SBAS messages; None without SBAS.
     #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
     klobuchar: Floats | None = None
     #: Standard deviation of the vertical delay if typical coefficients replace broadcast ones, otherwise 0.
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()  #: One sentence on each replacement of requested data.
     base: BaseErrors | None = None  #: Range errors measured by a base station.
-
-    @property
-    def sbas(self) -> SbasCorrections | DfmcService | None:
-        """Corrections from the SBAS messages; None without SBAS."""
-        return None if self.messages is None else self.messages.corrections
 
 
 def broadcast_source(received: Received, config: Config) -> BroadcastSource:
@@ -81,11 +102,7 @@ def broadcast_source(received: Received, config: Config) -> BroadcastSource:
 def correction_source(received: Received, config: Config) -> CorrectionSource:
     """Return the source of corrections from the received data."""
     models = broadcast_source(received, config)
-    source: CorrectionSource = models
-    if isinstance(received.sbas, DfmcService):
-        source = DfmcSource(models=models, service=received.sbas)
-    elif received.sbas is not None:
-        source = SbasSource(navigation=received.navigation, corrections=received.sbas)
+    source = models if received.corrections is None else received.corrections.source(models)
     return with_base_station(source, received, config)
 
 
@@ -99,23 +116,26 @@ def with_base_station(source: CorrectionSource, received: Received, config: Conf
 
 
 def known_from_start(
-    config: Config, *, navigation: Navigation | None = None, messages: SbasMessages | None = None
+    config: Config, *, navigation: Navigation | None = None, corrections: MessageCorrections | None = None
 ) -> Received:
     """Return the data known before the first epoch: all data when reading files, none on a running train.
 
-    In recorded messages the GEO is chosen if the settings request the best. SettingsError: SBAS and precise ephemerides
-    together, or no message of the requested GEO.
+    SettingsError: SBAS and precise ephemerides together.
     """
-    received = Received(navigation=navigation or no_navigation())
-    if messages is None and config.sbas == "stream":
-        return _with_notes(replace(received, messages=_empty_state(config)), config)
-    if messages is None:
-        return _with_notes(received, config)
-    try:
-        state = SbasState.from_log(messages, prn=config.sbas_prn, limits=config.sbas_limits, band=config.sbas_band)
-    except ValueError as error:
-        raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
-    return _with_notes(replace(received, messages=state), config)
+    return _with_notes(Received(navigation=navigation or no_navigation(), corrections=corrections), config)
+
+
+def check_corrections(config: Config, corrections: MessageCorrections | None) -> None:
+    """Raise SettingsError if corrections were given, but not requested, or the reverse, or for other frequencies."""
+    if bool(config.sbas) != (corrections is not None):
+        given, state = "not given" if corrections is None else "given", "on" if config.sbas else "off"
+        raise SettingsError(
+            f"SBAS is {state} in the settings (sbas), but its corrections were {given}; give both: "
+            "Config(sbas='stream', sbas_prn=137), EpochProcessor(..., corrections=SbasState(prn=137))"
+        )
+    if corrections is not None and corrections.dual_frequency != config.dual_frequency_sbas:
+        used = "L5" if corrections.dual_frequency else "L1"
+        raise SettingsError(f"sbas_band = {config.sbas_band}, but the corrections are of SBAS on {used}; give the same")
 
 
 def receive(
@@ -124,15 +144,15 @@ def receive(
     time: np.datetime64,
     *,
     navigation: Navigation | None = None,
-    messages: SbasMessages | None = None,
+    messages: Any = None,
 ) -> Received:
-    """Return the received data after new navigation records and SBAS messages; `before` if there are none.
+    """Return the received data after new navigation records and messages with corrections; `before` without any.
 
-    `time` is the time of the next epoch, NaT if unknown. SBAS messages that no epoch from `time` on can use are
+    `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are
     dropped, and so are repeated and expired records, except for a satellite's newest record. Newer coefficients and
     precise ephemerides replace the older ones. Without any message so far, every satellite is rejected until the
-    corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages while the settings leave
-    the GEO open.
+    corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages of another kind than the
+    corrections, or without corrections to which they are added.
     """
     if navigation is None and messages is None:
         return before
@@ -141,31 +161,23 @@ def receive(
         merged = merge_navigation(before.navigation, plausible_navigation(navigation))
         after = replace(before, navigation=_current(merged, time))
     if messages is not None:
-        state = before.messages
-        if state is None:
-            state = _empty_state(config)
-        state = state.add_messages(messages)
-        state = state if np.isnat(time) else state.drop_before(time)
-        after = replace(after, messages=state)
+        if before.corrections is None:
+            raise SettingsError(
+                "messages were given, but SBAS is off: Config(sbas='stream', sbas_prn=137), "
+                "EpochProcessor(..., corrections=SbasState(prn=137))"
+            )
+        corrections = before.corrections.add_messages(messages)
+        after = replace(after, corrections=corrections if np.isnat(time) else corrections.drop_before(time))
     return _with_notes(after, config)
-
-
-def _empty_state(config: Config) -> SbasState:
-    """Return the SBAS corrections before the first message."""
-    if config.sbas_prn == "best":
-        raise SettingsError(
-            "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN (sbas_prn = 137)"
-        )
-    return SbasState(prn=config.sbas_prn, limits=config.sbas_limits, band=config.sbas_band)
 
 
 def _with_notes(received: Received, config: Config) -> Received:
     """Return the data with the ionospheric coefficients in use and notes on replacements of requested data."""
-    messages = received.messages
-    if messages is not None and received.navigation.precise is not None:
+    corrections = received.corrections
+    if corrections is not None and received.navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
     received = _with_ionosphere(received, config)
-    return received if messages is None else replace(received, notes=(*received.notes, *messages.notes))
+    return received if corrections is None else replace(received, notes=(*received.notes, *corrections.notes))
 
 
 def _current(navigation: Navigation, time: np.datetime64) -> Navigation:
@@ -214,14 +226,15 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 
 def _with_ionosphere(received: Received, config: Config) -> Received:
     """Return the data with the Klobuchar coefficients in use, and notes if these are not the requested ones."""
-    if isinstance(received.sbas, DfmcService):  # the model helps the screens, and cancels in the combination
-        modelled = _with_ionosphere(replace(received, messages=None), config)
+    if received.corrections is not None and received.corrections.dual_frequency:
+        # the model helps the screens, and cancels in the combination
+        modelled = _with_ionosphere(replace(received, corrections=None), config)
         note = (
             f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} requested, ionosphere-free codes used "
             f"instead; troposphere: {config.troposphere} requested, SBAS model used"
         )
-        return replace(modelled, messages=received.messages, notes=(note,))
-    if received.sbas is not None:
+        return replace(modelled, corrections=received.corrections, notes=(note,))
+    if received.corrections is not None:
         asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
         note = f"{asked} requested, SBAS models used instead"
         return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=(note,))

@@ -25,7 +25,7 @@ from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.two_frequencies import Combined
-from railfix.ranges.second_codes import SecondCodes
+from railfix.ranges.corrected import SecondCodes
 from railfix.screens import SCREENS, ScreenColumn
 from railfix.tracking import Kind
 

@@ -15,11 +15,12 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import check_type
-from railfix.core.reasons import Reason, reason_text
+from railfix.core.reason_names import reason_text
+from railfix.core.reasons import Reason
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.balises import VERDICTS, Passing
-from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
     EPOCH,
@@ -36,7 +37,6 @@ from railfix.pipeline.result_columns import (
 )
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
-from railfix.pipeline.smoothed_track import SmoothedTrack
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus
 

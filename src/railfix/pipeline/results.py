@@ -16,10 +16,9 @@ from railfix.integrity.interference import Sign, WheelSigns
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.coordinates import LineCoordinates
-from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.filter_result import AlongTrack, Replay
 from railfix.pipeline.interference_stage import Interference, with_statuses
 from railfix.pipeline.level_stage import apply_verdicts
-from railfix.pipeline.smoothed_track import Replay
 from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.corrected import CorrectedRanges

@@ -32,7 +32,7 @@ from railfix.motion.tachometer import (
     pulse_acceleration,
     pulse_speeds,
 )
-from railfix.pipeline.feature_fixes import SLOWEST_MPS, RateSeries
+from railfix.pipeline.passed_features import SLOWEST_MPS, RateSeries
 from railfix.track.trajectory import Trajectory
 
 #: Sample spacing of the slip detection; samples are at its multiples in GPS time [ns].

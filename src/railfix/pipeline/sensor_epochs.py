@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
 
@@ -12,7 +12,6 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Masks, copy_with
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
-from railfix.motion.features import HALF_LENGTH_M, SCALE_SIGMA
 from railfix.motion.samples import (
     BaliseReadings,
     GroundUnits,
@@ -26,7 +25,7 @@ from railfix.motion.samples import (
 from railfix.motion.slip import MotionState, SlipLimits
 from railfix.motion.tachometer import LEAST_SPEED_MPS, TachometerLimits, distance_m, faults_until, window_start
 from railfix.pipeline.balises import BaliseLimits, BaliseState, balise_epochs
-from railfix.pipeline.feature_fixes import FeatureFix, FeatureState, LineFeatures, RateSeries, ahead_m, feature_fixes
+from railfix.pipeline.passed_features import FeatureSearch, FeatureState, PassedFeature, RateSeries, ahead_m
 from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import RangeEpochs, SensorEpochs
@@ -43,8 +42,6 @@ _CURVATURE_NOISE_1PM: Final = 1e-4
 #: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: with
 #: a map of 0.3 m features are located to no better than some metres, with one of 0.05 m to half a metre.
 _MAP_LENGTH_M: Final = 50.0
-#: Minimum standard deviation of a feature's position: the map's, and the body's on its bogies [m].
-_FEATURE_SIGMA_M: Final = 0.5
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
 
@@ -53,7 +50,7 @@ Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, Sta
 class LineReferences:
     """References of the sensor measurements."""
 
-    features: LineFeatures | None = None
+    features: FeatureSearch | None = None
     units: GroundUnits | None = None
     balises: ListedBalises | None = None
 
@@ -170,8 +167,8 @@ def sensor_epochs(
         )
         if rates is not None and references is not None and references.features is not None:
             noise = _with_map(trajectory)
-            fixes, passing = feature_fixes(rates, references.features, facing, motion.sigma_m, passing, noise=noise)
-            values |= _places(fixes, rates, time)
+            passed, passing = references.features.locate(rates, facing, motion.sigma_m, passing, noise=noise)
+            values |= _places(passed, rates, time)
     if wheel:
         values |= _wheel_values(pulses, edges, sensed, limits, known=~_silent("tachometer", samples, len(time)))
     if len(radar) and "radar" in sources:
@@ -251,16 +248,13 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     return float(np.hypot(_GRADIENT_NOISE, gradient)), float(np.hypot(_CURVATURE_NOISE_1PM, curvature))
 
 
-def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
-    """Return the antenna positions from accepted features, at the first epoch after each."""
+def _places(passed: Iterable[PassedFeature], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
+    """Return the antenna positions from passed features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
-    for fix in fixes:
-        if fix.located.verdict == "accepted":
-            epoch = int(np.searchsorted(time, rates.known[fix.tick]))
-            place[epoch] = at[epoch] + fix.correction_m
-            since = SCALE_SIGMA * HALF_LENGTH_M
-            sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + _FEATURE_SIGMA_M**2)
+    for feature in passed:
+        epoch = int(np.searchsorted(time, rates.known[feature.tick]))
+        place[epoch], sigma[epoch] = at[epoch] + feature.correction_m, feature.sigma_m
     return {"place_m": place, "place_sigma_m": sigma}
 
 

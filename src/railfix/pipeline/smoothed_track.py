@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, join_rows
-from railfix.core.notebook import NotebookTable
+from railfix.core.arrays import join_rows
+from railfix.pipeline.filter_result import Replay, SmoothedTrack
 from railfix.tracking import (
     BackwardInformation,
     GnssEpochs,
@@ -24,26 +24,6 @@ from railfix.tracking import (
 
 #: Epochs whose covariances are in memory at a time.
 _EPOCHS: Final = 300
-
-
-@dataclass(frozen=True, kw_only=True)
-class Replay:
-    """Filter input for a piece of the run."""
-
-    epochs: GnssEpochs
-    sensors: SensorEpochs
-    before: TrackState | None  #: Filter state before these epochs.
-
-
-@dataclass(frozen=True, kw_only=True, repr=False)
-class SmoothedTrack(NotebookTable):
-    """Positions of T epochs from all measurements before and after them."""
-
-    time: Datetimes  #: Shape (T,).
-    #: Shape (T,).
-    arc_m: Floats
-    sigma_m: Floats
-    speed_mps: Floats  #: Shape (T,).
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:

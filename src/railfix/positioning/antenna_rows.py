@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
 from typing import Any, TypeVar
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.epoch_rows import EVERY, join_epochs
-from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.search_index import SearchIndex
 from railfix.track.trajectory import Trajectory
 
@@ -95,18 +93,3 @@ class AntennaRows:
 
 #: Line of a stage: the trajectory of one antenna, its search index, or the rows of several antennas.
 Line = Trajectory | SearchIndex | AntennaRows
-
-
-def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
-    """Return the observations of several antennas stacked as rows, with all channels, and the rows of each antenna."""
-    first, *others = observations
-    if not others:
-        return first, (EVERY,)
-    ends = [0, *accumulate(map(len, observations))]
-    keys = {
-        (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
-        for each in observations
-    }
-    same = len(keys) == 1  # the same channels in the same order, and the same GLONASS frequencies
-    stacked = join_epochs(observations) if same else stack_parts(observations)
-    return stacked, tuple(slice(a, b) for a, b in pairwise(ends))

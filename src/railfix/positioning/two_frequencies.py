@@ -24,7 +24,7 @@ from railfix.core.epoch_rows import EVERY
 from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.positioning.noise_windows import correlated_sums
-from railfix.ranges.second_codes import SecondCodes
+from railfix.ranges.corrected import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
 _FIRST_SAMPLES: Final = 2.0  #: Number of prior samples, whose noise is the noise assumed by the weights.

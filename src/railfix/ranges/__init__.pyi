@@ -3,10 +3,17 @@
 from .base_station import BaseErrors, BaseLimits, BaseStationSource
 from .channels import DEFAULT_SIGNALS, SECOND_SIGNALS, Channels, select_channels
 from .cn0_curve import Cn0Curve
-from .corrected import AntennaRanges, CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
+from .corrected import (
+    AntennaRanges,
+    CorrectedRanges,
+    SatelliteRanges,
+    SecondCodes,
+    corrected_ranges,
+    find_satellites,
+)
 from .range_sigma import CodeNoise, NominalErrors, code_sigma_m
 from .sbas.sbas_sources import DfmcSource, SbasSource
-from .second_codes import SecondCodes
+from .second_codes import find_second_codes
 from .sources import BroadcastSource, CorrectionSource, SourceDelays, SourceSatellites
 
 __all__ = [
@@ -32,5 +39,6 @@ __all__ = [
     "code_sigma_m",
     "corrected_ranges",
     "find_satellites",
+    "find_second_codes",
     "select_channels",
 ]

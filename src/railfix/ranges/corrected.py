@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.epoch_rows import OnDemand
 from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
@@ -17,7 +17,6 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.atmosphere import SeenFrom
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
-from railfix.ranges.second_codes import SecondCodes, second_codes
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
 
 #: Least and largest distance of navigation satellites from the centre of the Earth [m].
@@ -49,6 +48,22 @@ class AntennaRanges(NotebookTable):
     reason: Bits  #: `reasons.Reason` bits of the reasons found so far, 0 if usable; shape (T, K).
 
 
+@dataclass(frozen=True, kw_only=True)
+class SecondCodes:
+    """Second codes of satellites: T epochs by K channels of the first codes."""
+
+    code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
+    noise_m: Floats  #: Standard deviation of noise and multipath assumed by the weights, shape (T, K).
+    cn0_dbhz: Floats  #: Shape (T, K).
+    group_delay_m: Floats  #: Group delay subtracted from the code, shape (T, K).
+    #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
+    #: shape (T, K).
+    delay_sigma_m: Floats
+    ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
+    pair: Integers  #: Index of satellite and signals in `Channels.pair_names`, shape (T, K).
+    column: Integers  #: Column of the observations, -1 where missing; shape (T, K).
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class CorrectedRanges(AntennaRanges, OnDemand):
     """Corrected pseudoranges before positioning: T epochs by the K channels of `select_channels`."""
@@ -68,7 +83,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     bias_m: Floats
     #: Epochs with a gross error that cannot be identified, not used for noise and map estimates; shape (T,).
     unsure: Masks
-    second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
+    second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`), where they are used.
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
 
     @property
@@ -182,13 +197,8 @@ def corrected_ranges(
     observed = (reason & int(Reason.NOT_OBSERVED)) == 0
     seen = SeenFrom.of(near, states.position_ecef_m)
     given = source.delays(time, channels, satellites.source, seen)
-    delays, second = given.delays, None
+    delays = given.delays
     reason = np.where(observed, reason | delays.reason, reason)
-    if channels.second.size and source.second != "none":
-        second = second_codes(observations, channels, states, source.navigation, seen.elevation_deg, delays, noise)
-    if source.second == "required":
-        alone = np.isnan(second.code_m) if second is not None else np.ones(code.shape, dtype=bool)
-        reason = np.where((reason == 0) & alone, reason | int(Reason.SBAS_NO_IONOSPHERE), reason)
     clean = code + states.clock_m - states.group_delay_m
     if satellites.source.fast_m is not None:
         clean = clean + satellites.source.fast_m
@@ -206,7 +216,7 @@ def corrected_ranges(
         elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg, ionosphere_m=delays.ionosphere_m,
         troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma, nominal_m=given.nominal_m,
         nominal_elevation_sigma_m=given.nominal_elevation_sigma_m, bound_sigma_m=none, bias_m=none,
-        unsure=np.zeros(len(time), dtype=np.bool_), second=second, base=given.base,
+        unsure=np.zeros(len(time), dtype=np.bool_), base=given.base,
         reason=np.where(lacking, int(Reason.NO_CORRECTION), reason),
     )  # fmt: skip
 

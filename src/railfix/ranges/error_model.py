@@ -6,7 +6,6 @@ one array of numbers per column, in the order of elevation, then sector, then C/
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Final, Literal
 
@@ -19,58 +18,19 @@ from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings, option
 from railfix.core.settings_files import read_model_file, write_toml
 from railfix.core.staged_files import FilePath
+from railfix.ranges.error_conditions import Conditions
 
 __all__ = [
     "LARGEST_PRIOR",
     "POOLED",
     "BinStatistics",
-    "Conditions",
     "ErrorBins",
     "ErrorModel",
     "ErrorModelSource",
     "FaultRate",
-    "condition_differences",
     "read_error_model",
     "write_error_model",
 ]
-
-
-class Conditions(Settings):
-    """Settings of a run that affect the errors of its corrected pseudoranges."""
-
-    systems: tuple[str, ...]  #: Letters of the constellations.
-    signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
-    screens: tuple[str, ...]  #: Active screens.
-    elevation_mask_deg: float = Field(ge=0.0, lt=90.0)
-    codes: Literal["raw", "smoothed"]  #: Raw pseudoranges, or carrier-smoothed pseudoranges.
-    #: Delay models: "klobuchar", "saastamoinen", "off", or "sbas".
-    ionosphere: Literal["klobuchar", "off", "sbas"]
-    troposphere: Literal["saastamoinen", "off", "sbas"]
-
-
-def condition_differences(
-    first: Conditions, second: Conditions, *, names: tuple[str, str] = ("model", "run")
-) -> tuple[str, ...]:
-    """Return one text for each field in which two conditions differ: "codes: model raw, run smoothed".
-
-    The order of screens and constellations does not matter; the order of signals, which is a preference, does.
-    """
-    differences = []
-    for name in Conditions.model_fields:
-        values = [getattr(conditions, name) for conditions in (first, second)]
-        compared = [sorted(value) if name in ("systems", "screens") else value for value in values]
-        if compared[0] != compared[1]:
-            texts = (f"{name} {_text(value)}" for name, value in zip(names, values, strict=True))
-            differences.append(f"{name.removesuffix('_deg').replace('_', ' ')}: {', '.join(texts)}")
-    return tuple(differences)
-
-
-def _text(value: object) -> str:
-    if isinstance(value, Mapping):
-        return " ".join(f"{key}:{'/'.join(part)}" for key, part in sorted(value.items())) or "none"
-    if isinstance(value, tuple):
-        return " ".join(value) or "none"
-    return f"{value:g} deg" if isinstance(value, float) else str(value)
 
 
 #: Sets of samples from which the statistics of a bin can be computed, from its own samples to the samples of all bins.
@@ -220,6 +180,15 @@ class ErrorModel:
         inside, safe = index >= 0, np.maximum(index, 0)
         sigma = np.where(inside, self.after.bound_sigma_m.ravel()[safe], np.nan)
         return sigma, np.where(inside, self.after.bound_bias_m.ravel()[safe], np.nan)
+
+    def missing_parts(self) -> tuple[str, ...]:
+        """Return one sentence for each part that the file of an earlier version lacks."""
+        if self.faults is None or "side_upper" in self.faults.model_fields_set:
+            return ()
+        return (
+            "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is "
+            "missing; the file is of an earlier version, so make it again with railfix error-model",
+        )
 
 
 FORMAT: Final = "railfix error model 2"

@@ -3,56 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.arrays import Floats, Indices, Masks, copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates
 from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
-from railfix.ranges.atmosphere import Delays
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels
+from railfix.ranges.corrected import CorrectedRanges, SecondCodes
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
+from railfix.ranges.sources import CorrectionSource
 
 
-@dataclass(frozen=True, kw_only=True)
-class SecondCodes:
-    """Second codes of satellites: T epochs by K channels of the first codes."""
-
-    code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
-    noise_m: Floats  #: Standard deviation of noise and multipath assumed by the weights, shape (T, K).
-    cn0_dbhz: Floats  #: Shape (T, K).
-    group_delay_m: Floats  #: Group delay subtracted from the code, shape (T, K).
-    #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
-    #: shape (T, K).
-    delay_sigma_m: Floats
-    ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
-    pair: Integers  #: Index of satellite and signals in `Channels.pair_names`, shape (T, K).
-    column: Integers  #: Column of the observations, -1 where missing; shape (T, K).
-
-
-def second_codes(
-    obs: Observations,
-    channels: Channels,
-    states: SatelliteStates,
-    navigation: Navigation,
-    elevation_deg: Floats,
-    delays: Delays,
-    noise: CodeNoise,
-) -> SecondCodes | None:
-    """Return the second code of each satellite, corrected like the first code; None if no channel has a second code.
+def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, noise: CodeNoise) -> CorrectedRanges:
+    """Return the ranges with the second code of each satellite, corrected like the first code; unchanged without any.
 
     The second code is the first signal, in order of preference, that is observed, healthy and has a group delay.
     Satellite position and clock are the same as for the first code, and the group delay is from the same record; where
-    the record lacks a part of the group delay, another message of the satellite is used.
+    the record lacks a part of the group delay, another message of the satellite is used. Where `source` requires second codes, satellites
+    without one have the reason `sbas_no_ionosphere`.
     """
+    channels = corrected.channels
+    second = _correct_second_codes(corrected, source.navigation, noise) if channels.second.size else None
+    if source.second == "required":
+        alone = np.isnan(second.code_m) if second is not None else np.ones(corrected.reason.shape, dtype=bool)
+        reason = np.where((corrected.reason == 0) & alone, int(Reason.SBAS_NO_IONOSPHERE), corrected.reason)
+        corrected = copy_with(corrected, reason=reason)
+    return corrected if source.second == "none" else copy_with(corrected, second=second)
+
+
+def _correct_second_codes(corrected: CorrectedRanges, navigation: Navigation, noise: CodeNoise) -> SecondCodes:
+    """Return the second code of each satellite, corrected like the first code."""
+    obs, channels, states = corrected.observations, corrected.channels, corrected.satellites
     second = channels.second
-    if not second.size:
-        return None
     shape = states.record.shape
     code, cn0, delay_m, delay_sigma = np.full((4, *shape), np.nan)
     column, rank = np.full(shape, -1), np.zeros(shape, dtype=np.intp)
@@ -68,9 +55,9 @@ def second_codes(
         column, rank = np.where(here, at, column), np.where(here, choice, rank)
     channel = np.arange(shape[1])
     ratio = channels.second_ratio[channel, rank]
-    sigma = code_sigma_m(cn0, elevation_deg, noise=noise.replaced(floor_sigma_m=0.0))
+    sigma = code_sigma_m(cn0, corrected.elevation_deg, noise=noise.replaced(floor_sigma_m=0.0))
     return SecondCodes(
-        code_m=code + states.clock_m - ratio * delays.ionosphere_m - delays.troposphere_m,
+        code_m=code + states.clock_m - ratio * corrected.ionosphere_m - corrected.troposphere_m,
         noise_m=sigma * channels.second_noise[channel, rank],
         cn0_dbhz=cn0,
         group_delay_m=delay_m,

@@ -17,7 +17,8 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
-from railfix.core.timescale import nearest_rows, seconds
+from railfix.core.nearest_times import nearest_rows
+from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed

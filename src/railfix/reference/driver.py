@@ -18,7 +18,7 @@ from pydantic import Field
 from railfix import __version__
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.settings import Settings, option
-from railfix.gnss.observations import concatenate
+from railfix.gnss.joined_observations import concatenate
 from railfix.io.logs import read_navigation
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions

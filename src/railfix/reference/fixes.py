@@ -11,13 +11,16 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, cheapest_path
+from railfix.core.array_functions import cheapest_path
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.geodesy import sigma_along
+from railfix.core.nearest_times import nearest_rows
 from railfix.core.settings import Settings, option
-from railfix.core.timescale import nearest_rows, seconds
+from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.positioning.doppler_speed import DopplerSpeedLimits
-from railfix.track.trajectory import Trajectory, find_segments_near
+from railfix.track.passes import find_segments_near
+from railfix.track.trajectory import Trajectory
 
 
 def _positive(default: float) -> Any:

@@ -15,7 +15,8 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from railfix.core.arrays import Datetimes, Floats, Indices, places_in_groups
-from railfix.core.timescale import nearest_rows, seconds, timedelta
+from railfix.core.nearest_times import nearest_rows
+from railfix.core.timescale import seconds, timedelta
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.singer import singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings

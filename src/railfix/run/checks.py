@@ -13,8 +13,8 @@ from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.motion.samples import SensorSamples
+from railfix.pipeline.received import MessageCorrections
 from railfix.ranges.base_station import LONGEST_AGE_S, LONGEST_KM
-from railfix.ranges.sbas import DfmcService, SbasCorrections
 from railfix.run.processor_setup import BaseLog
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally, Tally
@@ -118,13 +118,13 @@ def check_same_time(tally: Tally) -> None:
         raise MismatchError(f"{spans_text} (GPS time), expected logs of one run; give logs that overlap")
 
 
-def check_sbas_time(sbas: SbasCorrections | DfmcService | None, tally: Tally) -> None:
+def check_sbas_time(corrections: MessageCorrections | None, tally: Tally) -> None:
     """Raise MismatchError if the SBAS messages and a log have no common time."""
     for name, span in _spans(tally).items():
-        if sbas is not None and spans_apart(span, sbas.span):
+        if corrections is not None and spans_apart(span, corrections.span):
             raise MismatchError(
-                f"the SBAS messages of {_period(*sbas.span)} and the {name} log of {_period(*span)} (GPS time) have no "
-                "time in common; give the SBAS messages of the day of the log"
+                f"the SBAS messages of {_period(*corrections.span)} and the {name} log of {_period(*span)} (GPS time) "
+                "have no time in common; give the SBAS messages of the day of the log"
             )
 
 
@@ -163,7 +163,7 @@ def check_whole_run(
     navigation: Navigation,
     tally: Tally,
     *,
-    sbas: SbasCorrections | DfmcService | None = None,
+    corrections: MessageCorrections | None = None,
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> None:
@@ -174,7 +174,7 @@ def check_whole_run(
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)
     check_same_place(tally)
-    check_sbas_time(sbas, tally)
+    check_sbas_time(corrections, tally)
     if sensors is not None:
         check_sensor_time(sensors, tally)
     check_positions(tally, causes or {})

@@ -18,7 +18,8 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix import __version__
-from railfix.core.errors import NoPositionError, OutputError, needs_extra
+from railfix.core.errors import NoPositionError, OutputError
+from railfix.core.extras import needs_extra
 from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 from railfix.gnss.observations import ObservationHeader
@@ -30,7 +31,7 @@ from railfix.io.rinex.navigation_writer import with_written_messages
 from railfix.run.inputs import LogReading
 from railfix.run.output import OutputFolder, Overwrite, check_output_file
 from railfix.track import Track
-from railfix.track.track import section_spans
+from railfix.track.quality import section_spans
 from railfix.tracking import TrackStatus
 
 

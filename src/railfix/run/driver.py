@@ -22,6 +22,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
@@ -119,7 +120,7 @@ def run_files(
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
-        check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors, causes=causes)
+        check_whole_run(navigation, tally, corrections=processor.received.corrections, sensors=sensors, causes=causes)
         if base is not None:
             check_base(base, tally, line.trajectories)
         notes = (
@@ -224,7 +225,11 @@ def _position(
     Five stages run in parallel on consecutive chunks: reading, screens, single epochs, filter, and writing (by
     `beside`). `others` are the samples of the on-board sensors and the log of the base station.
     """
-    tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
+    tolerance_s = processor.config.antenna_pair.tag_tolerance_s
+    tally = Tally(
+        min_satellites=processor.config.min_satellites,
+        order=AntennaOrder.between(processor.trajectories, tolerance_s=tolerance_s),
+    )
     state = State()
     written: Future[None] | None = None
     chunks = read_ahead(align_logs({name: log.parts() for name, log in logs.items()}))

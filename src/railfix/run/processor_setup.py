@@ -11,16 +11,19 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
+from railfix.gnss.joined_observations import concatenate
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations, concatenate
-from railfix.integrity.protection.araim import read_integrity_support
+from railfix.gnss.observations import Observations
+from railfix.integrity.protection.support_message import read_integrity_support
 from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.base_station_stage import Stations
 from railfix.pipeline.config import Config
+from railfix.pipeline.feature_fixes import TrackFeatures
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import Models
 from railfix.ranges.cn0_curve_file import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
+from railfix.ranges.sbas import SbasState, read_sbas
 from railfix.run.inputs import RunOptions
 from railfix.run.sources import Log
 from railfix.track import Track
@@ -43,6 +46,28 @@ def with_measured_priors(config: Config) -> Config:
     return config.replaced(risk=risk, no_level_m=config.no_level_m or rate.no_level_m)
 
 
+def sbas_corrections(config: Config) -> SbasState | None:
+    """Return SBAS corrections from the files that the settings name, or before the first message; None without SBAS.
+
+    In recorded messages the GEO is chosen if the settings request the best. InputFileError: a file is missing or
+    malformed. SettingsError: no message of the requested GEO, or no GEO is requested for messages as they arrive.
+    """
+    if not config.sbas:
+        return None
+    prn, limits, band = config.sbas_prn, config.sbas_limits, config.sbas_band
+    if config.sbas != "stream":
+        messages = read_sbas(list(config.sbas), band=band)
+        try:
+            return SbasState.from_log(messages, prn=prn, limits=limits, band=band)
+        except ValueError as error:
+            raise SettingsError(f"sbas_prn = {prn}: {error}") from None
+    if prn == "best":
+        raise SettingsError(
+            "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN (sbas_prn = 137)"
+        )
+    return SbasState(prn=prn, limits=limits, band=band)
+
+
 def make_processor(
     config: Config,
     navigation: Navigation,
@@ -63,23 +88,18 @@ def make_processor(
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
-    messages = None
-    if config.sbas and config.sbas != "stream":
-        from railfix.ranges.sbas import read_sbas
-
-        messages = read_sbas(list(config.sbas), band=config.sbas_band)
+    features = {} if track is None else {name: TrackFeatures(track, path) for name, path in trajectories.items()}
     return EpochProcessor(
         config,
         trajectories,
         navigation=navigation,
-        messages=messages,
+        corrections=sbas_corrections(config),
         models=Models(
             error_model=None if config.error_model is None else read_error_model(config.error_model),
             cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
             support=None if config.integrity_support is None else read_integrity_support(config.integrity_support),
         ),
-        track=track,
-        stations=Stations(units, base_ecef_m, balises),
+        stations=Stations(units, base_ecef_m, balises, features),
     )
 
 

@@ -17,7 +17,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, join_rows, take_rows
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.core.timescale import nearest_rows
+from railfix.core.nearest_times import nearest_rows
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import PositionLog

@@ -16,7 +16,7 @@ from railfix.io.sensor_tables import COLUMNS, get_column, get_times, names_of_co
 from railfix.motion.samples import GroundUnits, ListedBalises, Samples, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.track import Track
-from railfix.track.track import section_spans
+from railfix.track.quality import section_spans
 
 #: Class of the samples by the name of the sensor.
 _CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}

@@ -16,7 +16,8 @@ import numpy as np
 
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.reasons import Status
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.joined_observations import concatenate
+from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.pipeline.along_track import mark_doubtful
 from railfix.pipeline.config import Config

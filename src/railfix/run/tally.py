@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
-from railfix.core.reasons import Reason, Status, first_reason, reason_names
+from railfix.core.reason_names import first_reason, reason_names
+from railfix.core.reasons import Reason, Status
 from railfix.integrity.interference import CAUSES, Suspicion
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.balises import balise_notes
+from railfix.pipeline.filter_result import Replay
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.result_tables import (
@@ -32,7 +34,7 @@ from railfix.pipeline.result_tables import (
     with_smoothed,
 )
 from railfix.pipeline.results import AntennaResult, Result
-from railfix.pipeline.smoothed_track import Replay, smooth
+from railfix.pipeline.smoothed_track import smooth
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sources import OpenedLine

@@ -23,7 +23,8 @@ from railfix.core.files import read_json_object
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, option
 from railfix.core.staged_files import write_whole
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.joined_observations import concatenate
+from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config
 from railfix.positioning.track_choice import NONE, StandstillErrors, TrackPosterior, YardTrack, track_posterior

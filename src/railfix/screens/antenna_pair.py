@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings, copy_with, medians
+from railfix.core.array_functions import medians
+from railfix.core.arrays import Floats, Strings, copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason

@@ -13,11 +13,11 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol,
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
-from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.gnss.observations import ObservationHeader
 from railfix.ranges.corrected import AntennaRanges as AntennaRanges
 
 Limits = TypeVar("Limits", bound=Settings)
@@ -60,13 +60,26 @@ def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats
     return result
 
 
+class OpenSkyCn0(Protocol):
+    """Mean C/N0 of an antenna and receiver under open sky (`railfix.ranges.cn0_curve.Cn0Curve`)."""
+
+    def covers(self, satellite: Strings, signal: Strings) -> Masks:
+        """Return whether the mean of each channel is known, shape (M,)."""
+
+    def mean_dbhz(self, elevation_deg: Floats, *, satellite: Strings, signal: Strings) -> Floats:
+        """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where unknown."""
+
+    def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
+        """Return one sentence for each difference of antenna or receiver from a log's header."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ScreenSetup:
     """Properties of a run that some screens need."""
 
     antennas: int = 1  #: Number of antennas.
     spacing_known: bool = False  #: Whether a vehicle file places both antennas on one vehicle.
-    cn0_curve: Cn0Curve | None = None  #: Mean C/N0 of the antenna and receiver as a function of elevation.
+    cn0_curve: OpenSkyCn0 | None = None  #: Mean C/N0 of the antenna and receiver as a function of elevation.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,11 +16,11 @@ from pydantic import Field
 from railfix.core.arrays import Strings
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
-from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
     ObservationPicture,
     ObservationScreen,
+    OpenSkyCn0,
     ScreenColumn,
     Screened,
     ScreenSetup,
@@ -54,7 +54,7 @@ def cn0_screen(
     satellite: Strings,
     signal: Strings,
     limits: Cn0Limits | None = None,
-    curve: Cn0Curve | None = None,
+    curve: OpenSkyCn0 | None = None,
 ) -> Cn0Screened:
     """Reject observations whose C/N0 is too far below the open-sky mean, or below the floor (P1 2.3(1), table 6).
 
@@ -64,7 +64,7 @@ def cn0_screen(
         An observation without C/N0 (NaN) is not rejected.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
-    curve : Cn0Curve, optional
+    curve : Cn0Curve or another OpenSkyCn0, optional
         Mean C/N0 as a function of elevation; without it only the floor is applied.
 
     Returns

@@ -23,7 +23,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, copy_with, freeze_arrays, medians, read_only
+from railfix.core.array_functions import medians
+from railfix.core.arrays import Datetimes, Floats, Strings, copy_with, freeze_arrays, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Strings
+from railfix.core.nearest_times import nearest_rows
 from railfix.core.reasons import Status
-from railfix.core.timescale import nearest_rows
 from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import Limits, Screen, Screened, ScreenSetup, Verdict
 from railfix.track.trajectory import Trajectory

@@ -16,7 +16,8 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import InputFileError, MismatchError, SettingsError, needs_extra
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.extras import needs_extra
 from railfix.core.files import FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.crs import (

@@ -11,7 +11,8 @@ import numpy as np
 from pyproj import CRS
 
 from railfix.core.arrays import Floats, places_in_groups
-from railfix.core.errors import InputFileError, SettingsError, needs_extra
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.extras import needs_extra
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.file_kind import find_kind

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import cheapest_path
+from railfix.core.array_functions import cheapest_path
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.io.mate import mate_table, read_mate

@@ -17,7 +17,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
+from railfix.core.array_functions import cheapest_path
+from railfix.core.arrays import Floats, Indices, Masks, read_only
 from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Network
 
 #: Negative logarithm of the likelihood of a position on an unmapped track parallel to no track, relative to a position

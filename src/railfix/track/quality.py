@@ -18,7 +18,7 @@ from railfix.core.errors import check_type
 from railfix.core.notebook import NotebookTable, plural
 from railfix.core.settings import Settings
 from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
-from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
+from railfix.track.track import BACKWARDS, HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Rounding of coordinates that is reported [deg]; it causes errors of up to 0.6 m.
@@ -292,3 +292,14 @@ def _attributes(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator
         opposite = geometry.map_curvature * geometry.point_curvature < 0.0
         opposite &= (np.abs(geometry.map_curvature) > _CURVED_1PM) & (np.abs(geometry.point_curvature) > _CURVED_1PM)
     yield from _runs(track, opposite, "radius side")
+
+
+def section_spans(track: Track) -> list[tuple[float, float]]:
+    """Return the chainages of the first and the last point of each section [m].
+
+    The chainages decrease if the section was joined in reverse order.
+    """
+    ends = [0.0, *track.chainage_m[np.flatnonzero(np.diff(track.section, append=len(track.sections)))].tolist()]
+    backwards = [f"{source} {BACKWARDS}" in track.provenance.notes for source in track.sections]
+    spans = zip(ends[:-1], ends[1:], backwards, strict=True)
+    return [(end, begin) if back else (begin, end) for begin, end, back in spans]

@@ -160,17 +160,6 @@ class Track(NotebookTable):
         return interpolate_kilometrage(chainage_m, self.chainage_m, self.kilometrage_m)
 
 
-def section_spans(track: Track) -> list[tuple[float, float]]:
-    """Return the chainages of the first and the last point of each section [m].
-
-    The chainages decrease if the section was joined in reverse order.
-    """
-    ends = [0.0, *track.chainage_m[np.flatnonzero(np.diff(track.section, append=len(track.sections)))].tolist()]
-    backwards = [f"{source} {BACKWARDS}" in track.provenance.notes for source in track.sections]
-    spans = zip(ends[:-1], ends[1:], backwards, strict=True)
-    return [(end, begin) if back else (begin, end) for begin, end, back in spans]
-
-
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
     """Return a mask of segments, shape (V - 1,), whose kilometrage has a break.
 

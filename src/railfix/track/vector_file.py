@@ -20,7 +20,8 @@ from xml.etree.ElementTree import ParseError, iterparse
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError, needs_extra
+from railfix.core.errors import InputFileError
+from railfix.core.extras import needs_extra
 from railfix.core.files import FilePath, open_stream, unpacked_file
 from railfix.io.file_kind import KIND_WORDS, find_kind
 from railfix.io.xml_lines import read_gpx_lines, read_kml_lines

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.errors import InputFileError, needs_extra
+from railfix.core.errors import InputFileError
+from railfix.core.extras import needs_extra
 from railfix.core.files import FilePath, file_sha256, read_bytes
 from railfix.io.xml_lines import read_root, tag
 from railfix.track.crs import choose_crs

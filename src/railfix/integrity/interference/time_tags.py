@@ -11,7 +11,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks, masked_median
+from railfix.core.array_functions import masked_median
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 

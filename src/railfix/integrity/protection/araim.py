@@ -18,20 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from itertools import combinations
-from typing import Annotated, Final, Literal, NamedTuple, Self
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import scipy
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, join_rows
-from railfix.core.errors import InputFileError
 from railfix.core.notebook import NotebookTable
-from railfix.core.settings import Settings, validate
-from railfix.core.settings_files import read_toml
-from railfix.core.staged_files import FilePath
+from railfix.core.settings import Settings
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
 #: Number of bisections for a level, which reduce its interval from 1e4 m to less than a tenth of a micrometre.
@@ -218,29 +214,6 @@ def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Float
     return np.where(high >= _LONGEST_M, np.inf, high)
 
 
-FORMAT: Final = "railfix integrity support 1"
-
-Letter = Annotated[str, Field(pattern=r"^[GJECR]$")]
-Satellite = Annotated[str, Field(pattern=r"^[GJECR][0-9]{2}$")]
-
-
-class SatelliteSupport(Settings):
-    """Integrity support of a satellite."""
-
-    #: Standard deviations of the range error due to orbit and clock, for integrity and for accuracy and continuity.
-    sigma_ura_m: float = Field(gt=0)
-    sigma_ure_m: float = Field(gt=0)
-    bias_m: float = Field(ge=0)  #: Largest nominal bias of the range (b_nom).
-    prior: float = Field(ge=0, lt=1)  #: Probability that the satellite is faulty at a given time (P_sat).
-
-
-class ConstellationSupport(SatelliteSupport):
-    """Integrity support of a constellation's satellites."""
-
-    #: Probability of a fault common to the constellation at a given time (P_const).
-    constellation_prior: float = Field(ge=0, lt=1)
-
-
 class SupportArrays(NamedTuple):
     """Integrity support by channel, shape (M,), and fault probabilities by constellation letter."""
 
@@ -251,59 +224,14 @@ class SupportArrays(NamedTuple):
     constellation_prior: dict[str, float]
 
 
-class IntegritySupport(Settings):
-    """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
-
-    format: Literal["railfix integrity support 1"]
-    #: Validity period of the message [GPS time]; None if not stated. Epochs outside the period have no ARAIM level.
-    valid_from: datetime | None = None
-    valid_until: datetime | None = None
-    #: Support by constellation letter; a constellation without support is not used in the levels.
-    constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
-    #: Support of single satellites, which replaces the support by constellation.
-    satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _period(self) -> Self:
-        ends = [end for end in (self.valid_from, self.valid_until) if end is not None]
-        if any(end.tzinfo is not None for end in ends):
-            raise ValueError("valid_from and valid_until are GPS time: write them without a time zone")
-        if len(ends) == 2 and not ends[0] < ends[1]:
-            raise ValueError(f"valid_from = {ends[0]} must be before valid_until = {ends[1]}")
-        return self
+class SatelliteSupport(Protocol):
+    """Integrity support of the satellites (`railfix.integrity.protection.support_message.IntegritySupport`)."""
 
     def holds(self, time: Datetimes) -> Masks:
-        """Return whether the message is valid at epochs, shape (T,)."""
-        first, last = (
-            np.datetime64("NaT" if end is None else end, "ns") for end in (self.valid_from, self.valid_until)
-        )
-        return ~((time < first) | (time > last))
+        """Return whether the support is valid at epochs, shape (T,)."""
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return a note if the message states no end of validity, or is not valid at some epochs."""
-        if self.valid_until is None:
-            return ("integrity support message: without valid_until it is not known whether it has expired",)
-        if self.holds(time).all():
-            return ()
-        first = "" if self.valid_from is None else f"from {self.valid_from} "
-        return (
-            f"integrity support message: valid {first}until {self.valid_until} (GPS time); epochs outside "
-            "this time have no ARAIM level; give a message that is valid at their time",
-        )
+        """Return sentences on its validity at epochs, shape (T,)."""
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
         """Return the support of each channel from the name of its satellite ("G07"); NaN without support."""
-        of_each = [self.satellite.get(name) or self.constellation.get(name[0]) for name in satellites]
-        ura, ure, bias, prior = (
-            np.array([np.nan if each is None else getattr(each, name) for each in of_each], dtype=np.float64)
-            for name in ("sigma_ura_m", "sigma_ure_m", "bias_m", "prior")
-        )
-        return SupportArrays(ura, ure, bias, prior, {k: c.constellation_prior for k, c in self.constellation.items()})
-
-
-def read_integrity_support(path: FilePath) -> IntegritySupport:
-    """Read an integrity support message from a TOML file; raise InputFileError for other files."""
-    values = read_toml(path, what="an integrity support message")
-    if values.get("format") != FORMAT:
-        raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")
-    return validate(IntegritySupport, values, source=str(path))

@@ -12,7 +12,8 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Integers, Masks, Strings, places_in_groups
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.timescale import from_week, nearest_week
+from railfix.core.nearest_times import nearest_week
+from railfix.core.timescale import from_week
 from railfix.io.receiver.framing import Frames, Subframes, gather_structures
 from railfix.io.receiver.measurements import Measurements
 

@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Integers, Strings
-from railfix.core.timescale import bdt_to_gpst, nearest_day, nearest_week, seconds, to_week, utc_to_gpst
+from railfix.core.nearest_times import nearest_day, nearest_week
+from railfix.core.timescale import bdt_to_gpst, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
 #: Names of the numbers of a Keplerian record in the order of the file, beginning with three clock coefficients.

@@ -20,7 +20,8 @@ from railfix.core.arrays import Masks
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import LENIENT, BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
 from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst
-from railfix.gnss.observations import Observations, channels_with_data, concatenate
+from railfix.gnss.joined_observations import channels_with_data, concatenate
+from railfix.gnss.observations import Observations
 from railfix.io.epoch_order import EpochOrder, FileEpochs
 from railfix.io.rinex.header import VERSION, RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import PADDING, decode, lines_per_satellite

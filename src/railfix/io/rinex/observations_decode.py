@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from railfix import kernels
 from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, places_in_groups, take_rows
-from railfix.gnss.observations import channels_with_data
+from railfix.gnss.joined_observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
 from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Lines, SignalColumn

@@ -20,7 +20,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, medians, read_only
+from railfix.core.array_functions import medians
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds

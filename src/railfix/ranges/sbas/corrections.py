@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
@@ -12,9 +10,9 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
-from railfix.ranges.sbas.dfmc import MASK_S, DfmcService
 from railfix.ranges.sbas.ionosphere import GridTables, ionosphere
-from railfix.ranges.sbas.messages import Band, SbasMessages
+from railfix.ranges.sbas.limits import SbasLimits
+from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.satellites import (
     FastInForce,
     Growth,
@@ -29,15 +27,12 @@ from railfix.ranges.sbas.satellites import (
 from railfix.ranges.sbas.standard import (
     DO_NOT_USE,
     INFLATION_M,
-    LEANT_ON,
     NOT_MONITORED,
-    OLDEST_S,
     STOP_S,
     UDRE_VARIANCE_M2,
     IonosphereDelays,
     SatelliteCorrections,
     SatelliteState,
-    SbasLimits,
     first_that_holds,
     mask_satellite,
     system_name,
@@ -235,74 +230,3 @@ class SbasCorrections:
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SbasState:
-    """Messages of one GEO received so far; `add_messages` returns a new state with further messages.
-
-    Corrections at an epoch are the same as from the complete log, for any division into parts: a message is used from
-    its reception on, and `drop_before` drops only messages that no later epoch can use.
-
-    ::
-
-        state = SbasState(prn=137)
-        state = state.add_messages(messages)  # whenever some arrive
-        fixes = state.corrections.satellites(time, satellite, navigation)
-        state = state.drop_before(time[-1])  # what later epochs need
-    """
-
-    prn: int  #: Chosen beforehand, because the best GEO is known only after all messages were received.
-    limits: SbasLimits = field(default_factory=SbasLimits)
-    #: Messages of that PRN, in the order of reception.
-    messages: SbasMessages = field(default_factory=SbasMessages.none)
-    band: Band = "L1"  #: Frequency of the messages.
-    #: For a recorded log, sentences on its messages and on the corrections from them; None for messages as they arrive.
-    log_notes: tuple[str, ...] | None = None
-
-    @classmethod
-    def from_log(
-        cls,
-        messages: SbasMessages,
-        *,
-        prn: int | Literal["best"] = "best",
-        limits: SbasLimits | None = None,
-        band: Band = "L1",
-    ) -> SbasState:
-        """Return the state after the messages of a recorded log; ValueError if it has none of the requested PRN."""
-        limits = limits or SbasLimits()
-        of_log: SbasCorrections | DfmcService = (
-            DfmcService.from_log(messages, prn=prn)
-            if band == "L5"
-            else SbasCorrections.from_log(messages, prn=prn, limits=limits)
-        )
-        state = cls(prn=of_log.prn, limits=limits, band=band).add_messages(messages)
-        return replace(state, log_notes=of_log.notes)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """One sentence on each correction that was requested and used, and on the messages of a recorded log."""
-        return self.corrections.notes if self.log_notes is None else self.log_notes
-
-    def add_messages(self, messages: SbasMessages) -> SbasState:
-        """Return the state after more messages, without other PRNs and messages repeated by a second receiver."""
-        joined = self.messages.merge(messages.of(self.prn))
-        return replace(self, messages=joined.take(~joined.repeated()), log_notes=None)
-
-    @cached_property
-    def corrections(self) -> SbasCorrections | DfmcService:
-        """Corrections from the messages received so far."""
-        if self.band == "L5":
-            return DfmcService(self.messages, prn=self.prn)
-        return SbasCorrections(self.messages, prn=self.prn, limits=self.limits)
-
-    def drop_before(self, time: np.datetime64) -> SbasState:
-        """Return the state without the messages that no epoch from `time` on can use."""
-        kind, age = self.messages.type, seconds(time - self.messages.time)
-        if self.band == "L5":  # the newest of each type, and corrections with all indicators since
-            newest = len(kind) - 1 - np.unique(kind[::-1], return_index=True)[1]
-            kept = (age <= MASK_S) | np.isin(np.arange(len(kind)), newest)
-            return self if kept.all() else replace(self, messages=self.messages.take(kept))
-        oldest = np.where(kind == 27, self.limits.timeout_s("service"), OLDEST_S + 1.0)
-        kept = age <= np.where(np.isin(kind, (*LEANT_ON, 27)), 2.0 * oldest, oldest)
-        return self if kept.all() else replace(self, messages=self.messages.take(kept))

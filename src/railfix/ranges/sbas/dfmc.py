@@ -35,7 +35,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.ephemerides import GM, Orbits, kepler_state
-from railfix.gnss.orbits.prepared_records import issue_records
+from railfix.gnss.orbits.issues import issue_records
 from railfix.ranges.sbas.decode import BitField, Decoded, Layout, covariance_factor, read_fields, time_near
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import first_that_holds, system_name

@@ -13,16 +13,10 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.timescale import seconds, timedelta
 from railfix.ranges.sbas.decode import decode, grid_delays
+from railfix.ranges.sbas.limits import SbasLimits
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.satellites import degradation_row
-from railfix.ranges.sbas.standard import (
-    GIVE_VARIANCE_M2,
-    STOP_S,
-    IonosphereDelays,
-    IonosphereState,
-    SbasLimits,
-    first_that_holds,
-)
+from railfix.ranges.sbas.standard import GIVE_VARIANCE_M2, STOP_S, IonosphereDelays, IonosphereState, first_that_holds
 from railfix.ranges.sbas.tables import SatelliteTables, Series, Stops
 
 Answer = TypeVar("Answer", bound=np.generic)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.prepared_records import issue_records
+from railfix.gnss.orbits.issues import issue_records
 from railfix.ranges.sbas.decode import Decoded, service
+from railfix.ranges.sbas.limits import TIMEOUT_S, SbasLimits
 from railfix.ranges.sbas.messages import SbasMessages
-from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR, TIMEOUT_S, SbasLimits
+from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR
 from railfix.ranges.sbas.tables import ALARM, SatelliteTables, Series
 
 #: A range rate is applied for at most this multiple of the time between the two fast corrections that determine it.

@@ -18,8 +18,9 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.ranges.atmosphere import Delays, SeenFrom
 from railfix.ranges.channels import DFMC_SIGNALS, Channels
-from railfix.ranges.sbas import DfmcService, IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections
-from railfix.ranges.sbas.dfmc import DfmcCorrections, DfmcState, residual_ionosphere_m
+from railfix.ranges.sbas.corrections import SbasCorrections
+from railfix.ranges.sbas.dfmc import DfmcCorrections, DfmcService, DfmcState, residual_ionosphere_m
+from railfix.ranges.sbas.standard import IonosphereState, SatelliteCorrections, SatelliteState
 from railfix.ranges.sbas.troposphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.sources import BroadcastSource, SourceDelays, SourceSatellites
 

@@ -1,17 +1,16 @@
-"""Names, time-outs and variances of RTCA DO-229D, the settings that select them, and classes of results."""
+"""Names, time-outs and variances of RTCA DO-229D, and classes of results."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-from pydantic import Field
 
 from railfix.core.arrays import Floats, FrozenArrays, Integers, Masks
-from railfix.core.settings import Settings
+from railfix.ranges.sbas.limits import TIMEOUT_S
 
 #: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).
 _SYSTEMS: Final = {
@@ -50,19 +49,6 @@ def mask_satellite(number: int) -> str:
     return ""
 
 
-#: Time since reception for which a message may be used [s], for precision approach, and for en route to non-precision
-#: approach (DO-229D, table A-25). Fast corrections have `FAST_TIMEOUT_S`.
-TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
-    "mask": (600.0, 600.0),
-    "udrei": (12.0, 18.0),
-    "long_term": (240.0, 360.0),
-    "fast_degradation": (240.0, 360.0),
-    "degradation": (240.0, 360.0),
-    "grid_mask": (1200.0, 1200.0),
-    "grid_delay": (600.0, 600.0),
-    "service": (86_400.0, 86_400.0),
-    "covariance": (240.0, 360.0),
-}
 #: Time-outs of fast corrections by degradation indicator ai (DO-229D, table A-8).
 FAST_TIMEOUT_S: Final[dict[str, tuple[float, ...]]] = {
     "precision": (120, 120, 102, 90, 90, 78, 66, 54, 42, 30, 30, 18, 18, 18, 12, 12),
@@ -95,32 +81,6 @@ OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "se
 #: Types that affect messages received later (stops and masks), and are therefore kept for twice that time.
 LEANT_ON: Final = (0, 1, 18)
 INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
-
-
-class SbasLimits(Settings):
-    """Settings of the use of SBAS messages."""
-
-    #: Time-outs of precision approach (shorter), or of en route to non-precision approach.
-    mode: Literal["precision", "en_route"] = "precision"
-    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops use of its GEO for 60 s, or is read as type 2.
-    range_rate: Literal["mops", "off"] = "mops"  #: Range-rate part of fast corrections (DO-229D, A.4.4.3), or none.
-    #: Satellites without degradation data are rejected, or used with the shortest time-out and a sigma increased by 8 m
-    #: (DO-229D, J.2.2).
-    incomplete: Literal["reject", "inflate"] = "reject"
-    #: Largest UDREI used; None is 11 for precision approach and 13 en route.
-    max_udrei: int | None = Field(default=None, ge=0, le=13)
-    message_s: float = Field(default=1.0, ge=0.0, le=2.0)  #: Time from the first bit of a message to its reception.
-
-    def timeout_s(self, kind: str) -> float:
-        """Return the time-out of a kind of message in this mode [s]."""
-        return TIMEOUT_S[kind][0 if self.mode == "precision" else 1]
-
-    @property
-    def largest_udrei(self) -> int:
-        """Largest UDREI used."""
-        if self.max_udrei is not None:
-            return self.max_udrei
-        return 11 if self.mode == "precision" else 13
 
 
 class SatelliteState(IntEnum):

@@ -23,8 +23,9 @@ from railfix.ranges.sbas.decode import (
     long_term,
     prn_masks,
 )
+from railfix.ranges.sbas.limits import SbasLimits
 from railfix.ranges.sbas.messages import SbasMessages
-from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S, SbasLimits
+from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S
 
 LONG_AGO: Final = GPS_EPOCH  #: Time before every message.
 ALARM: Final = 3  #: IODF of an alarm.

@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Integers
-from railfix.core.reasons import Reason, first_reason, reason_names
+from railfix.core.reason_names import first_reason, reason_names
+from railfix.core.reasons import Reason
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, satellite_kind
 from railfix.report.plots.chart import (
     BLACK,

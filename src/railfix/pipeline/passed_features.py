@@ -1,0 +1,81 @@
+"""Rates of the vehicle body, and the search for features of the line that it has passed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, Protocol
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.timescale import seconds
+from railfix.track.trajectory import Trajectory
+
+#: Below this speed the rates are not used [m/s].
+SLOWEST_MPS: Final = 1.0
+
+
+def ahead_m(trajectory: Trajectory) -> float:
+    """Return the distance of an antenna ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
+    if trajectory.body_chainage_m is None:
+        return 0.0
+    return float(np.median(trajectory.chainage_m - trajectory.body_chainage_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateSeries:
+    """Changes of the body's heading and pitch, wheel distances and speeds at K ticks."""
+
+    #: Times of validity, and times at which the rates became known; shape (K,).
+    time: Datetimes
+    known: Datetimes
+    distance_m: Floats  #: Wheel distance since the tick before the first, in rising arc length; shape (K,).
+    arc_m: Floats  #: Antenna position by the wheel; NaN if unknown; shape (K,).
+    #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
+    turned_rad: Floats
+    climbed_rad: Floats
+    speed_mps: Floats  #: Speed in rising arc length, shape (K,).
+    rolls: Masks  #: True where the wheel rolls, shape (K,).
+
+    def arc_at(self, time: Datetimes) -> Floats:
+        """Return positions at times after the first tick, from the preceding tick [m]."""
+        last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
+        since = seconds(time - self.time[last])
+        return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureState:
+    """State of the feature search after a chunk."""
+
+    distance_m: float = 0.0  #: Wheel distance at the last tick.
+    angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch at the last tick, from an arbitrary origin [rad].
+    #: Whole metres passed without a break, in the order of travel; shape (M,).
+    metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    #: Heading and pitch at each metre, shape (M,).
+    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
+    pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
+    #: Position of the last accepted feature, its standard deviation, and the wheel distance at the feature [m].
+    last: tuple[float, float, float] | None = None
+    done_m: float = float("nan")  #: Position up to which features have been compared; NaN before the first.
+
+
+class PassedFeature(NamedTuple):
+    """Position by a feature that the train has passed."""
+
+    tick: int  #: Index of the tick after which the feature was passed.
+    correction_m: float  #: Position less wheel position.
+    sigma_m: float  #: Standard deviation of the position, errors of the map and of the body on its bogies included.
+
+
+class FeatureSearch(Protocol):
+    """Search for features of a line, such as curves (`railfix.pipeline.feature_fixes.TrackFeatures`)."""
+
+    def locate(
+        self, rates: RateSeries, facing: float, sigma_m: float, state: FeatureState, *, noise: tuple[float, float]
+    ) -> tuple[tuple[PassedFeature, ...], FeatureState]:
+        """Return the features that the train has passed, and the state for the next chunk.
+
+        `facing` is 1 if the front points to rising arc length, else -1; `sigma_m` is the standard deviation of the
+        wheel position; `noise` has the standard deviations of gradient and curvature over one metre.
+        """

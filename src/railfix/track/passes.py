@@ -1,0 +1,51 @@
+"""Segments of a trajectory near positions."""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.track.trajectory import Trajectory
+
+
+class Passes(NamedTuple):
+    """P pairs of a position and a segment near it, sorted by position and segment; shapes (P,) unless stated."""
+
+    position: Indices  #: Index of the position.
+    segment: Indices  #: Index of the segment.
+    #: Distances from the start of the segment to the projection of the position on the extended segment, and to the
+    #: nearest point of the segment.
+    along_m: Floats
+    foot_m: Floats
+    offset_m: Floats  #: Vector from the nearest point to the position, shape (P, 3).
+    lowest: Masks  #: True if no adjacent segment in the list is nearer to the position.
+    again: Masks  #: True if the previous segment is equally near, because the nearest point is shared.
+
+
+def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
+    """Find all segments within `reach_m` of each position (n, 3).
+
+    Segments whose middle is within `reach_m` plus half of the longest segment are returned, so that some are farther
+    than `reach_m`.
+    """
+    length, tangent = trajectory.length_m, trajectory.tangent
+    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
+    reach = np.broadcast_to(reach_m + 0.5 * length.max(), len(ecef_m))
+    lists = scipy.spatial.cKDTree(middle).query_ball_point(ecef_m, reach, return_sorted=True)
+    position = np.repeat(np.arange(len(ecef_m)), [len(x) for x in lists])
+    segment = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(position))
+    delta = ecef_m[position] - trajectory.ecef_m[segment]
+    along = np.einsum("pi,pi->p", delta, tangent[segment])
+    foot = np.clip(along, 0.0, length[segment])
+    offset = delta - foot[:, None] * tangent[segment]
+    away = np.linalg.norm(offset, axis=1)
+    joined = (position[1:] == position[:-1]) & (segment[1:] == segment[:-1] + 1)
+    lowest, again = np.ones(len(position), dtype=np.bool_), np.zeros(len(position), dtype=np.bool_)
+    lowest[1:] &= ~joined | (away[1:] <= away[:-1])
+    lowest[:-1] &= ~joined | (away[:-1] <= away[1:])
+    again[1:] = joined & (away[1:] == away[:-1])
+    return Passes(position, segment, along, foot, offset, lowest, again)
