@@ -16,13 +16,8 @@ from scipy.stats import norm
 import pipeline_cases
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import enu_axes
-from railfix.integrity.protection.araim import (
-    AraimBudget,
-    AraimGeometry,
-    AraimLevels,
-    araim_levels,
-    read_integrity_support,
-)
+from railfix.integrity.protection.araim import AraimBudget, AraimGeometry, AraimLevels, araim_levels
+from railfix.integrity.protection.support_message import read_integrity_support
 from railfix.pipeline import level_stage
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import with_map

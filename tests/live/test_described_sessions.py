@@ -368,8 +368,7 @@ def _engine(*antennas: str, sensors: tuple[str, ...] = (), **settings: Any) -> L
     processor = Processor(
         notes=("a note",), received=SimpleNamespace(notes=(), navigation=no_navigation()),
         trajectories={name: clean_trajectories()[name] for name in antennas}, balises=None, units=None, given=[],
-        notes_later=[],
-        config=SimpleNamespace(antenna_pair=SimpleNamespace(tag_tolerance_s=0.01)),
+        notes_later=[], config=SimpleNamespace(antenna_pair=SimpleNamespace(tag_tolerance_s=0.01)),
     )  # fmt: skip
     return LiveEngine(processor, LiveSettings(**settings), sensors)  # type: ignore[arg-type]
 

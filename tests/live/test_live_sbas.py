@@ -110,8 +110,7 @@ def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> 
     observations = railfix.read_observations(log["log"])[:3]
     line = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([log["line"]]))}
     config = railfix.Config(sbas="stream", sbas_prn=137)
-    processor = make_processor(config, railfix.read_navigation(log["nav"]), line)
-    result, _ = processor.process({"front": observations})
+    result, _ = make_processor(config, railfix.read_navigation(log["nav"]), line).process({"front": observations})
     assert np.isnan(result.antennas["front"].chainage_m).all()
     with pytest.raises(SettingsError, match="give its PRN"):
         make_processor(railfix.Config(sbas="stream"), railfix.read_navigation(log["nav"]), line)

@@ -12,14 +12,13 @@ from scipy.stats import norm
 from railfix.cli.evaluate import priors_text
 from railfix.cli.options import Choices, resolve_settings
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.ranges.error_conditions import Conditions, condition_differences
 from railfix.ranges.error_model import (
     POOLED,
     BinStatistics,
-    Conditions,
     ErrorBins,
     ErrorModel,
     ErrorModelSource,
-    condition_differences,
     read_error_model,
     write_error_model,
 )

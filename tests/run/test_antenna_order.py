@@ -93,8 +93,7 @@ def test_the_sigma_grows_with_the_scatter_of_the_stretches() -> None:
     order = order_of(RISING)
     _, before = order.measure()
     stretches = order._stretches
-    for k, key in enumerate(sorted(stretches)):
-        count, distance, variance = stretches[key]
+    for k, (key, (count, distance, variance)) in enumerate(sorted(stretches.items())):
         stretches[key] = (count, distance + (-1.0) ** k * 20.0 * count, variance)
     assert order.measure()[1] > 5.0 * before
 

@@ -24,8 +24,8 @@ def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, nois
 
     The second code is the first signal, in order of preference, that is observed, healthy and has a group delay.
     Satellite position and clock are the same as for the first code, and the group delay is from the same record; where
-    the record lacks a part of the group delay, another message of the satellite is used. Where `source` requires second codes, satellites
-    without one have the reason `sbas_no_ionosphere`.
+    the record lacks a part of the group delay, another message of the satellite is used. Where `source` requires second
+    codes, satellites without a second code are rejected with the reason `sbas_no_ionosphere`.
     """
     channels = corrected.channels
     second = _correct_second_codes(corrected, source.navigation, noise) if channels.second.size else None
