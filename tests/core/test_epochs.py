@@ -12,7 +12,8 @@ from railfix.core.arrays import read_only
 from railfix.core.reason_names import first_reason, reason_text
 from railfix.core.reasons import POSITIONED, Reason, Status
 from railfix.gnss import concatenate
-from railfix.gnss.observations import MAX_PROBLEMS, ObservationHeader, Observations, first_problems
+from railfix.gnss.joined_observations import MAX_PROBLEMS, first_problems
+from railfix.gnss.observations import ObservationHeader, Observations
 
 START = np.datetime64("2024-03-13T08:00:00", "ns")
 

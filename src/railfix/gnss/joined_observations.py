@@ -1,19 +1,22 @@
-"""Join the parts of one log, and stack the observations of several antennas."""
+"""Join the parts of one log with their signals and problems, and stack the observations of several antennas."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import accumulate, chain, pairwise
-from typing import Any
+from itertools import accumulate, chain, groupby, islice, pairwise
+from operator import itemgetter
+from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Floats, Masks
+from railfix.core.arrays import Bytes, Floats, Masks, Strings
 from railfix.core.epoch_rows import EVERY, join_epochs
 from railfix.core.errors import check_type
-from railfix.gnss.observations import MAX_PROBLEMS, ObservationHeader, Observations, first_problems
+from railfix.gnss.observations import ObservationHeader, Observations
+
+MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; further faults are only counted.
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
@@ -126,3 +129,15 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
     same = len(keys) == 1  # the same channels in the same order, and the same GLONASS frequencies
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
+
+
+def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[str, ...]]:
+    """Return the signals of the channels by constellation letter, sorted (`ObservationHeader.signals`)."""
+    pairs = sorted(set(zip(satellite.astype("<U1").tolist(), signal.tolist(), strict=True)))
+    return {system: tuple(name for _, name in group) for system, group in groupby(pairs, key=itemgetter(0))}
+
+
+def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
+    """Return the first `MAX_PROBLEMS` messages, and a message with the number of further faults, `count` in total."""
+    kept = tuple(islice(messages, MAX_PROBLEMS))
+    return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

@@ -5,12 +5,9 @@ Axis 0 is time, and axis 1 is the channel, which is one satellite on one signal.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from itertools import groupby, islice
-from operator import itemgetter
-from typing import Final
 
 import numpy as np
 
@@ -51,9 +48,6 @@ def frequency_by_name_hz(name: Strings, glonass_channel: Floats) -> Floats:
         if letter == "R" and band in GLONASS_STEP:
             frequency[..., chosen] += glonass_channel[..., chosen] * GLONASS_STEP[band]
     return frequency
-
-
-MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; further faults are only counted.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,15 +192,3 @@ class Observations(NotebookTable):
                 raise KeyError(f"no {name} among the satellites {' '.join(np.unique(self.satellite).tolist())}")
             found |= own
         return np.flatnonzero(found)
-
-
-def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[str, ...]]:
-    """Return the signals of the channels by constellation letter, sorted (`ObservationHeader.signals`)."""
-    pairs = sorted(set(zip(satellite.astype("<U1").tolist(), signal.tolist(), strict=True)))
-    return {system: tuple(name for _, name in group) for system, group in groupby(pairs, key=itemgetter(0))}
-
-
-def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """Return the first `MAX_PROBLEMS` messages, and a message with the number of further faults, `count` in total."""
-    kept = tuple(islice(messages, MAX_PROBLEMS))
-    return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

@@ -12,8 +12,8 @@ from railfix.core.arrays import Datetimes, Indices, Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines
 from railfix.core.notebook import plural
-from railfix.gnss.joined_observations import stack_parts
-from railfix.gnss.observations import Observations, first_problems
+from railfix.gnss.joined_observations import first_problems, stack_parts
+from railfix.gnss.observations import Observations
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"

@@ -10,7 +10,8 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.errors import check_type
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
-from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
+from railfix.gnss.joined_observations import signals_by_system
+from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.observations_lines import KINDS, find_signal
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import SECONDS_PER_DAY, timedelta, utc_to_gpst
-from railfix.gnss.observations import first_problems
+from railfix.gnss.joined_observations import first_problems
 from railfix.io.position_log import PositionLog
 
 #: Names of counted lines that are not errors.

@@ -15,7 +15,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.notebook import plural
 from railfix.core.staged_files import check_path
 from railfix.core.timescale import from_week, utc_to_gpst
-from railfix.gnss.observations import first_problems
+from railfix.gnss.joined_observations import first_problems
 from railfix.io.file_kind import FileKind, find_kind, wrong_kind
 from railfix.io.nmea import read_nmea
 from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtklib_positions, skip_broken

@@ -21,7 +21,6 @@ from .base import (
     ScreenPicture,
     ScreenSetup,
     Verdict,
-    suspicion_sigma_m,
 )
 from .cn0 import Cn0Limits, Cn0Screened, cn0_screen
 from .doppler import (
@@ -35,6 +34,7 @@ from .doppler import (
 from .elevation import ElevationLimits, elevation_screen
 from .pairs import FilteredMotion, PairedEpochs, PairScreen, PositionScreen, pair_channels, pair_epochs
 from .registry import SCREENS, in_order
+from .suspicion import suspicion_sigma_m
 
 __all__ = [
     "SCREENS",

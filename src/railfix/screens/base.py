@@ -9,9 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
-
-import numpy as np
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.notebook import NotebookTable
@@ -21,8 +19,6 @@ from railfix.gnss.observations import ObservationHeader
 from railfix.ranges.corrected import AntennaRanges as AntennaRanges
 
 Limits = TypeVar("Limits", bound=Settings)
-#: Minimum error of a suspected range, in sigmas; added in quadrature, it leaves at most a fifth of the range's weight.
-LEAST_SUSPICION: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -44,20 +40,6 @@ class Verdict:
     screened: Screened  #: Metric and verdict, shape (T, M).
     #: Measured error that is added to the sigma of a suspected range; None if such ranges are rejected; shape (T, M).
     error_m: Floats | None = None
-
-
-def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats:
-    """Return the standard deviations of ranges, increased for suspected ranges, shape (T, M) [m].
-
-    For a suspected range (`reject`) the result is ``hypot(sigma_m, max(|error_m|, 2 sigma_m))``; `error_m` is the error
-    that the screen measured, and NaN counts as zero.
-    """
-    if not reject.any():
-        return sigma_m
-    at, result = np.nonzero(reject), sigma_m.copy()
-    sigma = sigma_m[at]
-    result[at] = np.hypot(sigma, np.fmax(np.abs(error_m[at]), LEAST_SUSPICION * sigma))
-    return result
 
 
 class OpenSkyCn0(Protocol):

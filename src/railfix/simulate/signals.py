@@ -18,8 +18,9 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds, timedelta
+from railfix.gnss.joined_observations import signals_by_system
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
+from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate.alignment import Alignment, build_alignment

@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines
-from railfix.gnss.observations import MAX_PROBLEMS, first_problems
+from railfix.gnss.joined_observations import MAX_PROBLEMS, first_problems
 from railfix.io.rinex.observations_lines import EpochHeads, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
 
 EPOCHS = "broken epochs"

@@ -20,7 +20,8 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.errors import OutputError, check_type
 from railfix.core.files import FilePath, hatanaka_program
 from railfix.core.staged_files import stage_file
-from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
+from railfix.gnss.joined_observations import signals_by_system
+from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.observations_lines import KINDS
 
 RinexVersion = Literal["3.04", "4.02"]  #: Versions that can be written.
