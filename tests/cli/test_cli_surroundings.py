@@ -40,8 +40,7 @@ def text_of(output: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "sentence"),
-    [(row["words"], int(row["exit"]), row["sentence"]) for row in BAD_WORDS],
+    ("words", "code", "sentence"), [(row["words"], int(row["exit"]), row["sentence"]) for row in BAD_WORDS]
 )
 @pytest.mark.every(2)
 def test_bad_words_end_with_one_sentence(desk: Desk, tmp_path: Path, words: str, code: int, sentence: str) -> None:

@@ -89,8 +89,7 @@ def test_absent_times_stay_absent() -> None:
 
 
 @given(
-    near=st.datetimes(datetime(1980, 1, 20), datetime(2099, 1, 1)),
-    offset_s=st.integers(-WEEK // 2 + 1, WEEK // 2 - 1),
+    near=st.datetimes(datetime(1980, 1, 20), datetime(2099, 1, 1)), offset_s=st.integers(-WEEK // 2 + 1, WEEK // 2 - 1)
 )
 def test_nearest_week_finds_any_time_within_half_a_week(near: datetime, offset_s: int) -> None:
     truth = near + timedelta(seconds=offset_s)

@@ -356,9 +356,7 @@ def restored(store: Store, state: Interlocking, sent: list[Authority], now: list
 
 
 @pytest.mark.requirement("F5")
-def test_routes_and_the_release_by_hand(
-    centre: tuple[ControlCentre, list[Authority], list[float]],
-) -> None:
+def test_routes_and_the_release_by_hand(centre: tuple[ControlCentre, list[Authority], list[float]]) -> None:
     control, sent, now = centre
     orders = list_orders(control)
 
@@ -420,9 +418,7 @@ def test_routes_and_the_release_by_hand(
     assert again.supervision.state.trains[2].stop is None
 
 
-def test_an_order_to_stop_is_acknowledged_and_timed(
-    centre: tuple[ControlCentre, list[Authority], list[float]],
-) -> None:
+def test_an_order_to_stop_is_acknowledged_and_timed(centre: tuple[ControlCentre, list[Authority], list[float]]) -> None:
     """A section is closed from the page: the train in it has the order, says so, and comes to rest; then it is lost."""
     control, sent, now = centre
     control.supervision.state, control.monitor = replace(control.supervision.state, stopped=False), None

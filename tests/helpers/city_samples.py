@@ -196,8 +196,7 @@ def cn0_by_elevation(sample: Sample) -> Floats:
 def environment(kind: Kind, *, seed: int) -> Environment:
     """An electrified line that is of one kind from end to end."""
     settings = EnvironmentSettings(
-        electrification=ElectrificationSettings(),
-        sections=(SectionSettings(from_m=0.0, to_m=LENGTH_M, kind=kind),),
+        electrification=ElectrificationSettings(), sections=(SectionSettings(from_m=0.0, to_m=LENGTH_M, kind=kind),)
     )
     return Environment(settings, line_length_m=LENGTH_M, seed=seed)
 

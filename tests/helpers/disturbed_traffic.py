@@ -107,11 +107,7 @@ def without_grants(state: Interlocking) -> Interlocking:
 
 
 def traffic(
-    seed: int,
-    *,
-    trains: int = 8,
-    layout: Layout | None = None,
-    conditions: Conditions | None = None,
+    seed: int, *, trains: int = 8, layout: Layout | None = None, conditions: Conditions | None = None
 ) -> DisturbedTraffic:
     """Return traffic at its start: trains at rest in stations, at places that the seed chooses."""
     layout, rng = layout or line_with_loops(), random.Random(seed)

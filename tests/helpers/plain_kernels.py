@@ -52,8 +52,8 @@ def named_tuple(kind: type, **values: Any) -> Any:
 
 def given(limits: TrackingLimits) -> layout.Given:
     """What the recursion reads, settings alone."""
-    made = named_tuple(layout.Given, parameters=pack_parameters(limits, 0.0), line=np.zeros(1, dtype=layout.LINE))
-    return cast(layout.Given, made)
+    rows = {"epoch": np.ones(1, dtype=layout.EPOCH), "line": np.zeros(1, dtype=layout.LINE)}
+    return cast(layout.Given, named_tuple(layout.Given, parameters=pack_parameters(limits, 0.0), **rows))
 
 
 def kernel_state(

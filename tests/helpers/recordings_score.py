@@ -176,11 +176,7 @@ def smartloc_ranges(folder: Path) -> SmartlocLog:
 
 
 def smartloc_chain(
-    time: np.ndarray,
-    ranges: Ranges,
-    trajectory: Trajectory,
-    start_ecef_m: np.ndarray,
-    config: Config,
+    time: np.ndarray, ranges: Ranges, trajectory: Trajectory, start_ecef_m: np.ndarray, config: Config
 ) -> np.ndarray:
     """The rooms in the order of the pipeline, on ranges that have no ephemerides; arcs, NaN where dropped."""
     index = SearchIndex(trajectory)

@@ -12,14 +12,7 @@ from scipy.stats import norm
 import protection_oracle
 import raim_cases
 import raim_oracle as oracle
-from railfix.integrity.protection import (
-    Cause,
-    LevelStatus,
-    ProtectionLevel,
-    RiskBudget,
-    availability,
-    protection_level,
-)
+from railfix.integrity.protection import Cause, LevelStatus, ProtectionLevel, RiskBudget, availability, protection_level
 from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
 from raim_cases import point_model
@@ -237,11 +230,7 @@ def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
     model, case = linear_model(ranges, raim_cases.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0], raim_cases.LINE)
     budget = HAND.replaced(satellite_prior={"G": common, "E": 0.3}, local_prior=0.0)
     expected = protection_oracle.level(
-        case,
-        dict(enumerate(budget.prior(list(systems)))),
-        risk_per_sample=1e-4,
-        share=1 / 3,
-        false_alarm=0.01,
+        case, dict(enumerate(budget.prior(list(systems)))), risk_per_sample=1e-4, share=1 / 3, false_alarm=0.01
     )
     got = protection_level(model, list(systems), risk=budget)
     assert expected.level_m * (1.0 - 1e-7) <= got.level_m[0] <= 1.003 * expected.level_m < np.inf

@@ -34,6 +34,7 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
+from railfix.ranges.range_sigma import NominalErrors
 from railfix.run.processor_setup import make_processor
 
 #: Epochs a chunk, and epochs of the log.
@@ -118,8 +119,8 @@ def test_receiver_clock_steps_change_nothing(told: str):
 @pytest.mark.requirement("A4")
 def test_error_over_its_own_sigma():
     """The run has noise alone: no satellite or atmospheric errors are to be stated."""
-    exact = {"nominal": {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}}
-    result, _ = processor(exact).process(clean_observations())
+    exact = dict.fromkeys(NominalErrors.model_fields, 0.0)
+    result, _ = processor({"nominal": exact}).process(clean_observations())
     for name, found in result.antennas.items():
         settled = np.arange(len(found)) > 100
         error = found.chainage_m - true_chainage(name)

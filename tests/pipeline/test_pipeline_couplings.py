@@ -14,12 +14,13 @@ from pipeline_cases import clean_navigation, clean_observations, clean_trajector
 from railfix.core.arrays import copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
+from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.integrity import fault_exclusion
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline import level_stage, range_stage
-from railfix.pipeline.along_track import gnss_epochs
+from railfix.pipeline.along_track import compute_tilt_scale, gnss_epochs
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import Models
@@ -30,6 +31,8 @@ from railfix.positioning.igg3_fit import RobustFit
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
+from railfix.ranges.sources import BaseDifferences
+from railfix.tracking import Line
 
 BASE = {"screens": ["elevation", "raim"]}
 
@@ -338,6 +341,38 @@ def test_phases_of_the_filter_are_without_troposphere_and_satellite_clocks() -> 
     for other, sign in ((delayed, -1.0), (copy_with(ranges, satellites=later), 1.0)):
         change = gnss_epochs(other, scale, config, None)[0].phase_m - phase
         np.testing.assert_allclose(change[used], (sign * rising + 0.0 * change)[used], atol=1e-6)
+
+
+@pytest.mark.requirement("C6")
+def test_an_active_ionosphere_widens_the_filter_unless_it_is_corrected() -> None:
+    """A fifth of the vertical delay over 1 m, by the hour of the day and without satellites."""
+    ranges, line = ranges_of_the_filter(), Line(clean_trajectories()["front"])
+    longitude = np.degrees(np.arctan2(line.ecef_m[0, 1], line.ecef_m[0, 0]))
+    local_s = 3600.0 * np.array([0.0, 6.0, 10.0, 13.0, 14.0, 15.0, 18.0, 22.0, 24.0, 26.0])
+    time = np.datetime64("2024-03-05", "ns") + timedelta(local_s - 240.0 * longitude)
+    ranges = copy_with(ranges, time=time, ionosphere_m=np.full(ranges.ionosphere_m.shape, np.nan))
+    coefficients = np.array([6e-8, 0.0, 0.0, 0.0, 1e5, 0.0, 0.0, 0.0])
+    phase = 2.0 * np.pi * (local_s % 86400.0 - 50_400.0) / 1e5
+    day = np.where(np.abs(phase) < 1.57, 6e-8 * (1.0 - phase**2 / 2.0 + phase**4 / 24.0), 0.0)
+    # the standard's obliquity factor at 90 degrees is 1 + 16 (0.53 - 0.5)^3
+    vertical = SPEED_OF_LIGHT * (5e-9 + day) * (1.0 + 16.0 * 0.03**3)
+
+    def tilt(of: CorrectedRanges, klobuchar: np.ndarray | None = coefficients, **settings: Any) -> np.ndarray:
+        return compute_tilt_scale(of, line, klobuchar, parse_config(settings))
+
+    assert np.ptp(vertical) > 17.0
+    np.testing.assert_allclose(tilt(ranges), np.maximum(vertical / 5.0, 1.0), rtol=1e-3)
+    np.testing.assert_allclose(
+        tilt(ranges, nominal={"ionosphere_share": 0.5}), np.maximum(vertical / 2.0, 1.0), rtol=1e-3
+    )
+    assert (tilt(ranges, nominal={"ionosphere_share": 0.0}) == 1.0).all()
+    assert (tilt(ranges, None) == 1.0).all()
+    free = {"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5", "frequencies": "two"}
+    assert (tilt(ranges, **free) == 0.0).all()
+    unknown = np.full(ranges.code_m.shape, np.nan)
+    code = np.where(np.arange(10)[:, None] < 5, 0.0, unknown)
+    base = BaseDifferences(code_m=code, phase_m=unknown, arc=np.zeros(code.shape, dtype=np.int64), sigma_m=unknown)
+    np.testing.assert_array_equal(tilt(copy_with(ranges, base=base)), np.r_[np.ones(5), tilt(ranges)[5:]])
 
 
 @pytest.mark.requirement("B4")

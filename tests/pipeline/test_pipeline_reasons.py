@@ -66,7 +66,7 @@ def test_everything_there_is_ok():
 
 def test_nominal_errors_add_to_the_variance_along_the_line():
     """Without an error model the variance grows with the square of the nominal sigma, from that of the noise alone."""
-    none = {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}
+    none = {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "ionosphere_share": 0.0, "troposphere_sigma_m": 0.0}
     variance = [
         front_alone(front(), MASK_ONLY | {"nominal": none | {"satellite_sigma_m": sigma}}).along_sigma_m ** 2
         for sigma in (0.0, 1.0, 3.0)

@@ -138,9 +138,7 @@ def test_the_parked_antenna_stays_where_it_is(recording: Recording, corrected: A
 
 
 @pytest.mark.requirement("C2")
-def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
-    recording: Recording,
-) -> None:
+def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(recording: Recording) -> None:
     config = recording.config()
     assert level_facts(config)["kind"] == "sbas"
     assert set(level_facts(config)["satellite_prior"].values()) == {0.0}

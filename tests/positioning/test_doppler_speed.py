@@ -13,13 +13,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.timescale import seconds
 from railfix.gnss import concatenate
 from railfix.pipeline.config import DEFAULT_SIGNALS
-from railfix.positioning.doppler_speed import (
-    Dopplers,
-    DopplerSpeed,
-    DopplerSpeedLimits,
-    doppler_speed,
-    dopplers_of_log,
-)
+from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, DopplerSpeedLimits, doppler_speed, dopplers_of_log
 from railfix.simulate.scenario import ReceiverSettings, RunSettings, Scenario
 from railfix.simulate.signals import Simulation
 

@@ -14,7 +14,7 @@ SRC: Final = Path(__file__).resolve().parents[2] / "src" / "railfix"
 #: Files that may do what is forbidden, with the reason.
 EXCEPTIONS: Final[dict[str, str]] = {
     # and none by which acknowledgements wait, or a server takes turns between its connections and new ones
-    "ground/quic.py": "aioquic has no public setting by which a server asks a client for its certificate",
+    "ground/quic.py": "aioquic has no public setting by which a server asks a client for its certificate"
 }
 #: Names with an underscore that the standard library documents.
 DOCUMENTED: Final = frozenset({"_replace", "_fields", "_asdict", "_make", "_field_defaults", "_missing_"})

@@ -174,16 +174,22 @@ def test_nominal_sigma_by_hand() -> None:
     """At the zenith the root of the summed squares; at 30 degrees each term with its own mapping."""
     nominal = NominalErrors(satellite_sigma_m=0.8, ionosphere_sigma_m=1.0, troposphere_sigma_m=0.12)
     wet = 1.001 / np.sqrt(1.002001)
-    assert nominal.sigma_m(np.array([90.0]))[0] == pytest.approx(np.sqrt(0.64 + 1.0 + (0.12 * wet) ** 2))
+    assert nominal.sigma_m(np.array([90.0]), np.zeros(1))[0] == pytest.approx(np.sqrt(0.64 + 1.0 + (0.12 * wet) ** 2))
     # Elevation 30 degrees: cosine at the shell 6378.1363/6728.1363 x 0.8660 = 0.82097, obliquity 1.75143.
     only = {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}
-    assert NominalErrors(**only | {"ionosphere_sigma_m": 2.0}).sigma_m(np.array([30.0]))[0] == pytest.approx(
-        2.0 * 1.75143, rel=1e-4
-    )
-    assert NominalErrors(**only | {"troposphere_sigma_m": 1.0}).sigma_m(np.array([30.0]))[0] == pytest.approx(
-        1.99404, rel=1e-4
-    )
-    assert np.isnan(nominal.sigma_m(np.array([0.0]))[0])
+    assert NominalErrors(**only | {"ionosphere_sigma_m": 2.0}).sigma_m(np.array([30.0]), np.full(1, np.nan))[
+        0
+    ] == pytest.approx(2.0 * 1.75143, rel=1e-4)
+    assert NominalErrors(**only | {"troposphere_sigma_m": 1.0}).sigma_m(np.array([30.0]), np.full(1, np.nan))[
+        0
+    ] == pytest.approx(1.99404, rel=1e-4)
+    assert np.isnan(nominal.sigma_m(np.array([0.0]), np.array([40.0]))[0])
+    # A fifth of the slant delay (DO-229D J.2.3): 1.7 m of 8.5 m is less than 1.75143 m, 1.8 m of 9 m is more.
+    for slant, ionosphere in ((8.5, 1.75143), (9.0, 1.8), (90.0, 18.0)):
+        found = NominalErrors(**only | {"ionosphere_sigma_m": 1.0}).sigma_m(np.array([30.0]), np.array([slant]))[0]
+        assert found == pytest.approx(ionosphere, rel=1e-4)
+    assert NominalErrors(**only, ionosphere_share=0.0).sigma_m(np.array([30.0]), np.array([90.0]))[0] == 0.0
+    np.testing.assert_allclose(nominal.vertical_ionosphere_m(np.array([0.0, 4.9, 6.0, 20.0])), [1.0, 1.0, 1.2, 4.0])
     np.testing.assert_array_equal(nominal.unusual_sigma_m(np.array([2.0, 5.0, 6.85, np.nan])), [0.0, 0.0, 6.85, 0.0])
 
 
@@ -286,7 +292,7 @@ def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is
         )
         result = processor.process(observations)[0].antennas["front"]
         used = result.reason == 0
-        nominal = NominalErrors().sigma_m(result.elevation_deg)
+        nominal = NominalErrors().sigma_m(result.elevation_deg, result.corrected.ionosphere_m)
         assert result.bound_sigma_m[used] == pytest.approx(np.sqrt(9.0 + extra * nominal[used] ** 2))
 
 

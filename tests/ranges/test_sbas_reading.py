@@ -66,10 +66,7 @@ def as_ems(log: SbasMessages) -> str:
 
 def as_rinex(log: SbasMessages) -> str:
     """Type B: the time is that of the first bit, a second before the message is there."""
-    rows = [
-        f"{2.10:9.2f}           {'B: SBAS BROADCAST':40s}RINEX VERSION / TYPE",
-        f"{'':60s}END OF HEADER",
-    ]
+    rows = [f"{2.10:9.2f}           {'B: SBAS BROADCAST':40s}RINEX VERSION / TYPE", f"{'':60s}END OF HEADER"]
     for i in range(len(log)):
         t = (log.time[i] - np.timedelta64(1, "s")).astype("datetime64[s]").item()
         octets = [f"{octet:02X}" for octet in log.bits[i].tolist()]

@@ -51,9 +51,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
         duration_s=130.0,
         rate_hz=5.0,
         sensors=SensorSettings(
-            tachometer=TachometerSettings(diameter_error_m=0.004),
-            inertial=InertialSettings(rate_hz=50.0),
-            radar=None,
+            tachometer=TachometerSettings(diameter_error_m=0.004), inertial=InertialSettings(rate_hz=50.0), radar=None
         ),
     )
     files = write_run(scenario, folder, packing="plain")

@@ -15,16 +15,7 @@ from matplotlib.figure import Figure
 from chart_tables import START, errors_table, observations_table, positions_table, times
 from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.report import plots
-from railfix.report.plots.chart import (
-    Cells,
-    Chart,
-    Marks,
-    Points,
-    extremes,
-    nice_step,
-    one_per_cell,
-    spread,
-)
+from railfix.report.plots.chart import Cells, Chart, Marks, Points, extremes, nice_step, one_per_cell, spread
 
 pytestmark = pytest.mark.requirement("D3")
 

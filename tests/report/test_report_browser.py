@@ -19,10 +19,7 @@ from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from report_page import Page, browser, opened, run_browser, timing_ms, visited
 
-pytestmark = [
-    pytest.mark.requirement("D3"),
-    pytest.mark.skipif(browser() is None, reason="no chromium is installed"),
-]
+pytestmark = [pytest.mark.requirement("D3"), pytest.mark.skipif(browser() is None, reason="no chromium is installed")]
 
 #: Charts whose points belong to epochs, drawn so far, and the ranges of their axes.
 RANGES = """() => Object.fromEntries([...document.querySelectorAll("figure[data-drawn]")].filter(f => f.plot.div).map(

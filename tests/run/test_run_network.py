@@ -235,8 +235,7 @@ def test_there_and_back_over_the_same_tracks_chainage_rises_on_the_way_there() -
             track=np.concatenate([matched.track, matched.track[::-1]]),
             probabilities=np.concatenate([share, share[::-1]]),
             candidates=replace(
-                matched.candidates,
-                track=np.concatenate([matched.candidates.track, matched.candidates.track[::-1]]),
+                matched.candidates, track=np.concatenate([matched.candidates.track, matched.candidates.track[::-1]])
             ),
         )
         assert find_route(net, found) == ([0, 1, 3], [])

@@ -81,11 +81,7 @@ def test_what_judges(curve: Cn0Curve | None, limits: Cn0Limits, words: list[str]
     assert result.curve.reject.all(axis=0).tolist() == ["curve" in word for word in words]
 
 
-@given(
-    cn0=st.lists(st.floats(0, 60), min_size=4, max_size=4),
-    weaker=st.floats(0.0, 20.0),
-    elevation=st.floats(0, 90),
-)
+@given(cn0=st.lists(st.floats(0, 60), min_size=4, max_size=4), weaker=st.floats(0.0, 20.0), elevation=st.floats(0, 90))
 def test_a_weaker_signal_is_never_better(cn0: list[float], weaker: float, elevation: float) -> None:
     satellite, signal = np.array(["G01", "G02", "G03", "G04"]), np.array(["1C"] * 4)
     now = np.array([cn0])

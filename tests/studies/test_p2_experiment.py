@@ -35,9 +35,7 @@ def test_all_of_it_is_as_it_was(shown: list[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.requirement("E1")
-def test_seven_slides_of_figure_3_leave_a_metre_where_wheel_and_paper_lose_forty(
-    shown: list[str],
-) -> None:
+def test_seven_slides_of_figure_3_leave_a_metre_where_wheel_and_paper_lose_forty(shown: list[str]) -> None:
     for rule in ("rule of railfix, no map", "rule of railfix "):
         speed, way = numbers([line for line in shown if "m/s " in line], rule)
         assert abs(speed) < 1.5

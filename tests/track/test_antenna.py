@@ -97,12 +97,7 @@ def test_chainage_that_does_not_rise_is_refused(chainage: list[float]) -> None:
     zero = np.zeros(3)
     with pytest.raises(ValueError, match="rise strictly"):
         Trajectory(
-            name="x",
-            ecef_m=points,
-            chainage_m=np.array(chainage),
-            kilometrage_m=zero,
-            cant_m=zero,
-            roll_deg=zero,
+            name="x", ecef_m=points, chainage_m=np.array(chainage), kilometrage_m=zero, cant_m=zero, roll_deg=zero
         )
 
 

@@ -205,8 +205,7 @@ def test_infrabel_network_has_every_switch(infrabel: Network) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "share"),
-    [("28876_L36-B", 0.99), ("29304_L36-B_to_L36N-B", 0.99), ("28554_L36-A_to_L36C-A", 0.80)],
+    ("name", "share"), [("28876_L36-B", 0.99), ("29304_L36-B_to_L36N-B", 0.99), ("28554_L36-A_to_L36C-A", 0.80)]
 )
 def test_infrabel_runs_lie_on_tracks_where_the_positions_are_fixed(
     recordings: Path, infrabel: Network, name: str, share: float

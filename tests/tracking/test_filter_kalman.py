@@ -60,10 +60,7 @@ def expected(case: tuple[Ride, SensorEpochs]) -> Kalman:
 def assert_equal(found: Tracked, expected: Kalman) -> None:
     """Places and speeds agree to a micrometre, their standard deviations to a millionth."""
     assert (found.hypotheses == 1).all()
-    for values, unknown, sigmas in (
-        (found.arc_m, S, found.sigma_m),
-        (found.speed_mps, V, found.speed_sigma_mps),
-    ):
+    for values, unknown, sigmas in ((found.arc_m, S, found.sigma_m), (found.speed_mps, V, found.speed_sigma_mps)):
         np.testing.assert_allclose(values, expected.mean[:, unknown], rtol=0.0, atol=1e-6)
         np.testing.assert_allclose(sigmas, np.sqrt(expected.covariance[:, unknown, unknown]), rtol=1e-6)
     np.testing.assert_allclose(found.innovation[:, 0], expected.code_innovation, rtol=0.0, atol=1e-6)

@@ -42,6 +42,7 @@ def level_of(
     weak_s: float = 0.0,
     in_view: tuple[float, float] | None = None,
     slow: tuple[float, float, float] | None = None,
+    scale: float = 1.0,
 ) -> dict[str, float]:
     """Levels of a place at 100 m with a standard deviation of 1 m, by sub-filters and at most one other branch.
 
@@ -71,8 +72,8 @@ def level_of(
     )
     result = np.zeros(1, dtype=EPOCH_RESULT)
     settings = given(limits)
-    settings.line["tilt_m"] = TILT_M[0]
-    level.write_level(settings, state, branches, far, result[0])
+    settings.line["tilt_m"], settings.epoch["tilt_scale"] = TILT_M[0], scale
+    level.write_level(settings, 0, state, branches, far, result[0])
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     return {name: float(result[name][0]) for name in fields}
 
@@ -94,20 +95,41 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
 
 
 @pytest.mark.requirement("C6")
-def test_a_tilted_ionosphere_is_a_hypothesis_of_the_level() -> None:
+@pytest.mark.parametrize("scale", [0.0, 0.4, 1.0, 1.01, 1.5, 3.0])
+def test_the_ionosphere_of_the_epoch_and_a_tilted_one_are_hypotheses_of_the_level(scale: float) -> None:
     """Against the equation, with the place of a larger slow code error by inverting the information of both."""
     risks, slow = budget(LIMITS), (0.4, 0.9, -0.8)
-    found = level_of(["G01"], [100.4], [1.1], slow=slow)["level_m"]
-    information = np.linalg.inv([[1.0, slow[2]], [slow[2], slow[1]]])
-    vector = information @ [0.0, slow[0]]
-    information[1, 1] += 1.0 / TILT_M[0] ** 2 - 1.0 / LIMITS.slow_code_m**2
-    tilted = np.linalg.inv(information)
-    assert tilted[0, 0] > 2.0
-    place, sigma = np.array([0.0, 0.4, (tilted @ vector)[0]]), np.array([1.0, 1.1, tilted[0, 0] ** 0.5])
-    prior = np.array([1.0, risks.prior[0], LIMITS.level_tilt_prior])
+    found = level_of(["G01"], [100.4], [1.1], slow=slow, scale=scale)["level_m"]
+    hypotheses = [(1.0, 0.0, 1.0), (risks.prior[0], 0.4, 1.1)]
+    for prior, size in ((1.0, scale * LIMITS.slow_code_m), (LIMITS.level_tilt_prior, scale * TILT_M[0])):
+        information = np.linalg.inv([[1.0, slow[2]], [slow[2], slow[1]]])
+        vector = information @ [0.0, slow[0]]
+        if size > LIMITS.slow_code_m:
+            information[1, 1] += 1.0 / size**2 - 1.0 / LIMITS.slow_code_m**2
+            tilted = np.linalg.inv(information)
+            hypotheses.append((prior, (tilted @ vector)[0], tilted[0, 0] ** 0.5))
+    assert len(hypotheses) == 2 + (scale > 0.5) + (scale > 1.0)
+    prior, place, sigma = np.array(hypotheses).T
     parts = prior * (norm.sf((found - place) / sigma) + norm.sf((found + place) / sigma))
-    assert parts.argmax() == 2
     assert parts.sum() == pytest.approx(risks.risk, rel=1e-6)
+
+
+@pytest.mark.requirement("C6")
+def test_an_active_ionosphere_widens_sigma_as_a_larger_slow_code_error_would() -> None:
+    """Against the filter with that prior from its start; epochs as in the piece alone, whatever the pieces."""
+    train = ride(60.0, noise=0.3)
+    scale = np.where(np.arange(len(train.epochs)) < 30, 1.0, 3.0)
+    epochs = replace(train.epochs, tilt_scale=scale)
+    quiet, found = track(train.epochs, train.line, levels=True)[0], track(epochs, train.line, levels=True)[0]
+    larger = track(train.epochs, train.line, limits=TrackingLimits(slow_code_m=3.0), levels=True)[0]
+    np.testing.assert_array_equal(found.arc_m, quiet.arc_m)
+    np.testing.assert_array_equal(found.level_m[:30], quiet.level_m[:30])
+    np.testing.assert_array_equal(found.sigma_m[:30], quiet.sigma_m[:30])
+    assert found.sigma_m[40:] == pytest.approx(np.hypot(larger.sigma_m, found.arc_m - larger.arc_m)[40:], rel=0.05)
+    first, state = track(epochs.take(slice(0, 37)), train.line, levels=True)
+    second = track(epochs.take(slice(37, None)), train.line, state, levels=True)[0]
+    np.testing.assert_array_equal(np.append(first.level_m, second.level_m), found.level_m)
+    np.testing.assert_array_equal(np.append(first.sigma_m, second.sigma_m), found.sigma_m)
 
 
 @pytest.mark.requirement("C6")

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, join_rows
-from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState, wheel_signs
@@ -25,6 +26,7 @@ from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.positioning.carrier import CycleSlipState, Slips, corrected_phase_m, find_slips
 from railfix.positioning.map_offset import beyond_threshold
+from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
@@ -54,6 +56,8 @@ _END_M: Final = 30.0
 #: echoes arrive late, and are separable from 0.3 m on (P2, table 3).
 _GATE_SIGMAS: Final = 3.0
 _LATE_M: Final = 0.6
+#: Vertical error of the ionospheric model for which the filter's displacements (`slow_code_m`, `TILT_M`) are set [m].
+_QUIET_IONOSPHERE_M: Final = 1.0
 #: With sensors, the filter processes blocks of this much GPS time [ns].
 _BLOCK_NS: Final = 5_000_000_000
 #: Number of sigmas of the speed beyond which a direction is reported.
@@ -81,7 +85,7 @@ def along_track(
     units and balises.
     """
     epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
-    epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
+    epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m, tilt_scale=single.tilt_scale)
     trajectory = line.trajectory
     tracked, sensed, replays, after = _run_filter(
         epochs, line, config, copy_with(state, slips=after_slips), samples, references, (single.arc_m, single.sigma_m)
@@ -363,3 +367,21 @@ def gnss_epochs(
         cn0_dbhz=ranges.cn0_dbhz, off_map=np.zeros(len(obs.time), dtype=np.bool_),
     )  # fmt: skip
     return epochs, after
+
+
+def compute_tilt_scale(ranges: CorrectedRanges, line: Line, klobuchar: Floats | None, config: Config) -> Floats:
+    """Return `GnssEpochs.tilt_scale`, shape (T,): 0 for ionosphere-free codes, 1 where SBAS or a base station corrects
+    or no model is used, otherwise the ratio, at least 1, of the error of the Klobuchar model to 1 m.
+
+    The error is the fraction `NominalErrors.ionosphere_share` of the vertical delay at the beginning of the line, so
+    that it does not depend on the satellites in view.
+    """
+    one = np.ones(len(ranges.time))
+    if klobuchar is None or config.dual_frequency_sbas:
+        return 0.0 * one if config.dual_frequency_sbas else one
+    latitude, longitude, _ = geodetic_from_ecef(line.ecef_m[0])
+    zenith, north = np.full((len(one), 1), 90.0), np.zeros((len(one), 1))
+    coordinates = latitude * one, longitude * one
+    vertical = klobuchar_delay_m(ranges.time, *coordinates, zenith, north, klobuchar, np.array([FREQUENCY_L1]))[:, 0]
+    scale = np.maximum(config.nominal.ionosphere_share * vertical / _QUIET_IONOSPHERE_M, 1.0)
+    return scale if ranges.base is None else np.where(np.isfinite(ranges.base.code_m).any(axis=1), 1.0, scale)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from railfix.core.arrays import Floats
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.solution import Solution
@@ -25,6 +26,8 @@ class Chunk:
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
     sensors: SensorSamples | None  #: On-board sensor samples since the previous chunk.
     notes: tuple[str, ...]
+    #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
+    klobuchar: Floats | None = None
     screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each observation screen.
     combined: Combined | None = None  #: Combination of the codes of two frequencies.
     slips: Slips | None = None  #: Cycle slips of all channels of the observations, if the carrier phase is used.

@@ -51,6 +51,7 @@ class SingleEpochs:
     off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`).
     map_offset: Masks  #: True where the mean 3-D position of the last minutes is beside, above or below the line.
     suspicion: Codes  #: `railfix.integrity.interference.Suspicion`.
+    tilt_scale: Floats | None = None  #: `railfix.tracking.GnssEpochs.tilt_scale`.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,7 +43,8 @@ def combine_frequencies(
     code = np.where(usable, corrected.corrected_code_m, np.nan)
     known = config.noise.floor_sigma_m**2 + (corrected.nominal_m**2 if config.dual_frequency_sbas else 0.0)
     noise = np.sqrt(np.maximum(corrected.sigma_m**2 - known, 1e-4))
-    field_m = _field_of_ionosphere(corrected, np.hypot(config.nominal.ionosphere_sigma_m, ionosphere_sigma_m))
+    vertical_m = config.nominal.vertical_ionosphere_m(corrected.vertical_ionosphere_m)
+    field_m = _field_of_ionosphere(corrected, np.hypot(vertical_m, ionosphere_sigma_m))
     pairs = corrected.channels.pair_names, corrected.channels.pair_groups
 
     def own_codes(_: SearchIndex, rows: slice, state: TwoFrequencyState) -> tuple[Combined, TwoFrequencyState]:
@@ -74,12 +75,12 @@ def combine_frequencies(
     return corrected, found, verdict, after
 
 
-def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: float) -> Floats:
+def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: Floats) -> Floats:
     """Return sigmas of the ionospheric model error: offset, two gradients and satellite remainder, shape (T, K, 4)
     [m].
     """
     obliquity, azimuth = thin_shell_obliquity(ranges.elevation_deg), np.radians(ranges.azimuth_deg)
-    offset = vertical_m * obliquity
+    offset = vertical_m[:, None] * obliquity
     to_pierce_point = np.radians(90.0 - ranges.elevation_deg) - np.arccos(1.0 / obliquity)
     slope = offset * to_pierce_point / _IONOSPHERE_ARC
     rest = _IONOSPHERE_REST * ranges.ionosphere_m

@@ -246,7 +246,9 @@ def compute_araim(
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
     stated = support.arrays(corrected.satellite[channels].tolist())
-    air = config.nominal.replaced(satellite_sigma_m=0.0).sigma_m(corrected.elevation_deg[:, channels])
+    air = config.nominal.replaced(satellite_sigma_m=0.0).sigma_m(
+        corrected.elevation_deg[:, channels], corrected.ionosphere_m[:, channels]
+    )
     noise = level_scale(solution.noise_scale, config)[:, None] * corrected.sigma_m[:, channels]
     if config.error_model is not None:
         noise = np.fmax(noise, corrected.bound_sigma_m[:, channels])

@@ -23,7 +23,13 @@ from railfix.gnss.joined_observations import stack_observations
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.along_track import along_track, apply_spacing_verdict, single_epochs, with_passings
+from railfix.pipeline.along_track import (
+    along_track,
+    apply_spacing_verdict,
+    compute_tilt_scale,
+    single_epochs,
+    with_passings,
+)
 from railfix.pipeline.base_station_stage import BaseStation, Stations, check_base
 from railfix.pipeline.channel_book import ChannelBook, missing_notes
 from railfix.pipeline.chunk import Chunk
@@ -289,7 +295,7 @@ class EpochProcessor:
         channels, source = self._channels.of(obs, received.navigation), correction_source(received, self.config)
         corrected, near = correct_ranges(obs, channels, self.config, source, antennas, error_model=self._error_model)
         chunk = Chunk(
-            names=names, antennas=antennas, corrected=corrected, sensors=sensors,
+            names=names, antennas=antennas, corrected=corrected, sensors=sensors, klobuchar=received.klobuchar,
             pair=self._pair(obs.time, near.arc_m, dict(zip(names, parts, strict=True))),
             notes=(
                 *missing_notes(received, self.config, corrected.second), *received.notes, *self._lacking,
@@ -370,10 +376,12 @@ class EpochProcessor:
         assert solution is not None, "single epochs are positioned before the filter"
 
         def one_antenna(name: str) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
-            rows, sensors = chunk.rows[name], chunk.sensors
+            rows, sensors, line = chunk.rows[name], chunk.sensors, self.lines[name]
+            corrected = take_epochs(chunk.corrected, rows)
+            scale = compute_tilt_scale(corrected, line, chunk.klobuchar, self.config)
+            single = single_epochs(take_epochs(solution, rows), interference[name], self.config)
             return along_track(
-                take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
-                single_epochs(take_epochs(solution, rows), interference[name], self.config), self.lines[name],
+                corrected, take_epochs(chunk.slips, rows), copy_with(single, tilt_scale=scale), line,
                 self.config, state.fusion.get(name) or FilterState(), samples=sensors,
                 references=self._line_references(name),
             )  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
+from railfix.core.array_functions import medians
 from railfix.core.arrays import Bits, Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
@@ -26,6 +27,15 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
     """Return the ratio of slant to vertical delay of a thin shell (DO-229D A.4.4.10.4); NaN up to 0.1 deg elevation."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
+
+
+def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
+    """Return the median over channels of the vertical delay on L1 that slant delays imply, shape (T,) [m].
+
+    `slant_m` and `elevation_deg` have shape (T, K), `frequency_hz`, shape (K,), is the carrier. 0 without a delay.
+    """
+    vertical = medians(slant_m / thin_shell_obliquity(elevation_deg) * (frequency_hz / FREQUENCY_L1) ** 2)
+    return np.where(np.isfinite(vertical), vertical, 0.0)
 
 
 def geomagnetic_latitude(latitude: Floats, longitude: Floats) -> Floats:

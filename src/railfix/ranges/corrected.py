@@ -14,7 +14,7 @@ from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates
-from railfix.ranges.atmosphere import SeenFrom
+from railfix.ranges.atmosphere import SeenFrom, vertical_delay_m
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
@@ -76,7 +76,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     troposphere_m: Floats
     #: Standard deviation of satellite and atmospheric errors, from SBAS, otherwise from `NominalErrors`; shape (T, K).
     nominal_m: Floats
-    #: Part of the standard deviation from `NominalErrors` that depends on elevation only; 0 with SBAS; shape (T, K).
+    #: Standard deviation that `NominalErrors` assumes by elevation and ionospheric delay; 0 with SBAS; shape (T, K).
     nominal_elevation_sigma_m: Floats
     #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
@@ -90,6 +90,11 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     def columns(self) -> Indices:
         """Columns of the channels in the observations, shape (K,)."""
         return self.channels.columns
+
+    @property
+    def vertical_ionosphere_m(self) -> Floats:
+        """Vertical ionospheric delay on L1 by the model in use, shape (T,); 0 without a model."""
+        return vertical_delay_m(self.ionosphere_m, self.elevation_deg, self.frequency_hz)
 
     @property
     def used_code_m(self) -> Floats:

@@ -52,8 +52,8 @@ _USUAL_ACCURACY_M: Final = 5.0
 class NominalErrors(Settings):
     """Assumed standard deviations of the errors that a local error model does not cover, where SBAS gives none.
 
-    ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
-    (A.4.4.10.4 and A.4.2.4).
+    ``sigma^2 = satellite^2 + max(ionosphere F(el), share I)^2 + (troposphere m(el))^2`` with the mappings of DO-229D
+    (A.4.4.10.4 and A.4.2.4) and the modelled slant delay I.
     """
 
     #: Orbit and clock error in the range. This error is about half a metre for GPS and Galileo, whose service
@@ -62,17 +62,32 @@ class NominalErrors(Settings):
     #: Vertical delay error of the Klobuchar model. The error is mostly common to all satellites, but treated as
     #: independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
+    #: Least ionospheric error as a fraction of the modelled slant delay, which depends on local time, season and solar
+    #: activity; a fifth is the value of DO-229D J.2.3. Where this exceeds a vertical error of 1 m, it also widens the
+    #: filter's sigma and level, unless SBAS or a base station corrects the ionosphere. 0 switches it off.
+    ionosphere_share: float = Field(default=0.2, ge=0)
     #: Additional vertical delay error with typical coefficients, which is also added to the sigma of the ranges.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
     #: Vertical delay error of the standard atmosphere (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
-    def sigma_m(self, elevation_deg: Floats) -> Floats:
-        """Return the standard deviation at elevations, any shape [m]; NaN up to 0.1 deg."""
+    def sigma_m(self, elevation_deg: Floats, ionosphere_m: Floats) -> Floats:
+        """Return the standard deviation at elevations, any shape [m]; NaN up to 0.1 deg.
+
+        `ionosphere_m`, same shape, are the modelled slant delays; NaN or 0 without a model.
+        """
         sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
         wet = 1.001 / np.sqrt(0.002001 + sine**2)
-        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
+        constant = self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)
+        ionosphere = np.where(
+            self.ionosphere_share * ionosphere_m > constant, self.ionosphere_share * ionosphere_m, constant
+        )
+        parts = (self.satellite_sigma_m**2, ionosphere**2)
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
+
+    def vertical_ionosphere_m(self, vertical_m: Floats) -> Floats:
+        """Return the standard deviation of the vertical delay for modelled vertical delays, any shape [m]."""
+        return np.maximum(self.ionosphere_sigma_m, self.ionosphere_share * vertical_m)
 
     def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
         """Return broadcast accuracies that are worse than usual [m], any shape; 0 for usual and unknown accuracies."""

@@ -47,8 +47,7 @@ class SourceDelays(NamedTuple):
 
     delays: Delays  #: Delays that are subtracted from the codes.
     sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
-    #: Standard deviation of satellite and atmospheric errors, and its part that depends on elevation only; shape (T,
-    #: K).
+    #: Standard deviation of satellite and atmospheric errors, and its part assumed by `NominalErrors`; shape (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
@@ -143,5 +142,5 @@ class BroadcastSource:
             troposphere=self.troposphere,
         )  # fmt: skip
         beyond = np.hypot(delays.sigma_m, self.nominal.unusual_sigma_m(satellites.states.accuracy_m))
-        unmodelled = self.nominal.sigma_m(seen.elevation_deg)
+        unmodelled = self.nominal.sigma_m(seen.elevation_deg, delays.ionosphere_m)
         return SourceDelays(delays, beyond, np.hypot(unmodelled, beyond), unmodelled)

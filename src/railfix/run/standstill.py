@@ -100,7 +100,8 @@ def standstill_codes(
     time, residual, names = obs.time, _residual(seen, origin), seen.corrected.channels.satellite
     columns, phases = np.arange(len(names)), None
     elevation = np.nanmedian(seen.corrected.elevation_deg, axis=0)
-    nominal = np.hypot(config.nominal.sigma_m(elevation), received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
+    nominal = config.nominal.sigma_m(elevation, np.nanmedian(seen.corrected.ionosphere_m, axis=0))
+    nominal = np.hypot(nominal, received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
     if base is not None:
         of_base, base_ecef_m = base
         other = ranges_without_map(of_base, received, config, book)

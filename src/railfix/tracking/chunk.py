@@ -60,13 +60,11 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     earlier = np.concatenate([np.array([state.time]), epochs.time[:-1]])
     gap = seconds(epochs.time - earlier)
     if np.isnat(state.time):
-        gap[:1] = 0.0
+        gap[:1] = 1.0
     apart = gap > _APART_S
     # The interval is at least a millisecond, even for equal times, because Dopplers and forces are weighted by it.
     interval = np.maximum(gap, _SHORTEST_S)
     interval[apart] = 1.0
-    if np.isnat(state.time):
-        interval[:1] = 1.0
 
     any_kind = np.asarray(has.any(axis=0), dtype=np.bool_)
     slot = _with_satellites(state, epochs.satellite, np.asarray(any_kind.any(axis=0)))
@@ -94,6 +92,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     channel["before_ecef_m"], channel["code_sigma_m"] = before, epochs.code_sigma_m
     for name, values in (("measured", measured), ("has", has), ("variance", variance)):
         channel[name] = np.moveaxis(values, 0, -1)
+    epoch["tilt_scale"] = 1.0 if epochs.tilt_scale is None else epochs.tilt_scale
     if epochs.near_ecef_m is not None:
         _write_velocities(epoch, channel, epochs.near_ecef_m)
     return Chunk(

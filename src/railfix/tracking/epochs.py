@@ -50,6 +50,9 @@ class GnssEpochs:
     #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
     #: measurement is used.
     off_map: Masks
+    #: Error of the ionospheric model in units of the error in a quiet ionosphere, shape (T,): more than 1 widens sigma
+    #: and level, 0 is for codes free of the ionosphere; None is 1.
+    tilt_scale: Floats | None = None
     #: Position computed without the line, accurate to some hundred metres, shape (T, 3). The velocity across the line
     #: is computed at this position, and is not used where it is NaN or None.
     near_ecef_m: Floats | None = None

@@ -15,7 +15,7 @@ from railfix.track.trajectory import Trajectory
 
 #: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude [m]: 2/9 of the
 #: vertical-delay sigma without SBAS in DO-229D J.2.3, which is 9 m up to 20 deg, 4.5 m up to 55 deg, and 6 m beyond. At
-#: middle latitudes the displacement equals `slow_code_m`.
+#: middle latitudes the displacement equals `slow_code_m`. `GnssEpochs.tilt_scale` multiplies both at each epoch.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 

@@ -30,6 +30,7 @@ EPOCH: Final = record_of({
     "interval_s": float,  # since the previous epoch [s]
     "begins": bool,  # the state restarts before this epoch
     "coded": bool,  # a satellite has codes
+    "tilt_scale": float,  # error of the ionospheric model in units of a quiet ionosphere's; 0 for codes free of it
     "motion_measured": bool,  # phases or Dopplers of at least four satellites, enough to propagate the position
     "velocity_mps": (float, (3,)),  # ECEF, from phases or Dopplers without the line [m/s]; NaN if unknown
     "velocity_covariance": (float, (3, 3)),  # [m2/s2]

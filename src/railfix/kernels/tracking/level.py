@@ -59,21 +59,22 @@ def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple
 
 
 @inner
-def _find_subfilters(given: Given, state: State) -> Alternatives:
-    """Return the running sub-filters, and the filter itself for a tilted ionosphere."""
+def _find_subfilters(given: Given, t: int, state: State) -> Alternatives:
+    """Return the running sub-filters, and the filter itself for the epoch's ionosphere and for a tilted ionosphere."""
     first, size, most = len(state.hypothesis), 0, find_other(state, ix.ALL_IN_VIEW)
-    away, sigma, probability = np.empty(most + 1), np.empty(most + 1), np.empty(most + 1)
+    away, sigma, probability = np.empty(most + 2), np.empty(most + 2), np.empty(most + 2)
     for b in range(most):
         if state.source[b].running:
             away[size] = abs(state.x[first + b, ix.ARC] - state.x[0, ix.ARC])
             sigma[size], probability[size] = math.sqrt(state.P[first + b, ix.ARC, ix.ARC]), state.source[b].prior
             size += 1
-    slow_m, tilt_m = given.parameters[0].slow_code_m, given.line[0].tilt_m
-    if tilt_m > slow_m:
-        place, variance = widen_slow_code(slow_m, tilt_m, state.x[0], state.P[0])
-        away[size], sigma[size] = abs(place - state.x[0, ix.ARC]), math.sqrt(variance)
-        probability[size] = given.parameters[0].level_tilt_prior
-        size += 1
+    slow_m, scale = given.parameters[0].slow_code_m, given.epoch[t].tilt_scale
+    for wide_m, prior in ((slow_m, 1.0), (given.line[0].tilt_m, given.parameters[0].level_tilt_prior)):
+        if scale * wide_m > slow_m:
+            place, variance = widen_slow_code(slow_m, scale * wide_m, state.x[0], state.P[0])
+            away[size], sigma[size] = abs(place - state.x[0, ix.ARC]), math.sqrt(variance)
+            probability[size] = prior
+            size += 1
     return Alternatives(away[:size], away[:size], away[:size], sigma[:size], probability[:size])
 
 
@@ -156,7 +157,7 @@ def find_unchecked(state: State) -> float:
 
 
 @inner
-def write_level(given: Given, state: State, positions: Alternatives, unbounded: float, result: Record) -> None:
+def write_level(given: Given, t: int, state: State, positions: Alternatives, unbounded: float, result: Record) -> None:
     """Write the level of the first hypothesis and its parts.
 
     The level is infinite without sub-filters, where one has been contradicted for longer than `LEVEL_DOUBT_S`, and
@@ -182,7 +183,7 @@ def write_level(given: Given, state: State, positions: Alternatives, unbounded: 
     if math.isnan(apart) or contradicted:
         return
     pairs, spent = _find_pairs(state, parameters.level_risk, start)
-    subfilters = _find_subfilters(given, state)
+    subfilters = _find_subfilters(given, t, state)
     crossed, spent_on_branches = _cross(positions, subfilters, parameters.level_risk, start)
     risk = parameters.level_risk - spent - spent_on_branches
     if risk <= 0.0:
@@ -232,10 +233,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
                 spent += probability[a] * 0.5 * math.erfc(away / math.sqrt(2.0))
                 slope += probability[a] * math.exp(-0.5 * away * away) / own[a]
         slope /= math.sqrt(2.0 * math.pi)
-        if spent > risk:
-            low = level
-        else:
-            high = level
+        low, high = (level, high) if spent > risk else (low, level)
         step = spent / slope * math.log(spent / risk) if spent > 0.0 and slope > 0.0 else -math.inf
         if not low <= level + step <= high:
             step = (0.5 * (low + high) if high < math.inf else 2.0 * level) - level

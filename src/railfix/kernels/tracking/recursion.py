@@ -18,7 +18,7 @@ from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
 from railfix.kernels.tracking.layout import Given, Results, Rows, State, Trace
-from railfix.kernels.tracking.level import bound_speed, find_other_positions, write_level
+from railfix.kernels.tracking.level import bound_speed, find_other_positions, widen_slow_code, write_level
 from railfix.kernels.tracking.line import excess_beyond_end, wrap_arc, write_point
 from railfix.kernels.tracking.measurements import choose_measurements, start_clocks
 from railfix.kernels.tracking.model import add_bend, narrow_speed_range, predict, restart
@@ -259,7 +259,9 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
         result.status = ix.EXPIRED
         return
     others, unbounded = find_other_positions(given, state)
-    spread = sigma * sigma
+    usual_m = parameters.slow_code_m * max(given.epoch[t].tilt_scale, 1.0)
+    place, variance = widen_slow_code(parameters.slow_code_m, usual_m, x, P)
+    spread = sigma * sigma + (variance - P[ix.ARC, ix.ARC]) + (place - x[ix.ARC]) ** 2
     for a in range(len(others.sigma_m)):
         own = others.straight_m[a] ** 2 + others.sigma_m[a] ** 2
         spread += others.probability[a] * (own - sigma * sigma)
@@ -268,12 +270,10 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     result.acceleration_mps2 = x[ix.ACCELERATION]
     result.wheel_scale, result.force_offset_mps2, result.radar_scale = x[ix.WHEEL], x[ix.FORCE_OFFSET], x[ix.RADAR]
     result.map_scale = math.exp(0.5 * monitors.map_log_variance)
-    if unbounded > parameters.level_risk:
-        monitors.ambiguity_hold_s = constants.LEVEL_HOLD_S
-    else:
-        monitors.ambiguity_hold_s = max(monitors.ambiguity_hold_s - given.epoch[t].interval_s, 0.0)
+    held_s = max(monitors.ambiguity_hold_s - given.epoch[t].interval_s, 0.0)
+    monitors.ambiguity_hold_s = constants.LEVEL_HOLD_S if unbounded > parameters.level_risk else held_s
     if len(state.source):
-        write_level(given, state, others, unbounded, result)
+        write_level(given, t, state, others, unbounded, result)
         if monitors.level_hold_s > 0.0:
             result.ground_level_m = math.inf
         if monitors.level_hold_s > 0.0 or monitors.ambiguity_hold_s > 0.0:
