@@ -51,22 +51,21 @@ class EpochOrder:
         waiting: list[FileEpochs] = []  # for later epochs, which may precede them
         for run in runs:
             waiting.append(run)
-            if self._rise_to(waiting):
+            if self._rise(epochs.time for _, epochs, _ in waiting):
                 while sum(len(epochs) for _, epochs, _ in waiting[1:]) >= _HELD:
                     yield self._hand_on(waiting.pop(0)[1])
             else:
                 ready, waiting = self._sort(waiting, final=False)
                 yield ready
-        if self._rise_to(waiting):
+        if self._rise(epochs.time for _, epochs, _ in waiting):
             yield from (self._hand_on(epochs) for _, epochs, _ in waiting)
         else:
             yield self._sort(waiting, final=True)[0]
         yield self._summary()
 
-    def _rise_to(self, waiting: Sequence[FileEpochs]) -> bool:
-        """Return whether the times of the last part returned and of the waiting epochs rise strictly."""
-        times = [*(time[-1:] for time in self._times[-1:]), *(epochs.time for _, epochs, _ in waiting)]
-        time = np.concatenate([*times, np.empty(0, "datetime64[ns]")])
+    def _rise(self, times: Iterable[Datetimes]) -> bool:
+        """Return whether the times of consecutive parts rise strictly, the last time returned included."""
+        time = np.concatenate([*(time[-1:] for time in self._times[-1:]), *times, np.empty(0, "datetime64[ns]")])
         return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
 
     def _hand_on(self, part: Observations) -> Observations:

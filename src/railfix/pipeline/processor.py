@@ -73,7 +73,8 @@ class EpochProcessor:
     Parameters
     ----------
     config : Config
-        The files named in it are not read here; pass their contents (`railfix.run.make_processor` does).
+        The files named in it are not read here; pass their contents, as
+        `railfix.run.processor_setup.make_processor` does.
     trajectories : mapping of str to Trajectory
         The trajectory of each antenna, one or two ("front", "rear").
     navigation : Navigation, optional

@@ -67,7 +67,9 @@ def correct_ranges(
         raw_ranges(obs, channels, satellites), antennas, limits=config.single_point, section=config.section
     )
     corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, gross=near.gross, noise=config.noise)
-    corrected = find_second_codes(copy_with(corrected, unsure=near.unsure), source, config.noise)
+    corrected = copy_with(corrected, unsure=near.unsure)
+    if source.second == "required" or (source.second == "optional" and channels.second.size):
+        corrected = find_second_codes(corrected, source, config.noise)
     if error_model is not None:
         corrected = _apply_error_model(error_model, corrected, antennas, near.arc_m, config)
     return corrected, near

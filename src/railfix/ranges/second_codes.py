@@ -20,7 +20,7 @@ from railfix.ranges.sources import CorrectionSource
 
 
 def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, noise: CodeNoise) -> CorrectedRanges:
-    """Return the ranges with the second code of each satellite, corrected like the first code; unchanged without any.
+    """Return the ranges with the second code of each satellite, corrected like the first code.
 
     The second code is the first signal, in order of preference, that is observed, healthy and has a group delay.
     Satellite position and clock are the same as for the first code, and the group delay is from the same record; where
@@ -33,7 +33,7 @@ def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, nois
         alone = np.isnan(second.code_m) if second is not None else np.ones(corrected.reason.shape, dtype=bool)
         reason = np.where((corrected.reason == 0) & alone, int(Reason.SBAS_NO_IONOSPHERE), corrected.reason)
         corrected = copy_with(corrected, reason=reason)
-    return corrected if source.second == "none" else copy_with(corrected, second=second)
+    return copy_with(corrected, second=second)
 
 
 def _correct_second_codes(corrected: CorrectedRanges, navigation: Navigation, noise: CodeNoise) -> SecondCodes:
