@@ -47,9 +47,6 @@ def output(sequence: int, **values: Any) -> LiveOutput:
     return LiveOutput(message=message, result=None)
 
 
-# --- outlets ------------------------------------------------------------------
-
-
 def test_a_slow_reader_delays_nothing_and_loses_what_does_not_fit() -> None:
     """A pipe that nobody reads: 5000 messages are handed over meanwhile, the rest is counted."""
     release, taken = threading.Event(), list[int]()
@@ -149,9 +146,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-# --- MQTT ---------------------------------------------------------------------
 
 
 def started_broker(folder: Path, port: int, *, password: bool) -> subprocess.Popen[bytes]:
@@ -323,9 +317,6 @@ def test_a_session_that_does_not_begin_leaves_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# --- forms --------------------------------------------------------------------
-
-
 def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:
     words = ["live", "--front", str(demo_files()["front"]), "--track", str(demo_files()["track"])]
     done = RUNNER.invoke(app, [*words, "--send", "etcs@-", "--live", "reference_m=400000"])
@@ -380,9 +371,6 @@ def test_an_output_on_a_full_disk_ends_alone(tmp_path: Path) -> None:
     assert "/dev/full: cannot be written (No space left on device); this output has ended, the others continue" in said
     alone = RUNNER.invoke(app, [*words, "--send", "json@/dev/full"])
     assert alone.exit_code == 8
-
-
-# --- what a person sees -------------------------------------------------------
 
 
 @pytest.mark.parametrize(("terminal", "status"), [*product((True, False), repeat=2)])

@@ -89,9 +89,6 @@ def in_fragments(data: bytes, seed: int) -> list[bytes]:
     return [bytes(part) for part in np.split(np.frombuffer(data, np.uint8), cuts) if len(part)]
 
 
-# --- serial -------------------------------------------------------------------
-
-
 def test_a_serial_line(log: bytes, tags: list[np.datetime64]) -> None:
     """A pair of pseudo-terminals: every epoch arrives; the end of the line is an error that names it."""
     pytest.importorskip("serial", reason="pyserial is not installed")
@@ -138,9 +135,6 @@ def test_a_serial_line(log: bytes, tags: list[np.datetime64]) -> None:
     writer.join()
     os.close(theirs)
     assert seen == tags
-
-
-# --- NTRIP --------------------------------------------------------------------
 
 
 def caster(log: bytes, version: int, *, chunked: bool = True) -> tuple[Answer, list[bytes]]:
@@ -207,9 +201,6 @@ def test_what_a_caster_refuses_ends_the_session(log: bytes, place: str, says: st
         asyncio.run(run())
     assert "wrong" not in str(error.value)
     assert "***" in str(error.value)
-
-
-# --- breaks -------------------------------------------------------------------
 
 
 def test_a_broken_connection_is_opened_again(
@@ -290,9 +281,6 @@ def test_a_message_cut_off_by_a_break_does_not_swallow_the_next(log: bytes) -> N
     assert sum(len(item.epochs) for item in items) == 1
     items = list(receive_bytes(log[second:], state.after_break()))
     assert sum(len(item.epochs) for item in items) == EPOCHS - 1
-
-
-# --- time tags ----------------------------------------------------------------
 
 
 def shifted(observations: Observations, by: np.timedelta64) -> Observations:

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import (
@@ -22,7 +23,9 @@ from railfix.motion.samples import (
 )
 from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
+from railfix.run.checks import check_sensor_time
 from railfix.run.sensor_checks import SensorChecks, compute_motion, range_notes, sign_notes
+from railfix.run.tally import AntennaTally, Tally
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -41,9 +44,8 @@ UNITS = GroundUnits(
 
 def places(speed_mps: float) -> pl.DataFrame:
     """The antenna once a second; the line runs east, the train at this speed."""
-    chainage = AT[:: 1 if speed_mps > 0 else -1]
     time = START + (np.arange(len(AT)) * 1e9).astype("timedelta64[ns]")
-    return pl.DataFrame({"time_gpst": time, "chainage_m": chainage})
+    return pl.DataFrame({"time_gpst": time, "chainage_m": AT[:: 1 if speed_mps > 0 else -1]})
 
 
 def ranges(table: pl.DataFrame, ahead_m: float, excess_m: float, *, right_m: float = 0.0) -> StationRanges:
@@ -66,8 +68,7 @@ def test_the_place_of_the_device_is_found_whichever_way_the_train_runs_and_faces
     trajectory, sign = replace(LINE, facing=facing), 1.0 if facing == "rising" else -1.0
     table = places(speed)
     made = ranges(table, 8.0 * sign, 0.0)
-    right = SensorLimits(range_ahead_m=8.0, range_above_m=1.0)
-    assert list(range_notes(made, UNITS, table, trajectory, right)) == []
+    assert list(range_notes(made, UNITS, table, trajectory, SensorLimits(range_ahead_m=8.0, range_above_m=1.0))) == []
     (note,) = range_notes(made, UNITS, table, trajectory, SensorLimits(range_above_m=1.0))
     assert f"8.0 m {'ahead of' if sign > 0 else 'behind'} satellite positions" in note
     assert "sensors.range_ahead_m = 8.0 would fit" in note
@@ -87,6 +88,14 @@ def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> No
     assert "too long" in "".join(range_notes(beside, UNITS, table, LINE, limits))
     (note,) = range_notes(ranges(table, 0.0, 0.0), UNITS, table[:3], LINE, limits)
     assert "too few ranges" in note
+    later = table.with_columns(pl.col("time_gpst").dt.offset_by("100ms"), pl.col("chainage_m") + 9.0)
+    ten_hertz = pl.concat([table, later]).sort("time_gpst")
+    rows = ten_hertz.with_columns(status=pl.lit("ok"), sources=pl.lit("doppler"), speed_mps=pl.lit(10.0))
+    for size in (1, 50, 1000):  # two positions a second, whatever the length of the chunks
+        checks = SensorChecks()
+        for part in rows.iter_slices(size):
+            checks.take(part, part)
+        assert checks.notes(SensorSamples(ranging=ranges(table, -6.0, -4.0)), UNITS, LINE, limits) == tuple(both)
 
 
 #: A ride on a circle to the right that climbs: speed 12 + 6 sin(2 pi t / 80), so 80 s of braking and accelerating.
@@ -233,6 +242,18 @@ def test_a_mounting_that_moves_by_a_degree_is_found_and_one_that_does_not_is_lef
     assert again.time == step.time
 
 
+def test_a_train_at_rest_has_no_pulses() -> None:
+    """A table that begins after a short log is reported; one of another day is an error."""
+    tally = Tally(antennas={"front": AntennaTally(first=START, last=START + np.timedelta64(9, "s"))})
+    later = START + np.arange(1, 3) * np.timedelta64(1, "h")
+    pulses = TachometerPulses(time=later, pulse=np.arange(2), direction=np.ones(2, dtype=np.int64))
+    (note,) = check_sensor_time(SensorSamples(tachometer=pulses), tally)
+    assert "the samples of --tachometer" in note
+    another_day = replace(pulses, time=later + np.timedelta64(24, "h"))
+    with pytest.raises(MismatchError, match="have no time in common; give the samples of the day of the logs"):
+        check_sensor_time(SensorSamples(tachometer=another_day), tally)
+
+
 @pytest.mark.requirement("E4")
 def test_a_radar_that_swings_has_not_moved() -> None:
     """Half a minute too much, half a minute too little: a step stays on one side."""
@@ -266,14 +287,12 @@ def test_a_run_names_a_mounting_that_moves() -> None:
     places, samples = circle(np.arange(0.0, SECONDS, 1.0)), on_the_circle(1.0)
     t = np.arange(0.0, SECONDS, 0.5)
     time, right = START + (t * 1e9).astype("timedelta64[ns]"), 12.0 + 6.0 * np.sin(2.0 * np.pi * t / 80.0)
-    speeds = pl.DataFrame({"time_gpst": time, "speed_mps": right})
-    checks = SensorChecks(places=[places], speeds=[speeds])
-    radar = samples.radar
-    scale = np.where(radar.time > START + np.timedelta64(200, "s"), 0.97, 1.0)
-    moved = replace(samples, radar=replace(radar, speed_mps=scale * radar.speed_mps))
+    checks = SensorChecks(places=[places], speeds=[pl.DataFrame({"time_gpst": time, "speed_mps": right})])
+    scale = np.where(samples.radar.time > START + np.timedelta64(200, "s"), 0.97, 1.0)
+    moved = replace(samples.radar, speed_mps=scale * samples.radar.speed_mps)
     assert checks.notes(samples, None, round_line(), SensorLimits()) == ()
     assert checks.radar_alarms(samples.radar) == ()
-    notes = checks.radar_alarms(moved.radar)
+    notes = checks.radar_alarms(moved)
     assert any("differ from satellite speeds by -3.0 % (+0.0 % before); check" in note for note in notes), notes
 
 

@@ -26,7 +26,7 @@ from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.live.sinks import Outlet, open_sink, parse_file_target
 from railfix.live.sources import check_source, is_file
-from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.live.state import SavedSession, belongs_to, check_state_path, load_state, write_state
 from railfix.live.stream import FOREVER, Sensed
 from railfix.live.warm_up import prepare_kernels
 from railfix.motion.samples import SensorSamples
@@ -96,7 +96,7 @@ def _files_read(inputs: LiveInputs) -> list[Path]:
 
 
 def _check_outputs(inputs: LiveInputs) -> None:
-    """Raise OutputError if a file to be written is also read or is written twice, or if the log file is not a log."""
+    """Raise OutputError if a file to be written is also read or is written twice, or cannot be the log or state."""
     named = [parse_file_target(text) for text in inputs.send]
     written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
     for k, path in enumerate(written):
@@ -105,6 +105,8 @@ def _check_outputs(inputs: LiveInputs) -> None:
             raise OutputError(f"{path}: is given for two outputs; give another file for one of them")
     if inputs.log is not None:
         check_log_file(inputs.log)
+    if inputs.state is not None:
+        check_state_path(inputs.state)
 
 
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
@@ -223,12 +225,8 @@ def _hooks(
         observers.append(watched.send)
         sensed = watched.send
     if inputs.state is not None:
-        path, under = (
-            inputs.state,
-            belongs_to(
-                inputs.files, {"settings": inputs.config, "track reading": inputs.reading}, tuple(inputs.sources)
-            ),
-        )
+        settings = {"settings": inputs.config, "track reading": inputs.reading}
+        path, under = inputs.state, belongs_to(inputs.files, settings, tuple(inputs.sources), base=inputs.base_place)
         loaded = load_state(path, under)
         log.say(loaded.outcome)
         if loaded.session is not None:

@@ -187,6 +187,9 @@ class _Session:
                     self.in_idle_time(outputs)
             if not replay:  # process epochs that still wait for their pair or period
                 self.emit(END_NS, self.clock())
+            for pump in pumps:  # an error of a source that ended while items were waiting
+                if pump.done():
+                    pump.result()
         except asyncio.CancelledError:
             self.save()
             raise

@@ -12,6 +12,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -46,13 +47,17 @@ class Loaded:
 
 
 def belongs_to(
-    files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
+    files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...], *, base: str | None = None
 ) -> dict[str, Any]:
-    """Return entries that must agree for a state to be used: versions, antennas, hashes of files and settings."""
+    """Return entries that must agree for a state to be used: versions, antennas, hashes of files and settings.
+
+    `base` is the given position of the base station.
+    """
     own = f"{railfix.__version__} ({source_commit()})"
     return {
         "version": f"railfix {own}, numpy {np.__version__}, Python {platform.python_version()}",
         "antennas": list(antennas),
+        "position of the base station": base,
         **{name: file_sha256(path) for name, path in files.items()},
         **{
             name: hashlib.sha256(json.dumps(values.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
@@ -65,7 +70,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
     """Write a complete state file with the entries of `belongs_to`, or keep the previous file and raise OutputError."""
     content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    part = path.with_name(f".{path.name}.part")
+    part = _part(path)
     try:
         with part.open("wb") as file:
             file.write(json.dumps(head).encode() + b"\n" + content)
@@ -73,7 +78,20 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
+        with suppress(OSError):
+            part.unlink()
         raise OutputError(f"{path}: the state cannot be written ({error.strerror or error})") from None
+
+
+def check_state_path(path: Path) -> None:
+    """Raise OutputError if no state can be written to a path, before a session that could not be continued."""
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path}: is not a regular file, and no state can be written there; give another file")
+    try:
+        _part(path).touch()
+        _part(path).unlink()
+    except OSError as error:
+        raise OutputError(f"{path}: no state can be written there ({error.strerror}); give another file") from None
 
 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
@@ -111,6 +129,11 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     if not isinstance(session, SavedSession):
         return _refuse(path, "holds no state of a session")
     return Loaded(session=session, outcome=f"state file {path}: belongs to this map, vehicle and settings")
+
+
+def _part(path: Path) -> Path:
+    """Return the name under which a state is written before it replaces the state file."""
+    return path.with_name(f".{path.name}.part")
 
 
 def _refuse(path: Path, why: str) -> Loaded:

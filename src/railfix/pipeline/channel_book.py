@@ -21,7 +21,7 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     known, notes = received.navigation, []
     if known.precise is None and not len(known.kepler) and not len(known.glonass):
         notes.append("no navigation record is known; give navigation to EpochProcessor or to process")
-    if config.frequencies == "two" and second is None:
+    if config.frequencies == "two" and (second is None or (second.column.size and (second.column < 0).all())):
         why = "SBAS on L1 corrects a single frequency" if config.sbas else "no satellite has a second code"
         why = why if received.base is None else "a base station corrects a single frequency"
         notes.append(f"frequencies: two requested, one used: {why}")

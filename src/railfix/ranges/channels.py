@@ -107,7 +107,7 @@ class Channels:
     left_out: Integers  #: Reason why settings leave out a channel, 0 for the other channels; shape (M,).
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
     #: Columns of the second signals of each channel's satellite, in order of preference, -1 for none; shape (K, P). P
-    #: is 0 with one frequency.
+    #: is 0 with one frequency, and at least 1 with two, so that epochs without a second code are processed likewise.
     second: Indices
     #: Second signal with the letter of the constellation, squared ratio of the first to the second frequency, and noise
     #: of the second signal relative to L1 C/A; shape (K, P).
@@ -208,7 +208,7 @@ def _second_channels(
         own = of_satellite[name := str(every_satellite[column])]
         order = [own[signal] for signal in wanted.get(name[0], ()) if signal in own]
         rows.append([i for i in order if frequency_hz[i] < frequency_hz[column]])
-    width = max(map(len, rows), default=0)
+    width = max(map(len, rows), default=0) or int(bool(wanted))
     second = np.array([row + [-1] * (width - len(row)) for row in rows], dtype=np.intp).reshape(len(rows), width)
     letter = np.char.add(every_satellite.astype("<U1"), every_signal)
     signals = np.where(second >= 0, letter[second], "") if width else np.empty(second.shape, dtype="<U3")

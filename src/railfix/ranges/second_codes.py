@@ -28,7 +28,7 @@ def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, nois
     codes, satellites without a second code are rejected with the reason `sbas_no_ionosphere`.
     """
     channels = corrected.channels
-    second = _correct_second_codes(corrected, source.navigation, noise) if channels.second.size else None
+    second = _correct_second_codes(corrected, source.navigation, noise) if channels.second.shape[1] else None
     if source.second == "required":
         alone = np.isnan(second.code_m) if second is not None else np.ones(corrected.reason.shape, dtype=bool)
         reason = np.where((corrected.reason == 0) & alone, int(Reason.SBAS_NO_IONOSPHERE), corrected.reason)

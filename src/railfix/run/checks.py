@@ -27,6 +27,8 @@ _SECOND: Final = np.timedelta64(1, "s")
 ENOUGH_TO_STOP: Final = 10
 #: Largest time between a log and its navigation records; records farther away are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
+#: Sensors without samples for a long time where the train is at rest, or passes no balise or ground unit.
+_OF_EVENTS: Final = ("tachometer", "ranging", "balises")
 #: Longest time from the reference time of a navigation record at which the record may be used (Galileo: 4 h).
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
@@ -128,18 +130,25 @@ def check_sbas_time(corrections: MessageCorrections | None, tally: Tally) -> Non
             )
 
 
-def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
-    """Raise MismatchError if the samples of a sensor and the logs have no common time."""
-    spans = list(_spans(tally).values())
+def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
+    """Return a note on each sensor of events (pulses, ranges, balises) without a sample in the time of the logs.
+
+    MismatchError: another sensor has no sample in this time, or a sensor of events none within a day.
+    """
+    spans, notes = list(_spans(tally).values()), []
     for name, samples in sensors.tables.items():
         if not (spans and len(samples)):
             continue
         of_sensor = samples.time[0], samples.time[-1]
-        if all(spans_apart(span, of_sensor) for span in spans):
-            raise MismatchError(
-                f"the samples of --{name} of {_period(*of_sensor)} and the logs of {_period(*spans[0])} (GPS time) "
-                "have no time in common; give the samples of the day of the logs"
-            )
+        if not all(spans_apart(span, of_sensor) for span in spans):
+            continue
+        text = f"the samples of --{name} of {_period(*of_sensor)} and the logs of {_period(*spans[0])} (GPS time) have "
+        text += "no time in common"
+        reach = ANOTHER_DAY if name in _OF_EVENTS else 0 * ANOTHER_DAY
+        if all(spans_apart(span, of_sensor, reach=reach) for span in spans):
+            raise MismatchError(f"{text}; give the samples of the day of the logs")
+        notes.append(f"{text}; the sensor was not used")
+    return tuple(notes)
 
 
 def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajectory]) -> None:
@@ -166,18 +175,19 @@ def check_whole_run(
     corrections: MessageCorrections | None = None,
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
-) -> None:
-    """Raise MismatchError if the inputs of a whole run do not match, or NoPositionError if the run has no position.
+) -> tuple[str, ...]:
+    """Return notes on sensors without a sample in the time of the logs.
 
-    `causes` has the likely cause by antenna, for the message.
+    `causes` has the likely cause by antenna, for the message. MismatchError: the inputs of the whole run do not match.
+    NoPositionError: the run has no position.
     """
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)
     check_same_place(tally)
     check_sbas_time(corrections, tally)
-    if sensors is not None:
-        check_sensor_time(sensors, tally)
+    notes = () if sensors is None else check_sensor_time(sensors, tally)
     check_positions(tally, causes or {})
+    return notes
 
 
 def check_positions(tally: Tally, likely: Mapping[str, str]) -> None:

@@ -120,12 +120,15 @@ def run_files(
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
-        check_whole_run(navigation, tally, corrections=processor.received.corrections, sensors=sensors, causes=causes)
+        unused = check_whole_run(
+            navigation, tally, corrections=processor.received.corrections, sensors=sensors, causes=causes
+        )
         if base is not None:
             check_base(base, tally, line.trajectories)
         notes = (
             *collect_notes(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
+            *unused,
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
         )

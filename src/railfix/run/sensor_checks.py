@@ -239,8 +239,7 @@ class SensorChecks:
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
         """Add the rows of a chunk; at most two positions per second are kept."""
-        passed = positions.filter(pl.col("status") == "ok").select("time_gpst", "chainage_m")
-        self.places.append(passed.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True))
+        self.places.append(_thin(positions.filter(pl.col("status") == "ok").select("time_gpst", "chainage_m")))
         self.speeds.append(doppler_speeds(train))
 
     def notes(
@@ -252,7 +251,7 @@ class SensorChecks:
         """
         if not self.speeds:
             return ()
-        places = pl.concat(self.places)
+        places = _thin(pl.concat(self.places))  # independent of the length of the chunks
         reversed_ones = tuple(sign_notes(samples, places, trajectory, limits.tachometer))
         if reversed_ones:  # the filter's speeds, the reference of the other checks, depend on these sensors
             return reversed_ones
@@ -321,6 +320,11 @@ def range_notes(
             f"ranging: the ranges are {abs(excess):.1f} m too {which} compared with satellite positions; the devices "
             "may have a delay"
         )
+
+
+def _thin(places: pl.DataFrame) -> pl.DataFrame:
+    """Return at most two rows per second, the first of each half second of `time_gpst`."""
+    return places.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True)
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
