@@ -111,7 +111,7 @@ def filtered(
 
 def result(**antennas: tuple[Any, Any]) -> Any:
     fusion = {name: track for name, (_, track) in antennas.items() if track is not None}
-    return SimpleNamespace(antennas={name: own for name, (own, _) in antennas.items()}, fusion=fusion)
+    return SimpleNamespace(antennas={name: own for name, (own, _) in antennas.items()}, fusion=fusion, notes=())
 
 
 def plain_line() -> dict[str, Trajectory]:
@@ -342,9 +342,11 @@ class Processor(SimpleNamespace):
             seconds = _second(epoch)
             place = 300.0 + 18.2 * (name == "front") + 40.0 * seconds
             antennas[name] = single(place, seconds=seconds)
-        received = SimpleNamespace(notes=self.notes_later.pop(0)) if self.notes_later else None
-        state = State(received=received)  # type: ignore[arg-type]
-        return result(**{name: (own, None) for name, own in antennas.items()}), state
+        notes = self.notes_later.pop(0) if self.notes_later else None
+        state = State(received=None if notes is None else SimpleNamespace(notes=notes))  # type: ignore[arg-type]
+        found = result(**{name: (own, None) for name, own in antennas.items()})
+        found.notes = (*(notes or ()), *(f"epoch {note}" for note in notes or ()), "a note")
+        return found, state
 
 
 def _count(value: Any) -> int:
