@@ -175,9 +175,6 @@ def test_a_train_on_a_track_that_the_map_lacks_is_on_none() -> None:
     assert sum(a is not None for a in answers) > 5
 
 
-# --- the real roof -----------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def roof(recordings: Path) -> dict[str, StandstillCodes]:
     folder = recordings / "dual" / "mosaic_x2_99cm"

@@ -125,8 +125,7 @@ class LiveEngine:
         self.counts: Counter[str] = Counter()
         self.reports: deque[str] = deque(processor.notes, maxlen=100)
         self._notes = processor.received.notes
-        self._own: list[str] = []
-        self._reported = set(processor.notes)
+        self._own, self._reported = list[str](), set(processor.notes)
         tolerance_s = processor.config.antenna_pair.tag_tolerance_s
         self._order = AntennaOrder.between(processor.trajectories, tolerance_s=tolerance_s)
         self._ordered_at_m = float("-inf")
@@ -425,16 +424,14 @@ class LiveEngine:
         """Report new replacements of received data and their end; of other notes on an epoch only the first of both."""
         received = state.received or self.processor.received
         notes = (received if state.base is None else state.base.beside(received)).notes
-        if notes != self._notes:
-            self.reports.extend(note for note in notes if note not in self._notes)
-            self.reports.extend(f"no longer valid: {note}" for note in self._notes if note not in notes)
-            self._notes = notes
+        self.reports.extend(note for note in notes if note not in self._notes)
+        self.reports.extend(f"no longer valid: {note}" for note in self._notes if note not in notes)
         own = [note for note in dict.fromkeys(of_epoch) if note not in notes]
         ended = [f"no longer valid: {note}" for note in self._own if note not in own]
         new = [text for text in (*own, *ended) if text not in self._reported]
         self._reported.update(new)
         self.reports.extend(new)
-        self._own = own
+        self._notes, self._own = notes, own
 
     def _check_order(self, result: Result) -> None:
         """Report once if the positions of the antennas are in the wrong order."""
