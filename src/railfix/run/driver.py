@@ -120,9 +120,8 @@ def run_files(
         if rows.replays:
             add_smoothed(rows.replays, processor, folder)
         causes = _causes(tally, logs, processor, config, line)
-        unused = check_whole_run(
-            navigation, tally, corrections=processor.received.corrections, sensors=sensors, causes=causes
-        )
+        corrections = processor.received.corrections
+        unused = check_whole_run(navigation, tally, corrections=corrections, sensors=sensors, causes=causes)
         if base is not None:
             check_base(base, tally, line.trajectories)
         notes = (
