@@ -162,6 +162,10 @@ def test_without_truth_rates_alone_are_told(tmp_path: Path) -> None:
     assert again.exit_code == 8
 
 
+def test_without_any_screen_there_is_one_choice(tmp_path: Path) -> None:
+    assert RUNNER.invoke(app, command(tmp_path / "out", "--screens", "none", "--filter", "off")).exit_code == 0
+
+
 def test_the_table_keeps_its_lines_where_the_terminal_is_narrow(truth: Path, tmp_path: Path) -> None:
     result = RUNNER.invoke(app, command(tmp_path / "out", "--truth", str(truth), "--filter", "off"))
     assert result.exit_code == 0, result.output

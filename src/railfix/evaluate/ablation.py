@@ -167,6 +167,7 @@ def ablate_files(
         }
         received, states = np.datetime64("NaT", "ns"), dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
+        bare = tallies[NONE if NONE in tallies else ALL]  # equal choices if no screen is active
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
         for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
             end = max(part.time[-1] for part in chunk.values() if len(part))
@@ -179,11 +180,11 @@ def ablate_files(
                     reference, trajectory = truth.get(antenna), line.trajectories[antenna]
                     columns = _columns(positions, result.fusion.get(antenna), reference, trajectory)
                     parts.setdefault((name, antenna), []).append(columns)
-            check_same_day(navigation, tallies[NONE])
-            check_same_place(tallies[NONE], antennas="all")
+            check_same_day(navigation, bare)
+            check_same_place(bare, antennas="all")
             if progress is not None:
-                progress(epochs=tallies[NONE].epochs, fraction=min(log.share for log in logs.values()))
-        check_whole_run(navigation, tallies[NONE])
+                progress(epochs=bare.epochs, fraction=min(log.share for log in logs.values()))
+        check_whole_run(navigation, bare)
         effects = tuple(
             _effect(name, processor.config, antenna, parts[name, antenna])
             for antenna in inputs.logs
