@@ -172,7 +172,7 @@ BROKEN = {
     "other kind": (('kind = "G"', 'kind = "X"'), "kind: one of G, J"),
     "signal": (('signal = "1C"', 'signal = "L1"\nband = 1'), "unknown entry curve.2.band; known are count"),
     "missing column": (("spread_db", "spread"), "spread_db"),
-    "not rising": (("2.5,\n    7.5", "7.5,\n    7.5"), "rise"),
+    "not rising": (("2.5,\n    7.5", "7.5,\n    7.5"), "ascending"),
     "out of range": (("2.5,\n    7.5", "2.5,\n    97.5"), "97.5"),
     "nan": (("2.5,\n    7.5", "2.5,\n    nan"), "nan"),
     "shorter": (("2.5,\n    7.5,\n", "2.5,\n"), "same number"),
