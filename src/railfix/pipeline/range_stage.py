@@ -68,7 +68,7 @@ def correct_ranges(
     )
     corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, gross=near.gross, noise=config.noise)
     corrected = copy_with(corrected, unsure=near.unsure)
-    if source.second == "required" or (source.second == "optional" and channels.second.size):
+    if source.second == "required" or (source.second == "optional" and channels.second.shape[1]):
         corrected = find_second_codes(corrected, source, config.noise)
     if error_model is not None:
         corrected = _apply_error_model(error_model, corrected, antennas, near.arc_m, config)
