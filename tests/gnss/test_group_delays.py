@@ -13,8 +13,9 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import satellite_states
 from railfix.gnss.orbits.ephemerides import Orbits, kepler_state
-from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
+from railfix.gnss.orbits.prepared_records import group_delay_s, unhealthy
 from railfix.io.rinex import read_navigation
+from railfix.ranges.second_codes import group_delay_sigma_m
 
 pytestmark = pytest.mark.requirement("A11")
 

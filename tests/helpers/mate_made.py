@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from railfix.core.timescale import gpst_to_utc, to_week
+from railfix.core.timescale import to_week
+from railfix.core.utc import gpst_to_utc
 from railfix.gnss import concatenate
 from railfix.io.mate import READ
 from railfix.simulate.sensor_columns import sensor_tables

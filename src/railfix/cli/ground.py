@@ -16,7 +16,8 @@ from railfix.cli.console import TableConsole, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import OutputError, SettingsError
 from railfix.core.notebook import plural
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.core.tables import plain_table
 from railfix.ground.on_board import OnBoardLimits
 from railfix.ground.triangle import MonitorLimits, TriangleLimits

@@ -15,7 +15,8 @@ from railfix.cli.options import OverwriteOption, Without, check_outputs, from_mo
 from railfix.core.arrays import Floats
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.notebook import plural
-from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.options import option
+from railfix.core.settings import INPUTS, Settings
 from railfix.core.staged_files import write_whole
 from railfix.core.tables import plain_table
 from railfix.run.inputs import ColumnNames, TrackReading

@@ -14,7 +14,8 @@ from railfix.cli.console import TableConsole, show_files, show_notes, show_table
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, resolve_settings
 from railfix.core.errors import SettingsError
 from railfix.core.notebook import plural
-from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.options import option
+from railfix.core.settings import INPUTS, Settings
 from railfix.core.tables import Column, count, listing, number, percent, plain_table
 from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits

@@ -17,7 +17,8 @@ import typer
 from pydantic import ValidationError
 
 from railfix.core.errors import SettingsError
-from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.options import option
+from railfix.core.settings import INPUTS, Settings
 from railfix.core.settings_files import read_toml
 from railfix.core.timescale import utc_to_gpst
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config

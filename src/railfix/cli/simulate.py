@@ -11,7 +11,8 @@ import typer
 from railfix.cli.console import progress_bar
 from railfix.cli.options import check_set_once, from_models, set_value
 from railfix.core.errors import SettingsError
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.run.output import Overwrite, check_folder
 from railfix.simulate.scenario import Scenario
 from railfix.simulate.scenario_file import Recipe, list_scenarios, load_recipe

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
 from railfix.core.errors import SettingsError
 from railfix.core.notebook import html_table
@@ -104,24 +104,6 @@ def is_number(kind: Any) -> bool:
 
 Model = TypeVar("Model", bound=BaseModel)
 INPUTS: Final = "Inputs"  #: Heading of the options that name input files.
-
-
-def option(
-    text: str,
-    default: Any = ...,
-    *,
-    name: str | None = None,
-    metavar: str | None = None,
-    panel: str = "Choices",
-    **limits: Any,
-) -> Any:
-    """Return a field of a `Settings` model that is also an option of the command line; required without a `default`.
-
-    The option is called ``--field-name`` unless `name` is given. A field with a `name`, a default and two allowed words
-    (`Literal`) becomes a switch. `panel` is the heading in the help text; `limits` are passed to `pydantic.Field`.
-    """
-    extra: Any = {"option": name, "metavar": metavar, "panel": panel}
-    return Field(default, description=text, json_schema_extra=extra, **limits)
 
 
 def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time as clock
 from datetime import datetime
 from typing import Final
 
@@ -24,7 +23,7 @@ _NAT: Final = np.iinfo(np.int64).min
 
 #: UTC instants at which GPST - UTC changes: the difference is 0 s from the first, and 1 s more from each later instant
 #: on (IERS Bulletin C).
-_LEAP_UTC: Final = np.array(
+LEAP_UTC: Final = np.array(
     [
         "1980-01-06", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01",
         "1990-01-01", "1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01",
@@ -85,7 +84,7 @@ def bdt_to_gpst(time: ArrayLike) -> Datetimes:
 def gpst_minus_utc(utc: ArrayLike) -> Integers:
     """Return the leap seconds GPST - UTC [s] that are in force at UTC instants."""
     at = np.asarray(utc, dtype="datetime64[ns]")
-    return np.asarray(np.searchsorted(_LEAP_UTC, at, side="right") - 1, dtype=np.int64)
+    return np.asarray(np.searchsorted(LEAP_UTC, at, side="right") - 1, dtype=np.int64)
 
 
 def utc_to_gpst(utc: ArrayLike) -> Datetimes:
@@ -93,15 +92,3 @@ def utc_to_gpst(utc: ArrayLike) -> Datetimes:
     at = np.asarray(utc, dtype="datetime64[ns]")
     leap = gpst_minus_utc(at).astype("timedelta64[s]")
     return np.asarray(at + leap, dtype="datetime64[ns]")
-
-
-def gps_now_ns() -> int:
-    """Return the time of the computer's clock as GPS time since `GPS_EPOCH` [ns]."""
-    return int((utc_to_gpst(np.datetime64(clock.time_ns(), "ns")) - GPS_EPOCH).astype(np.int64))
-
-
-def gpst_to_utc(time: ArrayLike) -> Datetimes:
-    """Convert GPS time to UTC; a time in an inserted leap second is mapped to the second after it."""
-    at = np.asarray(time, dtype="datetime64[ns]")
-    leap = np.searchsorted(utc_to_gpst(_LEAP_UTC), at, side="right") - 1
-    return np.asarray(at - leap.astype("timedelta64[s]"), dtype="datetime64[ns]")

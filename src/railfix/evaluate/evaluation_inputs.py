@@ -16,8 +16,9 @@ from pydantic import AfterValidator, Field
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.options import option
 from railfix.core.reasons import Status
-from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.settings import INPUTS, Settings
 from railfix.core.tables import reading_table
 from railfix.io.named_columns import read_named_columns
 from railfix.pipeline.level_stage import KINDS

@@ -17,14 +17,15 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
-from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.options import option
+from railfix.core.settings import INPUTS, Settings
 from railfix.core.timescale import seconds
 from railfix.evaluate.evaluation_inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
-from railfix.track.passes import find_segments_near
+from railfix.track.passes import find_segments_near, short_distance_m
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory, short_distance_m
+from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 

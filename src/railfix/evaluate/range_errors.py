@@ -18,8 +18,9 @@ from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import Reader, file_sha256
 from railfix.core.geodesy import range_with_rotation
+from railfix.core.options import option
 from railfix.core.reasons import Reason
-from railfix.core.settings import Settings, option
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.evaluate.place import bracket, interpolate_reference
 from railfix.gnss.observations import Observations

@@ -13,12 +13,12 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Integers, Masks
+from railfix.core.arrays import Bits, Datetimes, Floats, FrozenArrays, Indices, Integers, Masks, kernel_array
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.gnss.orbits import satellite_states
+from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.io import read_navigation, read_observations, read_positions
 from railfix.io.position_log import PositionLog
 from railfix.live.settings import LiveSettings
@@ -28,7 +28,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
 from railfix.positioning.normal_equations import point_position
-from railfix.positioning.range_arrays import Ranges, usable_ranges
+from railfix.positioning.range_arrays import FILLER_SATELLITE_M, Ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
@@ -318,3 +318,16 @@ async def stream_fixes(
         for task in pumps:
             task.cancel()
         await asyncio.gather(*pumps, return_exceptions=True)
+
+
+def usable_ranges(
+    states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
+) -> Ranges:
+    """Return the ranges for the fit; ranges with a rejection reason, or NaN, have weight 0 and finite filler values."""
+    used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
+    return Ranges(
+        sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, FILLER_SATELLITE_M)),
+        code_m=kernel_array(np.where(used, code, 0.0)),
+        weight=kernel_array(np.where(used, weight, 0.0)),
+        groups=groups,
+    )

@@ -9,7 +9,7 @@ from typing import Final
 
 from pydantic import Field
 
-from railfix.core.settings import option
+from railfix.core.options import option
 from railfix.ground.authority import Authority, BrakeOrder
 from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, supervise
 from railfix.ground.links import LinkMode

@@ -9,7 +9,7 @@ import sys
 from collections.abc import AsyncIterator, Callable
 from typing import Final, Literal
 
-from railfix.core.timescale import gps_now_ns
+from railfix.core.utc import gps_now_ns
 from railfix.io.train_message import MessageError, TrainMessage, from_json
 
 #: Longest line of a position message [bytes].

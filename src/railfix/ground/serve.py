@@ -22,7 +22,8 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings
 from railfix.core.settings_files import load_settings
-from railfix.core.timescale import GPS_EPOCH, gps_now_ns
+from railfix.core.timescale import GPS_EPOCH
+from railfix.core.utc import gps_now_ns
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.field import SimulatedPoints

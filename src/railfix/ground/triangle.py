@@ -23,7 +23,8 @@ from pydantic import Field, model_validator
 
 from railfix.core.arrays import Codes, Floats, FrozenArrays, Integers, Masks
 from railfix.core.errors import SettingsError
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.ground.fixes_at_stations import StationFixes
 
 #: Receivers of each side of the triangle.

@@ -16,7 +16,8 @@ from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.notebook import NotebookTable
 from railfix.core.settings import misspelt
-from railfix.core.timescale import SECONDS_PER_WEEK, from_week, gpst_to_utc, timedelta, utc_to_gpst
+from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst
+from railfix.core.utc import gpst_to_utc
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 
 SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Columns of standard deviations in a CSV log.

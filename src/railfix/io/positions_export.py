@@ -23,7 +23,7 @@ from pyproj import CRS
 from railfix.core.errors import NoPositionError
 from railfix.core.extras import needs_extra
 from railfix.core.staged_files import stage_file
-from railfix.core.timescale import gpst_to_utc
+from railfix.core.utc import gpst_to_utc
 
 #: Columns written as attributes of each position, where the table has them.
 ATTRIBUTES: Final = (

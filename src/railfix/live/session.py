@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from railfix.core.errors import OutputError
-from railfix.core.timescale import GPS_EPOCH, gps_now_ns
+from railfix.core.timescale import GPS_EPOCH
+from railfix.core.utc import gps_now_ns
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import gga_sentence

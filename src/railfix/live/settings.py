@@ -7,7 +7,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.pipeline.config import Config
 from railfix.run.inputs import BALISE_LIST, VIRTUAL_BALISES, LogReading, TrackReading, input_option
 from railfix.run.output import Overwrite

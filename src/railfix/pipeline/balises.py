@@ -18,7 +18,8 @@ from railfix.core.arrays import Datetimes, Floats, Integers, join_rows
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises
-from railfix.track.trajectory import Trajectory, short_distance_m
+from railfix.track.passes import short_distance_m
+from railfix.track.trajectory import Trajectory
 from railfix.tracking import BaliseEpochs, Tracked
 
 #: Readings of the same identity within this time belong to one passing [s]: a second balise of a group, or a standing

@@ -13,10 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Floats, Indices, Integers, Masks, RowArrays, Strings, kernel_array
+from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.notebook import NotebookTable
-from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.corrected import ORBITS_M, is_orbit, is_pseudorange
 
@@ -187,19 +186,6 @@ def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
         expected = "(T, M)" if axes == 2 else "(T, M, 3)"
         raise ValueError(f"{name} has shape {array.shape}, expected {expected}: epochs by channels")
     return np.asarray(array, dtype=np.float64)
-
-
-def usable_ranges(
-    states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
-) -> Ranges:
-    """Return the ranges for the fit; ranges with a rejection reason, or NaN, have weight 0 and finite filler values."""
-    used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
-    return Ranges(
-        sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, FILLER_SATELLITE_M)),
-        code_m=kernel_array(np.where(used, code, 0.0)),
-        weight=kernel_array(np.where(used, weight, 0.0)),
-        groups=groups,
-    )
 
 
 def without(ranges: Ranges, dropped: Masks) -> Ranges:

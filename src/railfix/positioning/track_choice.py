@@ -19,7 +19,8 @@ import scipy
 from pydantic import Field
 
 from railfix.core.arrays import Floats, Strings
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UNMAPPED_PRIOR
 

@@ -15,7 +15,8 @@ from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.core.settings_files import read_model_file, write_toml
 from railfix.core.staged_files import FilePath
 from railfix.ranges.error_conditions import Conditions

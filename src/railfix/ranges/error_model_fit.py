@@ -17,7 +17,8 @@ import scipy
 from pydantic import Field
 
 from railfix.core.arrays import Floats, Integers, Masks
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
 TAIL_SCORE: Final = 1.0  #: Least standard score of the samples in the tail, from which sigma is determined.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
-from railfix.gnss.navigation import Navigation
+from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits import SatelliteStates
-from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
+from railfix.gnss.orbits.prepared_records import P_CODES, group_delay_s, unhealthy
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels
 from railfix.ranges.corrected import CorrectedRanges, SecondCodes
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
@@ -110,3 +111,15 @@ def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, 
         nearest = rows[np.argmin(np.abs(records.toe[rows] - records.toe[i]))]
         delay[i], sigma[i] = delay[nearest], 0.0
     return delay, sigma, unhealthy(records, signal)
+
+
+#: Standard deviation of the delay on L2 and L5 without ISC [m]. For GPS satellites whose CNAV had ISC on 2025-02-15,
+#: the difference of TGD - ISC and the value used instead has a standard deviation of 0.24 m on L2C and 0.55 m on L5Q
+#: (`tests/gnss/test_group_delays.py`).
+_WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
+
+
+def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
+    """Return the sigma of the group delay of L2C and L5 by LNAV, which has no ISC, shape (n,) [m]; otherwise 0."""
+    lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
+    return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in P_CODES), 0.0)

@@ -17,7 +17,8 @@ from pydantic import Field
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.gnss.joined_observations import concatenate
 from railfix.io.logs import read_navigation
 from railfix.io.position_log import PositionLog

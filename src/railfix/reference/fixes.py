@@ -15,7 +15,8 @@ from railfix.core.array_functions import cheapest_path
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.geodesy import sigma_along
 from railfix.core.nearest_times import nearest_rows
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.positioning.doppler_speed import DopplerSpeedLimits

@@ -21,7 +21,7 @@ from railfix import __version__
 from railfix.core.errors import NoPositionError, OutputError
 from railfix.core.extras import needs_extra
 from railfix.core.staged_files import stage_file
-from railfix.core.timescale import gpst_to_utc
+from railfix.core.utc import gpst_to_utc
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.mate import WRITTEN, mate_table

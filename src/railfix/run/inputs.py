@@ -14,7 +14,8 @@ from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import BrokenLines, Reader, fingerprint, path_names
-from railfix.core.settings import INPUTS, Settings, option
+from railfix.core.options import option
+from railfix.core.settings import INPUTS, Settings
 from railfix.io.file_kind import find_kind
 from railfix.io.position_log import column_names
 from railfix.pipeline.config import Config

@@ -21,7 +21,8 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_json_object
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.core.staged_files import write_whole
 from railfix.gnss.joined_observations import concatenate
 from railfix.gnss.observations import Observations

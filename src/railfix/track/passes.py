@@ -49,3 +49,11 @@ def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats |
     lowest[:-1] &= ~joined | (away[:-1] <= away[1:])
     again[1:] = joined & (away[1:] == away[:-1])
     return Passes(position, segment, along, foot, offset, lowest, again)
+
+
+def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
+    """Return differences of arc length in the shorter direction of a closed line.
+
+    `turn_m` is the length of the closed line; with infinity, for an open line, the differences are unchanged.
+    """
+    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m

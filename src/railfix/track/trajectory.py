@@ -22,14 +22,6 @@ _FIRST_CANDIDATES = 6
 _CHUNK = 2_000_000  #: Largest product of the numbers of positions and candidates in one array.
 
 
-def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
-    """Return differences of arc length in the shorter direction of a closed line.
-
-    `turn_m` is the length of the closed line; with infinity, for an open line, the differences are unchanged.
-    """
-    return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
-
-
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
     """Return the fraction (0 to 1) of a segment at its nearest point, and the distance; shapes (..., 3) broadcast."""
     offset = points_m - start_m

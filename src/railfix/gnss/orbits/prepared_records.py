@@ -135,11 +135,7 @@ _ISC: Final[Mapping[str, list[int]]] = {
     "1C": [0], "1E": [0], "2S": [1], "2L": [1], "2X": [1], "5I": [2], "5Q": [3], "5X": [2, 3],
     "1S": [4], "1L": [5], "1X": [4, 5],
 }  # fmt: skip
-#: Standard deviation of the delay on L2 and L5 without ISC [m]. For GPS satellites whose CNAV had ISC on 2025-02-15,
-#: the difference of TGD - ISC and the value used instead has a standard deviation of 0.24 m on L2C and 0.55 m on L5Q
-#: (`tests/gnss/test_group_delays.py`).
-_WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
-_P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
+P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
 #: Bits of the health word of CNAV by band.
 _CNAV_HEALTH: Final[Mapping[str, int]] = {"1": 0b100, "2": 0b010, "5": 0b001}
 _ANY: Final = -1  #: All bits.
@@ -194,12 +190,6 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
     ):
         delay = np.where(np.isin(system, [*letters]), delays, delay)
     return delay
-
-
-def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of the group delay of L2C and L5 by LNAV, which has no ISC, shape (n,) [m]; otherwise 0."""
-    lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
-    return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 
 
 def _navstar(records: KeplerRecords, signal: str) -> Floats:

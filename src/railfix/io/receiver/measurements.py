@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows
 from railfix.core.nearest_times import nearest_day, nearest_week
-from railfix.core.timescale import from_week, gpst_to_utc, to_week
+from railfix.core.timescale import from_week, to_week
+from railfix.core.utc import gpst_to_utc
 from railfix.gnss.joined_observations import signals_by_system
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.receiver import nav_messages

@@ -14,7 +14,8 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.nearest_times import nearest_week
-from railfix.core.timescale import bdt_to_gpst, from_week, gpst_to_utc, utc_to_gpst
+from railfix.core.timescale import bdt_to_gpst, from_week, utc_to_gpst
+from railfix.core.utc import gpst_to_utc
 from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, read_signed, read_unsigned

@@ -14,7 +14,8 @@ from railfix.core.arrays import Datetimes, Floats, Masks, Strings, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S
 from railfix.core.errors import check_type
 from railfix.core.files import FilePath
-from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_to_utc, seconds, timedelta, to_week
+from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, seconds, timedelta, to_week
+from railfix.core.utc import gpst_to_utc
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line

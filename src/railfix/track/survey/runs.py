@@ -11,7 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Masks, freeze_arrays
-from railfix.core.settings import Settings, option
+from railfix.core.options import option
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.map_from_positions import SIGMA_OF_QUALITY
