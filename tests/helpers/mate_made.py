@@ -32,9 +32,8 @@ def write_mate_tables(simulation: Simulation, folder: Path) -> dict[str, Path]:
     sensors = sensor_tables(simulation)
     tables = {"S_GNSS_SAT": _satellites(simulation), "S_DM_TRACKPOINT": _track_points(simulation)}
     if "inertial" in sensors:
-        six = (
-            sensors["inertial"].drop("time_gpst").rename(dict(zip(sensors["inertial"].columns[1:], _SIX, strict=True)))
-        )
+        named = dict(zip(sensors["inertial"].columns[1:], _SIX, strict=True))
+        six = sensors["inertial"].drop("time_gpst").rename(named)
         tables["S_IMU"] = six.select(_utc(sensors["inertial"]), pl.all().round(6), COMPENSATED=False)
     if "radar" in sensors:
         speed = sensors["radar"].select(SPEED=pl.col("speed_mps").round(3))
