@@ -59,7 +59,7 @@ def test_score_counts_by_hand():
     assert found.max_m == 60.0
     assert found.wrong_place == pytest.approx(0.25)
     assert found.mean_m == pytest.approx(-14.5)
-    with pytest.raises(ValueError, match="inside the time of the reference"):
+    with pytest.raises(ValueError, match="within the time span of the reference"):
         score(error, np.zeros(6, dtype=bool))
 
 

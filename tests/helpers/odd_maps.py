@@ -286,7 +286,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("repeated.gpkg", written("GPKG", np.repeat(LINE, 2, axis=0)), "right"),
     Odd("swapped.fgb", written("FlatGeobuf", LINE[:, _SWAPPED]), "refused", "are swapped"),
     Odd("millimetres.gpkg", written("GPKG", GRID * 1000, "EPSG:25832"), "refused", "in the unit of the file"),
-    Odd("grid_not_named.dxf", written("DXF", GRID), "refused", "names no CRS, and its coordinates are no degrees"),
+    Odd("grid_not_named.dxf", written("DXF", GRID), "refused", "names no CRS, and its coordinates are not in degrees"),
     Odd("some_heights.gpkg", written("GPKG", LINE * _SOME_HEIGHTS), "refused", "21 of 41 points have no height"),
     Odd("flat.gpkg", written("GPKG", LINE[:, :2]), "refused", "the coordinates have no height"),
     Odd("no_database.gpkg", b"hello", "refused", "GDAL cannot read this file"),

@@ -32,7 +32,7 @@ CASES: dict[str, tuple[str, int | None, str]] = {
     "observation file": (header(kind="OBSERVATION DATA") + GOOD, None, "observation file"),
     "meteorological file": (header(kind="METEOROLOGICAL DATA") + GOOD, None, "a RINEX navigation file was expected"),
     "no RINEX": ("$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n", None, "is an NMEA log"),
-    "version no number": (header().replace("     3.04", "    three", 1) + GOOD, 1, "version .* is no number"),
+    "version no number": (header().replace("     3.04", "    three", 1) + GOOD, 1, "version .* is not a number"),
     "version 1": (header(1.0) + GOOD, 1, "version 1.00 is not supported"),
     "version 5": (header(5.0) + GOOD, 1, "version 5.00 is not supported"),
     "header without end": (header(end="COMMENT"), None, "END OF HEADER"),

@@ -110,7 +110,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     path.write_bytes(kept)
     rows, numbers, told = live(parts["late"], tmp_path, "late", "--state", str(path))
     late, _, _ = live(parts["late"], tmp_path, "late alone")
-    assert "only its ephemerides and sequence number are used: its last epoch is 120.1 s before" in told
+    assert "sequence number of the file are used, because its last epoch is 120.1 s before" in told
     assert numbers[0] == SPLIT + 1
     assert np.array_equal(rows["chainage_m"].to_numpy(), late["chainage_m"].to_numpy(), equal_nan=True)
     path.write_bytes(kept)

@@ -88,7 +88,7 @@ def test_a_damaged_entry_is_rebuilt_and_said(bench: Bench, folder: Path, damage:
     rebuilt = opened(bench)
     assert_same(rebuilt, first)
     assert len(rebuilt.preparing) == 3
-    assert all("damaged, the line was prepared again" in note for note in rebuilt.preparing)
+    assert all("is damaged; the line was prepared again" in note for note in rebuilt.preparing)
     assert set(rebuilt.preparing) <= set(rebuilt.notes)
     assert opened(bench).preparing == ()
 

@@ -100,7 +100,7 @@ class MapQualityError(RailfixError):
 
 
 class NoPositionError(RailfixError):
-    """There is no position: none in the results, or no usable position in the inputs."""
+    """The results have no position, or the inputs have no usable position."""
 
     exit_code = 7
 

@@ -77,14 +77,14 @@ def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Float
 
 
 def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Compute elevation and azimuth (clockwise from north) [deg] of satellites (T, N, 3) at receivers (T, 3)."""
+    """Compute the elevation and azimuth (clockwise from north) [deg] of satellites (T, N, 3) at receivers (T, 3)."""
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)
     return compute_angles(sat - receiver[:, None, :], axes_at(receiver))
 
 
 def compute_angles(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
-    """Compute elevation and azimuth [deg], shape (T, N), from vectors to satellites (T, N, 3) and `enu_axes`."""
+    """Compute the elevation and azimuth [deg], shape (T, N), from vectors to satellites (T, N, 3) and `enu_axes`."""
     enu = np.matmul(axes, line_ecef_m.swapaxes(1, 2))
     east, north, up = enu[:, 0], enu[:, 1], enu[:, 2]
     azimuth = np.degrees(np.arctan2(east, north))

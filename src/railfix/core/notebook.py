@@ -30,7 +30,7 @@ class NotebookTable:
 
     def _repr_html_(self) -> str:
         if not is_dataclass(self):
-            raise TypeError(f"{type(self).__name__} is no dataclass")
+            raise TypeError(f"{type(self).__name__} is not a dataclass")
         rows = "".join(
             f"<tr><th style='text-align:left'>{escape(item.name)}</th>"
             f"<td style='text-align:left'>{escape(value_text(getattr(self, item.name)))}</td></tr>"

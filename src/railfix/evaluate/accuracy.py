@@ -29,7 +29,7 @@ OVER_M: Final = (5, 10, 20, 50)
 class Score:
     """Availability and error statistics of a run; statistics in metres are NaN if there is no position."""
 
-    epochs: int  #: Number of epochs with observations inside the time of the reference.
+    epochs: int  #: Number of epochs with observations within the time span of the reference.
     positions: int  #: Number of these epochs with a position, so that the error is known.
     rate: float  #: positions / epochs.
     mean_m: float  #: Mean of the signed error.
@@ -46,7 +46,7 @@ def score(error_m: Floats, observed: Masks) -> Score:
     Raise ValueError if no epoch is observed.
     """
     if not observed.any():
-        raise ValueError("no epoch with observations lies inside the time of the reference")
+        raise ValueError("no epoch with observations lies within the time span of the reference")
     values = error_m[observed & np.isfinite(error_m)]
     size = np.abs(values) if len(values) else np.array([np.nan])
     return Score(

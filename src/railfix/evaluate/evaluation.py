@@ -94,8 +94,8 @@ class Evaluation(NotebookTable):
     def figure(self, name: str, **where: str) -> Any:
         """Return column `name` of the row of `figures` with the values `where`.
 
-        By default the row is of the grouping "all", of the epochs "own" and of the position "constrained". Raise
-        LookupError unless exactly one row has these values.
+        The defaults are `grouping` "all", `epochs_of` "own" and `position` "constrained". Raise LookupError unless
+        exactly one row has these values.
         """
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
@@ -103,7 +103,7 @@ class Evaluation(NotebookTable):
             words = rows.select(pl.selectors.string())
             several = {key: words[key].unique().sort().to_list() for key in words.columns if words[key].n_unique() > 1}
             raise LookupError(
-                f"{len(rows)} rows of the figures have {chosen}; name one{f' of {several}' if several else ''}"
+                f"{len(rows)} rows of figures have {chosen}, expected 1{f'; give one of {several}' if several else ''}"
             )
         return rows[name].item()
 

@@ -98,9 +98,9 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
     """Return the speed above which the train is braked, at once or after `before_s` [m/s].
 
-    It is the largest speed at which the train is on the curve of `braking_speed` when its brakes act. Between two
-    changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed, which
-    gives a quadratic equation. The equations are solved from the target backward.
+    The result is the largest speed at which the train is on the curve of `braking_speed` when its brakes act. Between
+    two changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed,
+    which gives a quadratic equation. The equations are solved from the target backward.
     """
     if at_m >= target.at_m:
         return 0.0

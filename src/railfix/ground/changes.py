@@ -77,7 +77,7 @@ def correct_interval(
 
 
 def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
-    """Return the reason for a refusal if a train may still run by an authority in transit, otherwise None."""
+    """Return the reason for refusal if a train may still run by an authority in transit, otherwise None."""
     if known.runs_by is None or lapsed:
         return None
     return (

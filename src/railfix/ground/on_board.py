@@ -269,7 +269,7 @@ class OnBoard:
         return "no position" if at_s is not None and now_s - at_s > self.limits.placeless_s else None
 
     def curve_reason(self, now_s: float) -> str | None:
-        """Return the reason if the train exceeds its braking curve, with speed, limit and overrun; otherwise None."""
+        """Return the reason for braking if the train exceeds its braking curve, otherwise None."""
         found, motion = self.supervised(now_s), self._motion
         if found is None or motion is None or motion.speed_mps <= found.intervention_mps:
             return None

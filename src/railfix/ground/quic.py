@@ -41,7 +41,7 @@ ACKNOWLEDGE_S: Final = 1.5
 #: Largest numbers of handshakes in progress, of one peer and of all peers; further handshakes wait.
 MOST_OF_PEER: Final = 16
 MOST_HANDSHAKES: Final = 64
-#: Time after which a handshake in progress is ended if another handshake waits, as its peer has given up [s].
+#: Time after which a handshake in progress is ended if another handshake waits, because its peer has given up [s].
 HANDSHAKE_S: Final = 5.0
 #: Time in which peers begin a handshake after a Retry, and interval at which waiting first packets are checked [s].
 INVITED_S: Final = 0.25
@@ -51,7 +51,7 @@ ASKING_S: Final = 0.01
 RECEIVE_BYTES: Final = 1 << 22
 #: Number of packets of connected peers that are processed for one packet of a handshake.
 TURN: Final = 16
-#: Time after which a waiting packet of a connected peer is dropped, as the peer has sent a newer message [s].
+#: Time after which a waiting packet of a connected peer is dropped, because the peer has sent a newer message [s].
 LATE_S: Final = 1.0
 #: Largest number of handshake packets that wait, and of packets that are read in a turn.
 MOST_WAITING: Final = 1024

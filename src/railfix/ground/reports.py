@@ -109,37 +109,37 @@ class PlacedReport:
 
 
 def no_length(report: PlacedReport) -> str | None:
-    """Return the reason if a report has no train length."""
+    """Return a contradiction if a report has no train length, otherwise None."""
     return "the report has no train length" if report.message.length_cm == 0 else None
 
 
 def other_line(report: PlacedReport) -> str | None:
-    """Return the reason if a report is from another line."""
+    """Return a contradiction if a report is from another line, otherwise None."""
     line, known = report.message.line, report.known.line
     return None if known in (None, line) else f"the report is of line {line}, the train is on line {known}"
 
 
 def wide_bounds(report: PlacedReport) -> str | None:
-    """Return the reason if the bounds of a position are too wide."""
+    """Return a contradiction if the bounds of a position are too wide, otherwise None."""
     wide = report.over_m + report.under_m > WIDEST_M
     return f"the bounds of the position are wider than {WIDEST_M:g} m" if wide else None
 
 
 def off_line(report: PlacedReport) -> str | None:
-    """Return the reason if a position is off the line."""
+    """Return a contradiction if a position is off the line, otherwise None."""
     first, last = report.layout.stations[0].begin_m, report.layout.stations[-1].end_m
     on_line = first - report.over_m <= report.front_m <= last + report.under_m
     return None if on_line else f"the position is not on the line: {report.front_m:.0f} m"
 
 
 def moving_standstill(report: PlacedReport) -> str | None:
-    """Return the reason if a standstill is reported with a speed."""
+    """Return a contradiction if a standstill is reported with a speed, otherwise None."""
     moving = report.message.standstill and not stands(report.message)
     return f"the report states standstill and a speed of {report.speed_mps:.1f} m/s" if moving else None
 
 
 def unknown_authority(report: PlacedReport) -> str | None:
-    """Return the reason if an authority is not in the centre's database."""
+    """Return a contradiction if an authority is not in the centre's database, otherwise None."""
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None
@@ -148,7 +148,7 @@ def unknown_authority(report: PlacedReport) -> str | None:
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
-    """Return the reason if ends are changed while the train runs, or with an end of the train outside its interval."""
+    """Return a contradiction if ends are changed while the train runs or is outside its interval, otherwise None."""
     if not report.turns:
         return None
     if not report.message.standstill:
@@ -162,7 +162,10 @@ def wrong_turn(report: PlacedReport) -> str | None:
 
 
 def holds_more(report: PlacedReport) -> str | None:
-    """Return the reason if an authority reaches beyond the interval, or after a change of ends beyond the position."""
+    """Return a contradiction if an authority ends beyond the interval, otherwise None.
+
+    After a change of ends, the limit is the reported position.
+    """
     held, facing = report.held_m, report.message.facing
     if held is None:
         return None
@@ -174,13 +177,13 @@ def holds_more(report: PlacedReport) -> str | None:
 
 
 def too_fast(report: PlacedReport) -> str | None:
-    """Return the reason if a speed exceeds the highest speed of trains."""
+    """Return a contradiction if a speed exceeds the highest speed of trains, otherwise None."""
     fast = report.speed_mps is not None and report.speed_mps > report.limits.speed_mps
     return f"the speed {report.speed_mps:.0f} m/s is above {report.limits.speed_mps:g} m/s" if fast else None
 
 
 def older_place(report: PlacedReport) -> str | None:
-    """Return the reason if a position is older than the previously reported position."""
+    """Return a contradiction if a position is older than the previously reported position, otherwise None."""
     older = report.elapsed_s is not None and report.elapsed_s < 0.0
     return "the position is older than in the previous report" if older else None
 
@@ -195,7 +198,7 @@ def longest_way_m(before: float | None, now: float | None, elapsed_s: float, lim
 
 
 def impossible_way(report: PlacedReport) -> str | None:
-    """Return the reason if no train can have run the distance since the previous position."""
+    """Return a contradiction if no train can have run the distance since the previous position, otherwise None."""
     known, elapsed = report.known, report.elapsed_s
     if report.turns:
         return None
@@ -211,19 +214,19 @@ def impossible_way(report: PlacedReport) -> str | None:
 
 
 def beyond_authority(report: PlacedReport) -> str | None:
-    """Return the reason if a position is beyond the authority."""
+    """Return a contradiction if a position is beyond the authority, otherwise None."""
     beyond = report.known.direction * (report.front_m - report.known.end_m) - report.over_m
     return "the train is beyond its authority" if not report.turns and beyond > 0.0 else None
 
 
 def rolled_back(report: PlacedReport) -> str | None:
-    """Return the reason if a position is behind the interval."""
+    """Return a contradiction if a position is behind the interval, otherwise None."""
     ahead = report.known.direction * (report.front_m - report.known.rear_m) + report.under_m
     return "the train has rolled back" if not report.turns and ahead < report.known.length_m else None
 
 
 def runs_backward(report: PlacedReport) -> str | None:
-    """Return the reason if a train runs in the direction of its rear end."""
+    """Return a contradiction if a train runs in the direction of its rear end, otherwise None."""
     message, speed = report.message, report.speed_mps
     backward = message.direction == -report.known.direction and (speed is None or speed > STANDING_MPS)
     return "the train runs backward" if backward and not message.standstill and not report.turns else None
@@ -259,7 +262,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
-    """Return the train's record with the data of a report, contradicted or not, and changes of its interval."""
+    """Return the train's record with the data of a report, contradicted or not, and with the changes in `interval`."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     noted: dict[str, Any] = {

@@ -51,7 +51,7 @@ _BELONGS_TO = "stations and trains"
 
 
 def parse_address(text: object) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``; raise ValueError if the text has another form."""
+    """Return the host and the port of ``HOST:PORT``; raise ValueError if the text has another form."""
     if isinstance(text, tuple):  # parsed before: changed settings are checked again
         text = ":".join(map(str, text))
     host, _, port = str(text).rpartition(":")

@@ -119,7 +119,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
 
 
 def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[PointName], layout: Layout) -> str | None:
-    """Return the reason for a refusal if points under a train's interval are not set for the train's tracks."""
+    """Return the reason for refusal if points under a train's interval are not set for the train's tracks."""
     for name in under:
         point = state.points[name]
         if not (point.lies and point.wanted == train.tracks.get(name[0])):

@@ -68,7 +68,7 @@ async def run_train(
 def is_complete(path: Path) -> bool:
     """Return whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
 
-    A file that is absent, unreadable, older, from the future or with other content is no confirmation.
+    The result is False if the file is absent, unreadable, older, from the future, or has other content.
     """
     try:
         age_s = time.time() - path.stat().st_mtime

@@ -177,7 +177,7 @@ def compare_triangle(
 def _verdicts(
     present: Masks, inside: Masks, small: Masks, coincide: Masks, all_fallen: Masks
 ) -> tuple[Codes, Integers]:
-    """Return verdict and named receiver of each set of fixes, shapes (T,)."""
+    """Return the verdict on each set of fixes and the receiver that it names, shape (T,) each."""
     outside = (~inside).sum(axis=1)
     # a receiver i is named if both sides at this receiver differ, and the third side does not
     alone = np.stack([~small[:, i] & ~small[:, i - 1] & small[:, i - 2] for i in range(3)], axis=1)

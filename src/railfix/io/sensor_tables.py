@@ -149,7 +149,7 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
     if name != expected.get(kind, "S_DM_BALISE" if kind == "list of balises" else ""):
-        raise InputFileError(path, f"is the table {name} of EGNSS MATE, which is no table of the {kind}")
+        raise InputFileError(path, f"is the table {name} of EGNSS MATE, which is not a table of the {kind}")
     if name == "S_DM_BALISE":
         table = read_mate(path, ("NID_C", "NID_BG", "N_PIG", "TRACK_EDGE_ID", "POSITION"))
         rows = _first_of_group(table).unique(("NID_C", "NID_BG"), keep="last", maintain_order=True)

@@ -93,7 +93,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
             what = f"{line.strip()!r} has an invalid satellite, time or number"
             raise InputFileError(path, what, line=number) from None
     if not states:
-        raise InputFileError(path, "has no satellite position; the file is cut short, give the complete file")
+        raise InputFileError(path, "has no satellite position; if the file is cut short, give the complete file")
     return states
 
 

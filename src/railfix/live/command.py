@@ -199,7 +199,7 @@ def _hooks(
 ) -> tuple[Hooks, Mapping[str, Any]]:
     """Return the hooks for result tables, state file, status line and sensor checks, and the streams' stored states.
 
-    There are no stored states without a state file, or if the file is not used.
+    The stored states are empty if there is no state file or the file is not used.
     """
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
 

@@ -244,10 +244,10 @@ class LiveEngine:
         else:
             self._state = State(received=saved.state.received)
             side = "before" if age_s > 0.0 else "after"
-            allowed = f"at most {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
+            allowed = f"at most {self.settings.state_age_s:g} s before the first new epoch are allowed (state_age_s)"
             self.reports.append(
-                f"state file: only its ephemerides and sequence number are used: its last epoch is "
-                f"{abs(age_s):.1f} s {side} the first new epoch, {allowed}"
+                f"state file: only the ephemerides and the sequence number of the file are used, because its last "
+                f"epoch is {abs(age_s):.1f} s {side} the first new epoch; {allowed}"
             )
         # Navigation files of this session are merged with the data of the state file.
         known = self.processor.received.navigation

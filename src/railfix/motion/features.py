@@ -61,7 +61,7 @@ class Feature:
 
 
 def line_series(trajectory: Trajectory) -> LineSeries:
-    """Compute gradient and curvature of a trajectory over chords of `BASE_M`, as for a vehicle on two bogies."""
+    """Compute the gradient and curvature of a trajectory over chords of `BASE_M`, as for a vehicle on two bogies."""
     half = 0.5 * BASE_M
     arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)

@@ -158,7 +158,7 @@ class MotionSamples(NamedTuple):
 def find_slips(
     samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
 ) -> tuple[SlipResult, SlipState | None]:
-    """Compute state of motion, speed and distance at each sample from this and all earlier samples.
+    """Compute the state of motion, the speed and the distance at each sample from this and all earlier samples.
 
     `state` is the state returned by the previous call, None at the start. The second returned value is the state for
     the next call.

@@ -1,6 +1,7 @@
 """Channels of a log that the settings allow.
 
-They are computed once for each set of channels: a daily log has few sets, and most live epochs have the same one.
+The allowed channels are computed once for each set of channels, because a daily log has few sets, and most live
+epochs have the same set.
 """
 
 from __future__ import annotations

@@ -195,7 +195,7 @@ def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, 
 
 @lru_cache
 def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return holding and release times by cause [s]."""
+    """Return the holding and release times of all causes [s]."""
     hold = {
         Sign.CN0_FALL: limits.hold_s, Sign.GAIN_FALL: limits.hold_s, Sign.EQUAL_CN0: limits.hold_s,
         Sign.LEFT_MAP: limits.hold_s, Sign.CONSTELLATIONS_PART: limits.part_hold_s,
@@ -276,10 +276,10 @@ def judge_interference(
     states: list[InterferenceState],
     limits: InterferenceLimits,
 ) -> tuple[Sequence[Interference | None], list[InterferenceState]]:
-    """Return interference and new state of each antenna; None where `InterferenceLimits.use` is off.
+    """Return the interference and the new state of each antenna; None where `InterferenceLimits.use` is off.
 
-    It is checked at the first epoch of each second, whose result applies to the other epochs of the second. A break or
-    an alarm in between counts at the next check.
+    Interference is checked at the first epoch of each second, whose result applies to the other epochs of the second. A
+    break or an alarm in between counts at the next check.
     """
     if limits.use == "off":
         return [None] * len(states), states

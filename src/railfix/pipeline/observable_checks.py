@@ -97,7 +97,8 @@ def check_observables(
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
     """Return the factor between observed and computed satellite rates, shape (T,); NaN where it is unclear.
 
-    It is the median over the satellites of one constellation, shape (T, K), each relative to their median.
+    The rates are those of one constellation, shape (T, K), less their median over the satellites at each epoch. The
+    factor is the median over the satellites.
     """
     known = np.isfinite(observed_mps) & np.isfinite(expected_mps)
     few = known.sum(axis=1) <= _LEAST_SATELLITES

@@ -30,7 +30,7 @@ class RateSeries:
     time: Datetimes
     known: Datetimes
     distance_m: Floats  #: Wheel distance since the tick before the first, in rising arc length; shape (K,).
-    arc_m: Floats  #: Antenna position by the wheel; NaN if unknown; shape (K,).
+    arc_m: Floats  #: Antenna position by dead reckoning with the wheel, shape (K,); NaN if unknown.
     #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
     turned_rad: Floats
     climbed_rad: Floats

@@ -176,7 +176,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("along_sigma_m", "standard deviation along the line, including alternatives of an ambiguous epoch"),
         Column(
             "own_sigma_m",
-            "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit",
+            "single-epoch sigma, computed from the codes of the epoch alone; the status is `uncertain` above "
+            "`largest_sigma_m`",
             "epoch_sigma_m",
         ),
         *IN_SPACE,

@@ -88,7 +88,7 @@ class SensedState:
     """State after a chunk."""
 
     tick: int = 0  #: Number of the last sample since the start of GPS time; 0 before the first.
-    #: Antenna position at that sample, by the wheel since the filter's last position; NaN if unknown.
+    #: Antenna position at that sample, by dead reckoning with the wheel from the last filter position; NaN if unknown.
     arc_m: float = float("nan")
     sigma_m: float = float("nan")  #: Standard deviation of the filter's last position.
     slip: SlipState | None = None
@@ -189,7 +189,7 @@ def sensed_motion(
 
 
 def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tuple[Floats, Floats]:
-    """Return gradient and curvature of the line by the sine of the gradient and the rate of turn."""
+    """Return the gradient and the curvature of the line from the sine of the gradient and the rate of turn."""
     gradient = sine / np.sqrt(1.0 - np.clip(sine, -0.5, 0.5) ** 2)
     return gradient, turned_radps / np.where(speed_mps == 0.0, np.nan, speed_mps)
 

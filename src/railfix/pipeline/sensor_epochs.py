@@ -201,7 +201,8 @@ def _wheel_values(
 ) -> dict[str, Any]:
     """Return the wheel distances of the intervals toward the front, with their sigmas and the kind of their sign.
 
-    They are from pulses where these are `known` and usable, from the inertial unit during slips, otherwise NaN.
+    The distances are taken from pulses where the pulses are `known` and usable, and from the inertial unit during
+    slips; otherwise they are NaN.
     """
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
@@ -294,7 +295,10 @@ def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: Sen
 
 
 def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Floats, Floats]:
-    """Return the mean of the samples in each interval after its first edge, and their finite fraction."""
+    """Return the mean of the finite samples in each interval, and the fraction of the samples that are finite.
+
+    An interval excludes its first edge and includes its last edge.
+    """
     known = np.isfinite(values)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(known)])
@@ -305,7 +309,7 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return the mask of intervals that a sensor's samples do not cover to the end: the last one, or none."""
+    """Return the mask of intervals that a sensor's samples do not cover to the end: the last interval, or none."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 

@@ -223,7 +223,7 @@ def survey_run(
 ) -> SurveyRun:
     """Return the survey run of a log, read in parts, with its ranges and range changes.
 
-    There is no range change between two parts. ValueError if fewer than three epochs have a position.
+    Range changes are not formed between two parts. Raise ValueError if fewer than three epochs have a position.
     """
     book, slips = ChannelBook(config), None
     runs: list[SurveyRun] = []

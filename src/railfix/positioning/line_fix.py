@@ -41,7 +41,7 @@ class LineFix(NotebookTable):
 
 
 def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimits | None = None) -> LineFix:
-    """Compute section and position on the line (P1 2.2(2), (3)); NaN with too few satellites (`min_satellites`)."""
+    """Compute section and position on the line (P1 2.2(2), (3)); NaN with fewer satellites than `min_satellites`."""
     limits, antennas = limits or FixLimits(), AntennaRows.on(line)
     section = find_section(ranges, antennas, point, limits=limits.section)
     vertex = np.where(ranges.n_used >= limits.min_satellites, section.vertex, -1)

@@ -64,11 +64,12 @@ def noise_scale(
     limits: NoiseScaleLimits,
     least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Return the ratio of the ranges' standard deviation to the assumed value (P4 assumes 1), and the new sums (A, 2).
+    """Return the ratio of the ranges' standard deviation to the assumed value, shape (T,), and the new sums, (A, 2).
 
-    The ratio, shape (T,), at least `least`, is the root mean square of the normalised residuals of earlier epochs with
-    exponential forgetting, combined with `prior`, shape (T,). Only epochs in the mask `teaching` are used. `start`,
-    shape (A, 2), are the sums after the previous epochs.
+    The ratio (1 in P4) is the root mean square of the normalised residuals of earlier epochs, with exponential
+    forgetting and the a-priori value `prior`, shape (T,). The ratio is at least `least`; if `limits.prior` is infinite,
+    residuals are not used. Only epochs in the mask `teaching` are used. `start`, shape (A, 2), are the sums after the
+    previous epochs.
     """
     use = teaching & (freedom > 0) & np.isfinite(wsse)
     values = np.array([np.where(use, wsse, 0.0), np.where(use, freedom, 0)], dtype=np.float64).T

@@ -52,7 +52,7 @@ _FAST_NOISE: Final = 0.5
 
 
 def relative_noise(signal: str) -> float:
-    """Return noise and multipath of a signal ("G5Q") relative to L1 C/A at the same C/N0."""
+    """Return the noise and the multipath of a signal ("G5Q") relative to L1 C/A at the same C/N0."""
     return _FAST_NOISE if signal[:2] in _FAST else 1.0
 
 

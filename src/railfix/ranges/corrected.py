@@ -246,7 +246,7 @@ def _check_near(near_ecef_m: ArrayLike, epochs: int) -> Floats:
 
 
 def _reasons_of_codes(satellite: Strings, code: Floats) -> Bits:
-    """Return the reasons that follow from the codes alone, shape (T, K)."""
+    """Return the rejection reasons that follow from the codes alone, shape (T, K)."""
     observed = np.isfinite(code)
     plausible = is_pseudorange(code)
     taken = first_available(satellite, plausible)

@@ -129,7 +129,7 @@ class BroadcastSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites from navigation data, without rejection reasons."""
+        """Return the satellites from navigation data; no satellite has a rejection reason."""
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s
         )

@@ -3,7 +3,8 @@
 1. The positions of each antenna are checked separately, in pairs, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at positions interpolated between fixes.
 3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
-4. The Dopplers are solved and all measurements are smoothed (`smoother`), repeatedly at the smoothed positions.
+4. All measurements are smoothed (`smoother`). The Dopplers are then solved at the smoothed positions, and all
+   measurements are smoothed again (`_ROUNDS` rounds).
 """
 
 from __future__ import annotations

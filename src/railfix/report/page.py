@@ -70,9 +70,9 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                     row += [number(figures.get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
-        "Settings are the preset and the changed settings. The rate is the fraction of the epochs with observations "
-        "that have a position. Sigma p95 is the 95th percentile of the stated standard deviation along the line, in "
-        "metres"
+        "The column of settings has the preset and the settings that differ from it. The rate is the fraction of the "
+        "epochs with observations that have a position. Sigma p95 is the 95th percentile of the stated standard "
+        "deviation along the line, in metres"
     )
     if evaluation:
         caption += (

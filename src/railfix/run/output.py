@@ -399,8 +399,8 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise OutputError if an output file cannot or must not be written.
 
-    This is the case if its folder does not exist or is not writable, if it is a folder or one of `inputs`, if it exists
-    (with "refuse"), or if its name lacks the ending of its kind.
+    A file cannot or must not be written if its folder does not exist or is not writable, if the file is a folder or one
+    of `inputs`, if it exists (with "refuse"), or if its name lacks the ending of its kind.
     """
     with _writing(target):
         check_not_input(target, inputs)
@@ -421,7 +421,7 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Convert errors of the system and of polars in the block to an OutputError that names the file."""
+    """Convert an OSError or PolarsError raised in the block to an OutputError that names the file."""
     from polars.exceptions import PolarsError
 
     try:

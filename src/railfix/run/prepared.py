@@ -106,7 +106,9 @@ class PreparedLines:
         except FileNotFoundError:
             return None
         except _DAMAGE as error:
-            self.notes.append(f"{file}: damaged, the line was prepared again ({type(error).__name__}: {error})")
+            self.notes.append(
+                f"{file}: the file is damaged; the line was prepared again ({type(error).__name__}: {error})"
+            )
             return None
         return plain, arrays
 

@@ -163,8 +163,8 @@ class RouteOfLog:
     def with_unmapped(self, config: Config) -> Config:
         """Return settings in which the prior of a wrong map is at least the probability of an unmapped track.
 
-        The largest probability in the log is used, limited to `_UNMAPPED_LIMIT`; if the probability is larger, there
-        is no protection level (`is_uncertain`).
+        The largest probability in the log is used, limited to `_UNMAPPED_LIMIT`. Beyond this limit no protection level
+        is computed (`is_uncertain`).
         """
         share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
         limits, risk, araim = config.tracking, config.risk, config.araim
@@ -287,7 +287,7 @@ class RouteOfLog:
         return positions, long[order]
 
     def _unconstrained(self, epoch: Indices, track: Indices) -> tuple[pl.Series, pl.Series]:
-        """Return offset and height [m] of matched positions, by index, from given tracks, shape (n,).
+        """Return the offset and height [m] of matched positions, by index, from given tracks, shape (n,).
 
         The values are null if the track is not among the candidates of the position.
         """

@@ -91,9 +91,10 @@ class AntennaTally:
     status: Counter[str] = field(default_factory=Counter)  #: Epochs by status.
     status_positioned: Counter[str] = field(default_factory=Counter)  #: Epochs with coordinates by status.
     #: Epochs with too few satellites by the first reason, in the order of the bits, after which too few satellites
-    #: remain, and by a single reason without which enough satellites would remain. `not_observed` means that too few
-    #: satellites were observed, `used` that enough remained, but their clocks left no range for the position.
+    #: remain. `not_observed` means that too few satellites were observed; `used` means that enough satellites remained,
+    #: but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
+    #: Epochs with too few satellites by each reason without which enough satellites would remain.
     short_only: Counter[str] = field(default_factory=Counter)
     #: Observations by the first rejection reason, and observations with a single rejection reason by this reason.
     first_reason: Counter[str] = field(default_factory=Counter)

@@ -18,7 +18,7 @@ from railfix.screens.pairs import FilteredMotion, PairedEpochs, PositionScreen
 class AntennaSpacingLimits(Settings):
     """Limits of the antenna-spacing screen."""
 
-    #: Largest difference between the distance of the two positions and the antenna spacing; 5 in P1 table 6.
+    #: Largest difference between the distance from one position to the other and the antenna spacing; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Smallest rejected difference of filter positions or speeds, in standard deviations. This limit applies in
     #: addition to the limits in m and m/s, because the filter may predict over gaps.
@@ -92,7 +92,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge(
         self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict for pairs of positions; where the spacing is unknown, NaN and no rejection."""
+        """Return the metric and the verdict for pairs of positions; NaN and False where the spacing is unknown."""
         unknown = np.isnan(pair.along_m)
         along = np.where(unknown, 0.0, pair.along_m)
         found = antenna_spacing_screen(
@@ -104,7 +104,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict for pairs of filtered positions.
+        """Return the metric and the verdict for pairs of filtered positions.
 
         A pair is rejected where the positions or the speeds differ by more than their limit and by more than
         `filter_sigmas` standard deviations.

@@ -137,10 +137,10 @@ class PositionScreen(_OfTwoAntennas[Limits]):
 
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:
-        """Return metric and verdict for P pairs of positions, given as chainages of shape (P,) [m]."""
+        """Return the metric and the verdict for P pairs of positions, given as chainages of shape (P,) [m]."""
 
     @abstractmethod
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: Limits
     ) -> Screened:
-        """Return metric and verdict for P pairs of filtered positions and speeds."""
+        """Return the metric and the verdict for P pairs of filtered positions and speeds."""

@@ -111,7 +111,7 @@ KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, 
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
 _SENT_AFTER_S: Final = 18  #: Delay of the first transmission of a record after the full hour [s].
 _SYNCHRONOUS_M: Final = (GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0)  #: Radius of a synchronous orbit [m].
-#: Galileo data source: I/NAV of E1-B, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
+#: Galileo data source: I/NAV of E1-B and of E5b-I, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
 _INAV_SOURCE: Final = 517
 
 

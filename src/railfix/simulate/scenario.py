@@ -158,7 +158,8 @@ class ReceiverSettings(ScenarioSettings):
     #: none.
     code_smoothing_s: NotNegative = 0.0
     cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ  #: C/N0 of an unobstructed signal at the horizon.
-    cn0_rise_db: Finite = CN0_RISE_DB  #: Increase of C/N0 to the zenith, proportional to the sine of the elevation.
+    #: Increase of C/N0 from the horizon to the zenith, proportional to the sine of the elevation.
+    cn0_rise_db: Finite = CN0_RISE_DB
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
     clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers share one hardware clock.
     #: Clock bias of the front receiver at the start; separate clocks of other receivers have fixed multiples of this

@@ -106,7 +106,7 @@ def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame
 
 
 def dropouts(settings: RadarSettings, seed: int, duration_s: float) -> list[tuple[float, float]]:
-    """Return start and end of each interval without a measurement [s]: the given, then random intervals."""
+    """Return the start and the end of intervals without a measurement [s], first the given, then random intervals."""
     found = [(d.start_s, d.end_s) for d in settings.dropouts]
     if settings.dropouts_per_hour > 0.0:
         rng = np.random.default_rng([seed, _DROPOUTS])

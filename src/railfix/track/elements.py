@@ -83,7 +83,7 @@ class PlanElement:
         return np.asarray(self.direction_rad + self.first * way_m + change)
 
     def place_at(self, way_m: Floats) -> Floats:
-        """Return easting and northing, shape (n, 2) [m], at distances from the first point [m]."""
+        """Return the easting and northing, shape (n, 2) [m], at distances from the first point [m]."""
         turn = max(abs(self.first), abs(self.last)) * self.length_m
         pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even, as Helmert's law has a knot in the middle
         knots = np.linspace(0.0, self.length_m, pieces + 1)

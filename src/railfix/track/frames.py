@@ -173,7 +173,7 @@ def in_map_frame(
     """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
-        raise MismatchError("there is no position to move to the frame of the map")
+        raise MismatchError("all positions are NaN, so none can be transformed to the frame of the map")
     moved, shift = points_at(ecef_m[known], crs, time, named=named, **motion)
     back = ecef_m.copy()
     back[known] = 2.0 * ecef_m[known] - moved
@@ -243,7 +243,7 @@ def _by_parameters(
     try:
         correction = jgdtrans.loads(read_text(path), format="SemiDynaEXE")
     except jgdtrans.ParseParFileError as error:
-        raise InputFileError(path, f"is no parameter file of semi-dynamic correction ({error})") from None
+        raise InputFileError(path, f"is not a parameter file of semi-dynamic correction ({error})") from None
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     cells, which = np.unique(np.round(np.stack([latitude, longitude], axis=-1), 3), axis=0, return_inverse=True)
     try:

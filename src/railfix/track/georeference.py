@@ -310,7 +310,7 @@ def _to_datum(crs: str) -> tuple[Transformer, float, float]:
 
 
 def _in_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return latitude and longitude on the datum of a CRS for coordinates in the CRS, shape (n,) each [deg]."""
+    """Return the latitude and longitude on the datum of a CRS for coordinates in the CRS, shape (n,) each [deg]."""
     conversion, unit, origin = _to_datum(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in conversion.transform(x, y))
     return (latitude, longitude) if (unit, origin) == (1.0, 0.0) else (latitude * unit, longitude * unit + origin)

@@ -45,7 +45,7 @@ _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError that names all missing options for a raster, or InputFileError if the file is no raster."""
+    """Raise SettingsError that names all missing options for a raster, or InputFileError for another file."""
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []

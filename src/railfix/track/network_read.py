@@ -51,8 +51,8 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
     whole = Network(tracks=tuple(tracks), links=())
     cuts = _places_of_ends(whole, tolerance_m)
     network, _ = _divide(whole, cuts)
-    note = f"connections from ends within {tolerance_m:g} m; {len(cuts)} tracks divided where the end of another meets "
-    note += "them"
+    note = f"tracks are connected at ends within {tolerance_m:g} m; {len(cuts)} tracks are divided where another "
+    note += "track ends at them"
     if packed := [path for path in paths if ending(path) == ".pbf"]:
         note += f"; {packed[0]} is read without the ids of its nodes, which 'osmium cat FILE.osm.pbf -o FILE.osm' keeps"
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)

@@ -207,14 +207,14 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _without_geometry(document: dict[str, Any]) -> list[int]:
-    """Return the numbers, from 1, of features without geometry (null, RFC 7946, 3.2) that are no connections."""
+    """Return the numbers, from 1, of features without geometry (null, RFC 7946, 3.2) that are not connections."""
     features = [f if isinstance(f, dict) else {} for f in document.get("features") or ()]
     empty = [f.get("geometry", ...) is None and RELATION not in (f.get("properties") or {}) for f in features]
     return [number for number, without in enumerate(empty, start=1) if without]
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Return the ways of an Overpass JSON document as segments; ways that are no tracks are left out, with a note."""
+    """Return the ways of an Overpass JSON document as segments; ways that are not tracks are left out, with a note."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [

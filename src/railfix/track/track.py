@@ -22,8 +22,8 @@ SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about t
 #: Note on a section whose points are joined in reverse order; it follows the name of the section.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
-#: Largest difference of a segment's change of kilometrage from its length that is no break, in addition to a twentieth
-#: of the length [m].
+#: Largest difference between a segment's change of kilometrage and its length that is not a break, in addition to a
+#: twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of ellipsoidal heights of railways, including tunnels below the sea [m].
 ANOTHER_PLACE_M = 100_000.0  #: Distance of a log from a map beyond which they are at different locations [m].

@@ -101,7 +101,7 @@ class OrdinateElement:
         return np.asarray(curvature if self.into else -curvature)
 
     def place_at(self, way_m: Floats) -> Floats:
-        """Return easting and northing, shape (n, 2) [m], at distances along the curve from the first point [m]."""
+        """Return the easting and northing, shape (n, 2) [m], at distances along the curve from the first point [m]."""
         x = self._place_on_tangent(way_m)
         own = np.stack([x, self._ordinates(x)[0]], axis=-1)
         if not self.into:  # a transition from the curve to the straight is the same curve from its curved end

@@ -138,7 +138,7 @@ def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]
     Raise InputFileError if there is no segment.
     """
     left_out = ", ".join(f"{n} {why}" for why, n in reasons.items())
-    note = f"{path}: lines left out that are no tracks: {left_out}"
+    note = f"{path}: these lines are not tracks and are left out: {left_out}"
     if not segments:
         why = f" ({note})" if reasons else ""
         raise InputFileError(path, f"there is no track in this file; LineStrings were expected{why}")
@@ -351,7 +351,7 @@ def plan_segment(
         raise InputFileError(source, "a track needs at least two different points")
     crs = reading.crs
     if crs is None and (np.abs(values[:, :2]) > (360.0, 90.0)).any():
-        raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give crs (--crs)")
+        raise InputFileError(source, "names no CRS, and its coordinates are not in degrees; give crs (--crs)")
     used = crs or "EPSG:4326"
     place = georeference(used, values[:, 0], values[:, 1], path=source)
     heights = None

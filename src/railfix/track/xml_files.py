@@ -82,7 +82,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
         except (TypeError, ValueError):
             raise InputFileError(
                 path,
-                f"netElement {name!r}: a number that railML 3 requires is missing in a coordinate, or is not a number",
+                f"netElement {name!r}: a number that railML 3 requires in a coordinate is missing or invalid",
             ) from None
         points = np.array(sorted(rows))[:, 1:]
         if any(place.get("z") is None for _, place in found):

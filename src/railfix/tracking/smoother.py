@@ -141,7 +141,7 @@ def smooth_steps(
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return vector and matrix for the given satellites; 0 for satellites that are not in the later state."""
+    """Return the vector and the matrix for given satellites; 0 for satellites that are not in the later state."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

@@ -119,7 +119,7 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
 
 
 def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Compute sine and cosine after adding a small angle: exact to rounding below 1e-3 rad."""
+    """Compute the sine and the cosine after adding a small angle: exact to rounding below 1e-3 rad."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
     small_cosine = 1.0 - square * (0.5 - square / 24.0)
@@ -251,7 +251,10 @@ class GlonassStates:
         return cls(position, velocity, luni_solar)
 
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
-        """Compute position and velocity (3, n) of records at times since their reference (n,), within `reach_s` [s]."""
+        """Compute positions and velocities, (3, n), of records at times since their reference (n,) [s].
+
+        Times are within `reach_s`.
+        """
         middle = self.position.shape[2] // 2
         node = np.trunc(since_toe_s / STEP_S)
         rest = since_toe_s - node * STEP_S

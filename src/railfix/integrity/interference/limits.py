@@ -243,8 +243,8 @@ def power_signs(
 
     `cn0_dbhz` has the shape (T, K), with one signal per satellite at an epoch; `channel` names satellite and signal.
     `gain`, shape (T,), is in any unit that increases with the gain; NaN where unknown. The recent peak of a satellite
-    decays by `peak_decay_db_per_min`, so that slow changes of elevation or obstruction are no sign, and a constant
-    jammer is detected for minutes.
+    decays by `peak_decay_db_per_min`, so that slow changes of elevation or obstruction do not raise an alarm, and a
+    constant jammer is detected for minutes.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

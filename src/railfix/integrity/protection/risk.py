@@ -207,7 +207,7 @@ class Allocation:
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
     members: Masks  # (T, B, M) satellites affected by each set of shared faults
     shared_prior: Floats  # (T, B) probability of each set of shared faults, 0 where absent
-    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if the set is no hypothesis
+    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if it is not a hypothesis
     beyond: Floats  # (T,) probability of the classes that are not hypotheses
     fault_free: Floats  # (T,) risk for no fault; `one`, `two` and `more` for one, two and three or more faults
     one: Floats
@@ -351,7 +351,7 @@ class _Classes:
     def rest(self, order: Indices) -> Floats:
         """Return the probability of faults that are not hypotheses, shape (T,).
 
-        The probability of a set of shared faults that is no hypothesis includes its supersets.
+        The probability of a set of shared faults that is not a hypothesis includes the supersets of the set.
         """
         whole = (order < 0) & (self.each > 0.0)
         covered = whole.astype(np.float64) @ self.within.T > 0.0

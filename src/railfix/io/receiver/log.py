@@ -80,7 +80,7 @@ def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple
 
 
 def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
-    """Yield offset in the stream, kind, alarm bits and gain of each valid message with indicators."""
+    """Yield the offset in the stream, the kind, the alarm bits and the gain of each valid message with indicators."""
     readers = {
         ("ubx", MON_RF): _mon_rf,
         ("ubx", MON_HW): _mon_hw,

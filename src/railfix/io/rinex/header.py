@@ -105,7 +105,7 @@ def read_version(path: FilePath, line: str) -> float:
     try:
         version = float(line[:9])
     except ValueError as error:
-        raise InputFileError(path, f"RINEX version '{line[:9].strip()}' is no number", line=1) from error
+        raise InputFileError(path, f"RINEX version '{line[:9].strip()}' is not a number", line=1) from error
     if not 2.0 <= version < 5.0:
         message = f"RINEX version {version:.2f} is not supported; 2.10 to 2.12, 3.00 to 3.05 and 4.00 to 4.02 are"
         raise InputFileError(path, message, line=1)
@@ -195,7 +195,7 @@ class _HeaderRecords:
 
     def _count(self, text: str, what: str) -> int:
         if not text.strip().isdecimal():
-            raise self._fail(f"{what}: the number of types '{text.strip()}' is no whole number")
+            raise self._fail(f"{what}: the number of types '{text.strip()}' is not a whole number")
         return int(text)
 
     def types_2(self, text: str) -> None:
@@ -230,7 +230,7 @@ class _HeaderRecords:
         wrong = [name for name in names if not re.fullmatch(pattern, name)]
         if wrong:
             if not words or not all(re.fullmatch(pattern, word) for word in words):
-                raise self._fail(f"'{wrong[0]}' is no observation type")
+                raise self._fail(f"'{wrong[0]}' is not an observation type")
             names = words
             self._remark(label)
         self._types[system] += tuple(names)

@@ -216,7 +216,7 @@ def _blocks_4(path: FilePath, lines: list[str], begin: int, content: NavigationC
         text = lines[start + 1 : end]
         try:
             if title is None:
-                what = f"{lines[start].strip()!r} is no title such as '> EPH G01 LNAV' (type, satellite, message)"
+                what = f"{lines[start].strip()!r} is not a title such as '> EPH G01 LNAV' (type, satellite, message)"
                 raise InputFileError(path, what, line=start + 1)
             kind, name, message = title.groups()
             if kind == "EPH":

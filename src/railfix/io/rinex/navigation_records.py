@@ -120,7 +120,7 @@ def number(text: str) -> float:
 
 
 def first_fault(record: RawRecord) -> tuple[int, str] | None:
-    """Return index and description of the first impossible number; None for a valid record."""
+    """Return the index and a description of the first impossible number; None for a valid record."""
     for k, (name, value) in enumerate(zip(record.fields, record.numbers, strict=True)):
         if name in _NEEDED and math.isnan(value):
             return k, f"{name} is blank"

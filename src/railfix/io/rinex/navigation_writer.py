@@ -164,7 +164,7 @@ def _calendar_text(time: Datetimes) -> Strings:
 
 
 def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Datetimes, Floats]:
-    """Return toc in the constellation's time, and the numbers `names` of `FIELDS`, shape (n, numbers).
+    """Return the toc in the constellation's time, and the numbers `names` of `FIELDS`, shape (n, numbers).
 
     Raise ValueError if a constellation has no Keplerian records in RINEX.
     """
@@ -210,7 +210,7 @@ def _week_and_transmission(
 
 
 def glonass_numbers(records: GlonassRecords) -> tuple[Datetimes, Floats]:
-    """Return toe in UTC, and the numbers in file order, lengths in kilometres, shape (n, numbers)."""
+    """Return the toe in UTC, and the numbers in file order with lengths in kilometres, shape (n, numbers)."""
     toe, sent = gpst_to_utc(records.toe), gpst_to_utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     position, velocity, acceleration = (

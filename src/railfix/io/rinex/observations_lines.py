@@ -96,9 +96,9 @@ FLAWS: Final = (
     "",
     "the epoch line is shorter than {width} characters",
     "the epoch flag '{flag}' is not in 0 to 6",
-    "the number of satellites '{count}' is no number",
+    "the number of satellites '{count}' is not a number",
     "the fields of the epoch line are not in their columns",
-    "the year is no number",
+    "the year is not a number",
     "the month is none of 1 to 12",
     "the day does not exist in its month",
     "the hour is not in 0 to 23",
@@ -195,7 +195,7 @@ def _value(digits: Bytes, counted: Masks) -> Integers:
 
 
 def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
-    """Return flag and count of a RINEX 2 event line without a time; None for other lines."""
+    """Return the flag and the count of a RINEX 2 event line without a time; None for other lines."""
     text = f"{lines.text(line):<32}"
     flag, count = text[28], text[29:32].strip()
     if text[:26].strip() or flag not in "2345" or not count.isdecimal():

@@ -157,7 +157,8 @@ def write_observations(
     Raises
     ------
     ValueError
-        There is no epoch, a time tag is finer than 100 ns, a value is too large for F14.3, or a channel has no column.
+        The observations have no epoch, a time tag is finer than 100 ns, a value is too large for F14.3, or a channel
+        has no column.
     OutputError
         The file cannot be written.
     """

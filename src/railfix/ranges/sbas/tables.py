@@ -95,7 +95,7 @@ class Series:
 
 
 class Stops:
-    """Times at which type 0 stopped the GEO."""
+    """Times at which a message of type 0 stopped the use of the GEO."""
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:
         stops = messages.type == 0
@@ -228,7 +228,7 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add where the run of each row begins: at the satellite's first row, or after a row that was not monitored."""
+    """Add the column `fresh`, the last row that is the first of its satellite or follows an unmonitored row."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))

@@ -148,11 +148,11 @@ class LocalFrame:
         )
 
     def plane(self, ecef_m: Floats) -> Floats:
-        """Return east and north of points in ECEF, shape (P, 2) [m]."""
+        """Return the east and north of points in ECEF, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
     def to_plane(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
-        """Return east and north of geodetic points [deg] at the height of the origin, shape (P, 2) [m]."""
+        """Return the east and north of geodetic points [deg] at the height of the origin, shape (P, 2) [m]."""
         return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 

@@ -193,7 +193,7 @@ def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int)
 def _spans(
     length_m: Between, gap_m: Between, low: float, high: float, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Return start and end of consecutive structures between two chainages, with random lengths and gaps."""
+    """Return the start and the end of consecutive structures between two chainages, with random lengths and gaps."""
     spans = []
     at = low + rng.uniform(0.0, 1.0) * gap_m[1]
     while at < high:

@@ -46,8 +46,8 @@ class SurveyLimits(Settings):
         gt=0,
     )
     apart_m: float = option(
-        "Standard deviation of the distance of a pass from the line, for example with an antenna elsewhere on the "
-        "vehicle.",
+        "Standard deviation of the distance of a pass from the line, including the offset between antennas at "
+        "different positions on the vehicle.",
         0.5,
         name="--apart",
         metavar="M",
