@@ -12,8 +12,9 @@ from railfix.integrity.protection.solution_separation import LevelStatus
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
     """Return the `LevelStatus` of each epoch from its level [m] and the alarm limit (P1 2.4), as int8, same shape.
 
-    A level of NaN means that there is no position. The status of an inconsistent epoch with a position is ALARM
-    (`ProtectionLevel.consistent`). A ValueError is raised if the alarm limit is not positive.
+    A level of NaN means that there is no position. `consistent` states whether the ranges of each epoch are consistent
+    (`ProtectionLevel.consistent`); epochs with a position and inconsistent ranges are ALARM. Raise ValueError if the
+    alarm limit is not positive.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
