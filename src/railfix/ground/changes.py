@@ -148,7 +148,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # the section of a whole station counts only for its points, as its tracks are separate sections
+        # the section of a whole station counts only for its points, because its tracks are separate sections
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None

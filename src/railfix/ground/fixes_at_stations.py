@@ -160,7 +160,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
     """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
 
-    `n_satellites` is 0, as it is unknown whether the fixes are from the same satellites. Raise MismatchError if the
+    `n_satellites` is 0: it is unknown whether the fixes are from the same satellites. Raise MismatchError if the
     logs have no epoch in common.
     """
     known = [np.flatnonzero(np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time)) for log in logs]

@@ -223,7 +223,7 @@ def comes_the_other_way(other: TrainInterval, direction: int, section: int, layo
 
 
 def is_free(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether points may be moved, as they are not locked, and under no interval and no barred section."""
+    """Return whether points may be moved: they are not locked, and not under an interval or a barred section."""
     return not (state.points[point].locked or under_interval(state, point, layout, nearby))
 
 

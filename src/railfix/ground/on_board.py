@@ -138,7 +138,7 @@ class OnBoard:
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:
-        """End the authority at the front, as a train that was stopped by order gets a new authority at its release."""
+        """End the authority at the front end; a train that was stopped by order gets a new authority at its release."""
         self.end_m = self.direction * min(self.direction * self.end_m, self.direction * front_m)
         self._granted = False
 

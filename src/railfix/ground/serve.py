@@ -340,7 +340,7 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
-    """Run a step every `STEP_S`, for at most half of the time, as the links receive frames in the same event loop."""
+    """Run a step every `STEP_S`, for at most half of the time, because links receive frames in the same event loop."""
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:

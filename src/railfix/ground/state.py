@@ -207,7 +207,7 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
-    """Return the state from its texts; times of release restart, as the earlier process's clock is unknown.
+    """Return the state from its texts; times of release restart, because the earlier process's clock is unknown.
 
     Raise InputFileError if the texts were written by an older version.
     """

@@ -38,7 +38,7 @@ def overlaps_stopped(
     nearby: NearbyTrains | None = None,
     checked: Mapping[int, TrainInterval] | None = None,
 ) -> Interlocking:
-    """Return the state with trains stopped whose intervals overlap, as the bounds of trains at rest may have grown.
+    """Return the state with trains stopped if their intervals overlap: the bounds of trains at rest may have grown.
 
     Trains that are unchanged since `checked`, the trains of an earlier call, are not compared with each other again.
     """

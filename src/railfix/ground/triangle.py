@@ -142,7 +142,7 @@ def compare_triangle(
     Raises
     ------
     ValueError
-        A side of the triangle is too short for the limits, as it is not longer than ``2 radius_m + side_m``.
+        A side of the triangle is too short for the limits: it is not longer than ``2 radius_m + side_m``.
     """
     first, second = np.array(SIDES).T
     side = points_m[second] - points_m[first]

@@ -102,7 +102,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning starts without one")
+        return Loaded(session=None, outcome=f"state file {path}: not found, positioning starts without a stored state")
     except OSError as error:
         return _refuse(path, f"cannot be read ({error.strerror})")
     line, _, content = data.partition(b"\n")

@@ -114,7 +114,7 @@ class Passing:
     time: np.datetime64
     earliest: np.datetime64 = _NEVER
     latest: np.datetime64 = _NEVER
-    read: np.datetime64 = _NEVER  #: Time of the reading; NaT without one.
+    read: np.datetime64 = _NEVER  #: Time of the reading; NaT without a reading.
     read_error_m: float = float("nan")  #: Listed chainage less the filter's chainage at the reading.
     here: str = ""  #: For a contradicting reading, the listed balise nearest to the filter's position.
     #: At the passing or reading: speed, standard deviation, level and over- and under-reading amount of the position,
@@ -139,7 +139,7 @@ class PassingState:
     over: Datetimes
     over_values: Floats  #: `_VALUES` at that time, and the odometer's confidence; shape (M, 6).
     read: Datetimes  #: Last reading, shape (M,).
-    #: Readings not yet compared, as the next epoch is not known.
+    #: Readings not yet compared, because the next epoch is not known.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
     #: Correct readings with the filter's position [m], from the last one `_APART_S` before the chunk's end on.
     right: tuple[tuple[np.datetime64, float], ...] = ()
@@ -226,7 +226,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return an odometer's confidence at a point since the previous balise reading [m]; NaN without one."""
+    """Return an odometer's confidence at a point since the previous balise reading [m]; NaN if not given."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 

@@ -155,7 +155,7 @@ class BaseStation:
 
 
 def check_base(config: Config, base: BaseStation | None) -> None:
-    """Raise SettingsError if settings require a missing base station, or exclude a given one."""
+    """Raise SettingsError if settings require a base station that is missing, or exclude one that is given."""
     if config.carrier == "fixed" and base is None:
         raise SettingsError("carrier = fixed: integers need a base station; give one (--base), or carrier = float")
     if config.sbas and base is not None:

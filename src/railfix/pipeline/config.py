@@ -122,7 +122,7 @@ class Config(ScreenSettings):
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     #: Satellites ("G07") and constellations ("C") left out.
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
-    #: Signals of each constellation in order of preference; the first one observed is used.
+    #: Signals of each constellation in order of preference; the first observed signal is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
     #: Number of codes per satellite that are combined (not with SBAS on L1).
     frequencies: Literal["one", "two"] = "one"

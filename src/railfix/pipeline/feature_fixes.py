@@ -130,8 +130,8 @@ def _fix_feature(
     """Compare the measured profile with a feature; `noise` covers the wheel position and the profile."""
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
-    # Rates are in rising arc length: for a reversing or turned vehicle the sign of pitch changes, the sign of heading
-    # does not.
+    # Rates are in rising arc length: for a reversing or turned vehicle the sign of the pitch changes, but the sign of
+    # the heading does not.
     passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
     place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
     profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])

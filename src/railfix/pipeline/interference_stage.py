@@ -229,7 +229,7 @@ def _due(second: Integers, rows: slice, alarms: Bytes, breaks: Masks, state: Int
     count = int(group[-1]) + 1 if len(group) else 1
     alarm, broken = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.bool_)
     alarm[0], broken[0] = state.alarm, state.broken
-    # epochs after a checked epoch belong to the next one
+    # epochs after a checked epoch belong to the next checked epoch
     np.bitwise_or.at(alarm, group - due, alarms)
     np.logical_or.at(broken, group - due, breaks)
     last = int(second[-1]) if len(second) else state.second

@@ -216,7 +216,7 @@ class EpochProcessor:
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Result, State]:
-        """Return the positions of one chunk, and the state for the next one.
+        """Return the positions of one chunk, and the state for the next chunk.
 
         Each note and each doubt of the result is a `RailfixWarning`, except for default screens that lack their input.
 
@@ -233,9 +233,9 @@ class EpochProcessor:
             SBAS messages received since the previous chunk, for processors with `corrections`.
         sensors : SensorSamples, optional
             On-board sensor samples since the previous chunk, for the filter along the track. For an antenna without
-            observations in this chunk they are used with its next one.
+            observations in this chunk they are used with its next observations.
         base : Observations, optional
-            Observations of the base station since the previous chunk, up to the last epoch of this one.
+            Observations of the base station since the previous chunk, up to the last epoch of this chunk.
 
         Raises
         ------

@@ -225,7 +225,7 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 
 
 def _with_ionosphere(received: Received, config: Config) -> Received:
-    """Return the data with the Klobuchar coefficients in use, and notes if these are not the requested ones."""
+    """Return the data with the Klobuchar coefficients in use, and notes if others were requested."""
     if received.corrections is not None and received.corrections.dual_frequency:
         # the model helps the screens, and cancels in the combination
         modelled = _with_ionosphere(replace(received, corrections=None), config)

@@ -115,7 +115,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def bound_sigma_m(self) -> Floats:
-        """Minimum sigma of each range in the level, by the error model; 0 without one; shape (T, M)."""
+        """Minimum sigma of each range in the level, by the error model; 0 without a model; shape (T, M)."""
         return self.on_all_channels(self.corrected.bound_sigma_m)
 
     @property

@@ -137,7 +137,10 @@ def _solvable(ranges: Ranges) -> Masks:
 
 
 def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
-    """Return positions from raw ranges (T, 3), NaN without one; gross errors (T, M); inconsistent epochs (T,)."""
+    """Return positions from raw ranges (T, 3), and masks of gross errors (T, M) and of inconsistent epochs (T,).
+
+    Unknown positions are NaN.
+    """
     start = _below(raw)
     point = point_position(raw, start, limits=config.single_point)
     place, gross, rms = point.ecef_m.copy(), np.zeros(raw.weight.shape, dtype=np.bool_), _rms_m(raw, point)

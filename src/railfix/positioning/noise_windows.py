@@ -17,7 +17,7 @@ Dated = tuple[np.datetime64, float]
 class Windows(NamedTuple):
     """Ages of T epochs since the start of a log, concatenated for A antennas."""
 
-    step_s: Floats  #: Time since the previous epoch; 0 without one; shape (T,).
+    step_s: Floats  #: Time since the previous epoch; 0 at the first epoch; shape (T,).
     growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).
     decay: Floats  #: Decay factor of the running sums for spans begun since the previous epoch; 1 if none; shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).

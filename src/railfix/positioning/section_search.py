@@ -59,12 +59,12 @@ class Section:
     """Best-fitting point of the trajectory, T epochs."""
 
     vertex: Indices  #: Point with the least q; -1 where there are no more ranges than clocks; shape (T,).
-    q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without one; shape (T,).
+    q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without a point; shape (T,).
     #: Excess of q at the best alternative position over q at the best position, both interpolated between the points of
     #: the trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
     #: better, infinite without an alternative; shape (T,).
     excess: Floats
-    other_vertex: Indices  #: Point of the alternative position; -1 without one; shape (T,).
+    other_vertex: Indices  #: Point of the alternative position; -1 if there is none; shape (T,).
     evaluations: Integers  #: Points whose q was computed, shape (T,).
 
 

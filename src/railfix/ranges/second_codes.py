@@ -120,6 +120,6 @@ _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of the group delay of L2C and L5 by LNAV, which has no ISC, shape (n,) [m]; otherwise 0."""
+    """Return the sigma of the group delay of L2C and L5 from LNAV, which has no ISC, shape (n,) [m]; 0 for others."""
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in P_CODES), 0.0)

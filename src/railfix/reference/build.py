@@ -375,8 +375,8 @@ def _name_source(misclosures: Closings) -> str:
 def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:
     if time[-1] < fix_time[0] or time[0] > fix_time[-1]:
         raise MismatchError(
-            f"{path}: from {time[0]} to {time[-1]}, the fixes from {fix_time[0]} to {fix_time[-1]}: no time in common; "
-            "give a table of the same run, in GPS time"
+            f"{path}: data from {time[0]} to {time[-1]} and fixes from {fix_time[0]} to {fix_time[-1]} have no time "
+            "in common; give a table of the same run, in GPS time"
         )
 
 

@@ -245,7 +245,7 @@ def match(
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
-    """Return the components of offsets to the right, and upward, perpendicular to path and right."""
+    """Return the components of offsets to the right, and upward (perpendicular to the path and to the right)."""
     right, along = trajectory.across[section], trajectory.tangent[section]
     return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
 

@@ -173,7 +173,7 @@ def _first_sigmas(states: _States, settings: ReferenceSettings) -> Floats:
 
 
 def _motion(states: _States, evidence: Evidence, dt: Floats, settings: ReferenceSettings) -> tuple[Floats, Floats]:
-    """Return the transition to each instant from the previous one and its noise covariance, shapes (N, n, n).
+    """Return the transition to each instant from the previous instant and its noise covariance, shapes (N, n, n).
 
     The states are position, speed and a time-correlated acceleration (Singer's model). The Doppler speed's error is a
     first-order Gauss-Markov process. The difference of wheel distance and position changes with the distance by the

@@ -150,8 +150,8 @@ class LineSettings(ScenarioSettings):
 
     elements: tuple[Element, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Gradients by rising chainage; without gradients, the line is level.
-    #: Length of the line. The pattern of 756 m is repeated, every second copy mirrored, and cut off at this length. The
-    #: length of elements is their sum; for a file, `length_m` must be NaN.
+    #: Length of the line. The pattern of 756 m is repeated, every second copy mirrored, and cut off at this length.
+    #: With `elements`, this is the sum of their lengths; for a file, `length_m` must be NaN.
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
 
     generated: GeneratedLine = GeneratedLine()

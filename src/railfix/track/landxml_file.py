@@ -241,7 +241,7 @@ def _read_ordinates(
 ) -> OrdinateElement:
     """Create a transition of ordinates through start and end, whose tangent at the straight end points to the PI.
 
-    Raise InputFileError if no end, or both ends are straight, or the curvature does not match the stated radius.
+    Raise InputFileError unless exactly one end is straight and the curvature matches the stated radius.
     """
     start, middle, end = points
     into = curvature[0] == 0.0

@@ -316,7 +316,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
 class _At:
     """Result of the forward recursion at one position."""
 
-    share: Floats  #: Probabilities of the states given the positions up to this one, shape (m + S + 1, C, U).
+    share: Floats  #: Probabilities of the states given the positions up to this position, shape (m + S + 1, C, U).
     likelihood: Floats  #: Likelihood of the position given each state, shape (m + S + 1, C, U).
     move: Floats  #: Transition probabilities to the position, shape (m + S + 1, m + S + 1).
 

@@ -39,7 +39,7 @@ class Provenance:
     #: Height datum given by the user and datum that was used, "ellipsoidal" or "orthometric"; "" if not given.
     height_datum_asked: str = ""
     height_datum_used: str = "ellipsoidal"
-    geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" without one.
+    geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" if none was.
     notes: tuple[str, ...] = ()  #: Notes that must be in every result computed with this map.
 
 

@@ -89,7 +89,7 @@ class ProtectionLevel(NotebookTable):
     #: Channel that determines `one_fault_m`, shape (T,); -1 if a constellation, a side or the map determines it.
     worst_one: Indices
     worst_two: Indices  #: Pair of channels that determines `two_fault_m`, shape (T, 2); -1 if no pair does.
-    #: Letter of the constellation that determines `one_fault_m`, shape (T,); else empty.
+    #: Letter of the constellation that determines `one_fault_m`, shape (T,); empty if no constellation does.
     worst_constellation: Strings
     unchecked_risk: Floats  #: Probability of faults that are not hypotheses, subtracted from the risk, shape (T,).
     cause: Codes  #: `Cause`, shape (T,).

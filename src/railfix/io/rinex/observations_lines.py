@@ -173,7 +173,7 @@ def _right_aligned(text: Bytes) -> Bytes:
 
 
 def _number(text: Bytes) -> tuple[Integers, Masks]:
-    """Parse right-aligned digits, shape (width, n), and flag the valid ones."""
+    """Parse right-aligned digits, shape (width, n), and flag valid numbers."""
     digits = text - np.uint8(_ZERO)
     is_digit, blank = digits <= 9, text == _BLANK
     fine = (is_digit | blank).all(axis=0) & is_digit[-1] & ~(is_digit[:-1] & blank[1:]).any(axis=0)

@@ -107,8 +107,8 @@ class DfmcCorrections:
     """Corrections of T epochs by K satellites."""
 
     state: Integers  #: `DfmcState`, shape (T, K).
-    issue: Integers  #: Issue of data of the record to which the correction refers; -1 without one; shape (T, K).
-    record: Integers  #: Row of `navigation.kepler` with that issue, -1 without one; shape (T, K).
+    issue: Integers  #: Issue of data of the record to which the correction refers; -1 if none does; shape (T, K).
+    record: Integers  #: Row of `navigation.kepler` with that issue, -1 if no record has it; shape (T, K).
     position_m: Floats  #: Correction added to the broadcast position, shape (T, K, 3).
     clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
     sigma_m: Floats  #: Sigma by the indicator and its scale, before covariance and degradation; shape (T, K).
@@ -143,7 +143,7 @@ def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
 
 
 def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
-    """Return the row of the newest of some messages at epochs, and its age [s]; -1 and infinite without one."""
+    """Return the row of the newest of some messages at epochs, and its age [s]; -1 and infinity without a message."""
     row = np.searchsorted(sent, time, side="right") - 1
     ages = seconds(time - np.append(sent, np.datetime64("NaT", "ns"))[row])
     return row, np.where(row >= 0, ages, np.inf)
@@ -377,7 +377,7 @@ class SbasOrbits:
         return np.where(self.usable[:, None], position, np.nan)
 
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on the last orbit with a position; an empty tuple without one."""
+        """Return a sentence on the last orbit with a position; an empty tuple without such an orbit."""
         last = zip(self.prn[self.usable][-1:], self.position_ecef_m(self.reference)[self.usable][-1:], strict=True)
         return tuple(
             f"PRN {prn} is, by its own messages, at {float(geodetic_from_ecef(place)[1]):.1f} degrees east, "

@@ -286,7 +286,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
 
 
 def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMessages:
-    """Check parity, preamble and order, and return the messages without damaged and repeated ones."""
+    """Check parity, preamble and order, and return the messages that are not damaged or repeated."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
     bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()

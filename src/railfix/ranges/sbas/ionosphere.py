@@ -200,7 +200,10 @@ def pierce_point(
 
 
 def triangle_weights(x: Floats, y: Floats, missing: int) -> Floats:
-    """Return weights of SW, NW, SE, NE without one corner, shape (..., 4); one is negative outside the triangle."""
+    """Return the weights of SW, NW, SE and NE if one corner is missing, shape (..., 4).
+
+    One weight is negative outside the triangle.
+    """
     zero = np.zeros_like(x)
     weights = {
         0: (zero, 1.0 - x, 1.0 - y, x + y - 1.0),

@@ -33,7 +33,7 @@ class FastInForce:
     timed_out: Masks
     no_factor: Masks
     no_rate: Masks
-    udrei: Integers  #: UDREI, -1 without one.
+    udrei: Integers  #: UDREI, -1 if it was not received.
     correction_m: Floats
     rate_mps: Floats
     #: Degradation by the age of the correction (A.4.5.1.1). Degradation of the range rate per second, and the time
@@ -307,7 +307,7 @@ class ServiceTable:
         return factor, incomplete
 
     def _complete(self, last: int) -> Integers | None:
-        """Return the rows of the newest complete set at or before a row; None without one."""
+        """Return the rows of the newest complete set at or before a row; None without a complete set."""
         issue, message = self.values["issue"], self.values["message"]
         young = np.flatnonzero(seconds(self.time[last] - self.time[: last + 1]) <= self._limit)
         for row in young[::-1].tolist():

@@ -153,7 +153,7 @@ def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tup
 def sbas_delays(
     sbas: SbasCorrections, fixes: SatelliteCorrections, time: Datetimes, seen: SeenFrom, frequency_hz: Floats
 ) -> Delays:
-    """Return delays of the SBAS grid and of the DO-229D troposphere, with the sigma of corrected codes; else NaN."""
+    """Return delays of the SBAS grid and of the DO-229D troposphere, and sigmas; NaN for uncorrected satellites."""
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
     reason = np.zeros(shape, dtype=np.int64)

@@ -37,7 +37,7 @@ def system_name(prn: int) -> str:
 
 
 def mask_satellite(number: int) -> str:
-    """Return the satellite of a PRN mask number (DO-229D, table A-1; QZSS: IS-QZSS L1-SAIF); empty without one."""
+    """Return the satellite of a PRN mask number (DO-229D, table A-1; QZSS: IS-QZSS L1-SAIF); empty if not assigned."""
     if 1 <= number <= 37:
         return f"G{number:02d}"
     if 38 <= number <= 61:
@@ -132,7 +132,7 @@ class SatelliteCorrections(FrozenArrays):
     rate_mps: Floats  #: Range-rate correction, shape (T, K).
     position_m: Floats  #: Shape (T, K, 3).
     clock_s: Floats  #: Shape (T, K).
-    iode: Integers  #: Issue of data of the long-term correction used, -1 without one; shape (T, K).
+    iode: Integers  #: Issue of data of the long-term correction used, -1 if none is used; shape (T, K).
     record: Integers  #: Row of `navigation.kepler` with that issue, -1 without navigation data; shape (T, K).
     udrei: Integers  #: -1 where none was received, shape (T, K).
     sigma_udre_m: Floats  #: Shape (T, K).
@@ -143,7 +143,7 @@ class SatelliteCorrections(FrozenArrays):
     en_route_m: Floats
     inflated: Masks  #: True where degradation data are missing and sigma is sigma UDRE plus 8 m, shape (T, K).
     rss: Masks  #: True where the squares of the terms are summed (RSS_UDRE of type 10), shape (T, K).
-    covariance: Integers  #: Row of the covariance (type 28) in force, -1 without one; shape (T, K).
+    covariance: Integers  #: Row of the covariance (type 28) in force, -1 if none is; shape (T, K).
 
     def take_satellites(self, which: Integers) -> SatelliteCorrections:
         """Return the corrections of some satellites, by index."""

@@ -76,7 +76,7 @@ class Series:
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
-        """Return the newest row of each series at or before each instant; -1 without one, or older than `OLDEST_S`."""
+        """Return the newest row of each series at or before each instant; -1 if none, or older than `OLDEST_S`."""
         since = (time - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64) // _MS
         wanted_series, wanted_time = np.broadcast_arrays(series, np.clip(since, 0, _SPAN - 1))
         wanted = wanted_series * _SPAN + wanted_time
@@ -157,7 +157,7 @@ class SatelliteTables:
     `fast`: `fresh` is the first row since the satellite was last out of use. `udre`: UDREI from fast corrections and
     type 6; `grows_from` is the reception time from which the degradation and the time-out are counted.
     `fast_degradation` (type 7): `shortest` is the indicator of the smallest time-out of the message's satellites.
-    `long_term`: `other` is the last row with another IODE, -1 without one. `covariance` is type 28, `degradation`
+    `long_term`: `other` is the last row with another IODE, -1 if none. `covariance` is type 28, `degradation`
     type 10; `unused` counts corrections without a matching mask or fast correction.
     """
 
@@ -235,7 +235,7 @@ def _with_fresh(fast: Series) -> Series:
 
 
 def _with_other(table: Series) -> Series:
-    """Add the index of the last row of the same satellite with another issue of data; -1 without one."""
+    """Add the index of the last row of the same satellite with another issue of data; -1 without such a row."""
     number, iode = table.series, table["iode"]
     changed = np.ones(len(number), dtype=bool)
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])

@@ -224,7 +224,7 @@ class EnvironmentSettings(ScenarioSettings):
     @classmethod
     def _complete(cls, shares: dict[Kind, float]) -> dict[Kind, float]:
         if shares and abs(sum(shares.values()) - 1.0) > 1e-6:
-            raise ValueError(f"must add up to 1; they are {sum(shares.values()):g} together")
+            raise ValueError(f"must add up to 1, got {sum(shares.values()):g} in total")
         return shares
 
     @model_validator(mode="after")
