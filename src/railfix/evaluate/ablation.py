@@ -131,7 +131,7 @@ def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> t
     )
     chosen = [screen for screen in SCREENS if screen.name in config.screens]
     unable = [screen for screen in chosen if screen.unable(getattr(config, screen.name), setup)]
-    notes = tuple(f"screen {screen.name}: left out, as it needs {screen.needs}" for screen in unable)
+    notes = tuple(f"screen {screen.name}: left out, because it needs {screen.needs}" for screen in unable)
     return tuple(screen.name for screen in chosen if screen not in unable), notes
 
 

@@ -146,9 +146,9 @@ class OnBoard:
         """Process an authority; return whether it is accepted.
 
         An authority must be newer than the last accepted authority, and have the train's direction. An authority that
-        answers a report from before the last change of ends is rejected, as it may have been granted for the present
-        direction two changes ago. An authority that has lapsed in transit is rejected. An order to brake is always
-        accepted; a late order lasts until the next authority.
+        answers a report from before the last change of ends is rejected, because it may have been granted for the
+        present direction two changes ago. An authority that has lapsed in transit is rejected. An order to brake is
+        always accepted; a late order lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
             # accepted also with a number below the train's, from a centre whose database is an older copy

@@ -353,9 +353,9 @@ class Monitor:
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
         """Process fixes at a clock time, by default each at its tag; return the verdicts and the orders to be sent.
 
-        Fixes that are late after the previous fixes stop the trains, in a log as in a stream. The cause of an order is
-        the cause of the stop after all these fixes, which may have become more exact. Raise SettingsError if the sides
-        of the triangle are too short for the limits.
+        Trains are stopped if fixes are late after the previous fixes, in logs as well as in streams. The cause of an
+        order is the cause of the stop after all these fixes, which may have become more exact. Raise SettingsError if
+        the sides of the triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9

@@ -144,7 +144,7 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
 def _sentences(
     path: FilePath, lines: list[str], problems: list[InputFileError], counts: Counter[str]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and fields of every sentence whose checksum is correct or absent; append `problems`."""
+    """Yield the line number and the fields of every sentence whose checksum is correct or absent; append `problems`."""
     for number, line in enumerate(lines, start=1):
         _, dollar, text = line.partition("$")
         if not dollar:

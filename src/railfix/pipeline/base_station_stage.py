@@ -31,7 +31,7 @@ from railfix.track.trajectory import Trajectory
 
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
-_NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
+_NO_EPOCH: Final = "base station: no epoch of known position so far, so nothing is subtracted"
 #: Station positions within this distance are equal [m].
 _SAME_PLACE_M: Final = 0.01
 

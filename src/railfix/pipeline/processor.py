@@ -121,7 +121,7 @@ class EpochProcessor:
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not (isinstance(trajectories, Mapping) and trajectories):
-            raise SettingsError("trajectories are one for each antenna, at least one: {'front': trajectory}")
+            raise SettingsError("trajectories must name one for each antenna, at least one: {'front': trajectory}")
         if unknown := sorted(set(trajectories) - {"front", "rear"}, key=str):
             raise SettingsError(f"trajectories: unknown antenna {unknown[0]!r}; the antennas are front and rear")
         models, stations = models or Models(), stations or Stations()

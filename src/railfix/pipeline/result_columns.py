@@ -195,12 +195,12 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
             "raim.statistic",
         ),
-        Column("raim_scale", "noise scale of that statistic, from consistent ranges of earlier epochs", "raim.scale"),
+        Column("raim_scale", "noise scale of the statistic, from consistent ranges of earlier epochs", "raim.scale"),
         Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
-            "P4's level: error by a fault that RAIM misses, plus noise; infinite with an unchecked satellite, "
-            "empty with a remaining fault",
+            "P4's level: error caused by a fault that RAIM misses, plus noise; infinite if a satellite is unchecked, "
+            "empty if a fault remains",
             "raim.protection_level_m",
         ),
         Column(
@@ -217,8 +217,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_level_m",
-            "along the line: the error exceeds it with the stated risk; infinite where `protection_cause` says "
-            "why, empty where a fault remains",
+            "level that the error along the line exceeds with the stated risk; infinite for the reason given by "
+            "`protection_cause`, empty where a fault remains",
             "protection.level.level_m",
         ),
         Column(
@@ -233,14 +233,14 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             protection_two_faults_m="protection.level.two_fault_m",
         ),
         *of_one_meaning(
-            "factor K of each part",
+            "factor K of the level for no, one and two faults",
             protection_k_fault_free="protection.level.k_fault_free",
             protection_k_one_fault="protection.level.k_one_fault",
             protection_k_two_faults="protection.level.k_two_faults",
         ),
         Column(
             "protection_separation",
-            "largest distance of the position of a hypothesis, over its threshold",
+            "largest ratio of a hypothesis: distance of its position over the threshold of the distance",
             "protection.level.separation",
         ),
         Column(
@@ -251,7 +251,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_basis",
-            "priors of faults: `measured` on the line, or `indicative`: assumed, no hourly risk is claimed",
+            "fault priors: `measured` on the line, or `indicative` (assumed, so no hourly risk is claimed)",
             "protection.basis",
             words=BASES,
         ),
@@ -274,16 +274,18 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "araim_level_m",
-            "ARAIM with the integrity support message: along the line, the map as a constraint",
+            "ARAIM level along the line from the integrity support message, with the map as a constraint",
             lambda r: None if r.araim is None else r.araim.along.level_m[:, 0],
         ),
         Column(
             "araim_horizontal_m",
-            "level of a 3-D position from these ranges, without the map: horizontal",
+            "horizontal ARAIM level of a 3-D position from these ranges, without the map",
             "araim.horizontal_m",
         ),
         Column(
-            "araim_vertical_m", "the same, vertical", lambda r: None if r.araim is None else r.araim.space.level_m[:, 2]
+            "araim_vertical_m",
+            "vertical ARAIM level of the same 3-D position",
+            lambda r: None if r.araim is None else r.araim.space.level_m[:, 2],
         ),
         *_screen_columns("positions", _get_screened),
         Column(
@@ -293,13 +295,15 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             words=tuple(s.name.lower() for s in PointStatus),
         ),
         Column("conventional_chainage_m", "3-D single point, moved to the nearest point of the trajectory"),
-        Column("conventional_offset_m", "distance of the 3-D single point from that point"),
+        Column("conventional_offset_m", "distance of the 3-D single point from the nearest point of the trajectory"),
         Column(
             "map_offset_across_m",
-            "mean of the 3-D positions of the last minutes, right of the line with rising chainage",
+            "mean offset of the 3-D positions of the last minutes to the right of the line, facing rising chainage",
             "map_offset.across_m",
         ),
-        Column("map_offset_up_m", "mean of the 3-D positions of the last minutes, above the line", "map_offset.up_m"),
+        Column(
+            "map_offset_up_m", "mean height of the 3-D positions of the last minutes above the line", "map_offset.up_m"
+        ),
         *of_one_meaning(
             "smallest offset, across and up, that the status `map_offset` detects (99 %)",
             map_detectable_across_m=lambda r: r.map_offset.detectable_m[:, 0],
@@ -348,8 +352,8 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             "corrected pseudorange minus the range and clock at the position on the line",
             "result.residual_m",
         ),
-        Column("elevation_deg", "of the satellite, azimuth from north over east", "result.elevation_deg"),
-        Column("azimuth_deg", "of the satellite, azimuth from north over east", "result.azimuth_deg"),
+        Column("elevation_deg", "elevation of the satellite", "result.elevation_deg"),
+        Column("azimuth_deg", "azimuth of the satellite, from north over east", "result.azimuth_deg"),
         Column("cn0_dbhz", "carrier-to-noise density", "result.cn0_dbhz"),
         Column("sigma_m", "standard deviation that the weights assume", "result.sigma_m"),
         Column(
@@ -360,18 +364,18 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         *_screen_columns("observations", _get_screened_channels),
         Column(
             "second_share",
-            "two frequencies: weight of the second code; negative: toward the ionosphere-free combination; "
-            "empty: the first code alone",
+            "two frequencies: weight of the second code, negative toward the ionosphere-free combination, empty if the "
+            "first code is used alone",
             lambda o: _second(o, lambda r, _: r.share),
         ),
         Column(
             "ionosphere_measured_m",
-            "two frequencies: delay on the first signal beyond the model",
+            "two frequencies: measured ionospheric delay on the first signal, less the delay of the model",
             lambda o: _second(o, lambda r, _: r.ionosphere_m),
         ),
         Column(
             "metric_two_frequencies_m",
-            "two frequencies: second code less first, less the prediction: multipath and noise",
+            "two frequencies: second code less first code and predicted difference, which leaves multipath and noise",
             lambda o: _second(o, lambda r, _: r.difference_m),
         ),
         Column(

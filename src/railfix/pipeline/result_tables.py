@@ -178,16 +178,16 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "standard deviation of the position, including the straight distance to other branches",
             "tracked.sigma_m",
         ),
-        Column("speed_mps", "along the line, + toward rising chainage", "tracked.speed_mps"),
-        Column("speed_sigma_mps", "its standard deviation", "tracked.speed_sigma_mps"),
-        Column("acceleration_mps2", "along the line", "tracked.acceleration_mps2"),
+        Column("speed_mps", "speed along the line, + toward rising chainage", "tracked.speed_mps"),
+        Column("speed_sigma_mps", "standard deviation of the speed", "tracked.speed_sigma_mps"),
+        Column("acceleration_mps2", "acceleration along the line", "tracked.acceleration_mps2"),
         Column(
             "direction",
             "`rising` or `falling` chainage, `unknown` where the speed is too small to decide",
             lambda r: r.direction + 1,
             words=("falling", "unknown", "rising"),
         ),
-        Column("standstill", "slower than 1 km/h with two sigmas", dtype=pl.Boolean()),
+        Column("standstill", "whether the speed, including two sigmas, is below 1 km/h", dtype=pl.Boolean()),
         Column(
             "branch_probability",
             "probability of the given position against other positions on the line",
@@ -196,8 +196,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "number of possible positions", "tracked.hypotheses", dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "exceeded by the error along the line with the stated risk; infinite where another position is "
-            "more probable than the risk or measurements contradict the position",
+            "level that the error along the line exceeds with the stated risk; infinite where another position is "
+            "more probable than the risk, or measurements contradict the position",
             "tracked.level_m",
         ),
         Column(
@@ -205,7 +205,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "level of the straight distance on the ground, also on another lap or off the map",
             "tracked.ground_level_m",
         ),
-        Column("protection_noise_m", "part of that level by fault-free noise", "tracked.level_noise_m"),
+        Column("protection_noise_m", "part of the level for noise without a fault", "tracked.level_noise_m"),
         Column("protection_separation_m", "largest separation of a sub-filter of the level", "tracked.separation_m"),
         Column(
             "protection_unchecked",
@@ -221,7 +221,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("under_reading_m", "largest distance of the train ahead, likewise (`L_DOUBTUNDER`)", "tracked.amount_m"),
         Column(
             "motion",
-            "by tachometer and inertial unit together, see `docs/sensors.md`",
+            "state of motion from tachometer and inertial unit together, see `docs/sensors.md`",
             "sensed.state",
             words=tuple(state.name.lower() for state in MotionState),
         ),
@@ -254,23 +254,24 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "measured_gradient_permille",
-            "gradient by tachometer and accelerometer, positive if the line rises with chainage; empty in slips "
+            "gradient from tachometer and accelerometer, positive if the line rises with chainage; empty in slips "
             "and below 1 m/s",
             lambda r: 1e3 * r.sensed.gradient,
         ),
         Column(
             "measured_curvature_1pm",
-            "curvature at that chainage by the yaw rate, positive to the right in rising chainage",
+            "curvature at `measured_chainage_m` from the yaw rate, positive to the right in rising chainage",
             "sensed.curvature_1pm",
         ),
         Column(
             "measured_cant_mm",
-            "cant at that chainage by the roll of the body, positive with the left rail higher; needs a vehicle file",
+            "cant at `measured_chainage_m` from the roll of the body, positive if the left rail is higher; needs a "
+            "vehicle file",
             lambda r: 1e3 * r.sensed.cant_m,
         ),
         Column(
             "metric_antenna_spacing_m",
-            "distance of the two positions less the antenna spacing; empty for one antenna",
+            "distance between the two positions less the antenna spacing; empty for one antenna",
             "spacing_error_m",
         ),
         Column(
@@ -313,7 +314,7 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
             "distance along the line from all measurements before and after",
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
-        Column("smoothed_sigma_m", "its standard deviation", "track.sigma_m"),
+        Column("smoothed_sigma_m", "standard deviation of the smoothed chainage", "track.sigma_m"),
         Column("smoothed_speed_mps", "speed along the line from all measurements before and after", "track.speed_mps"),
     )
 )
@@ -361,24 +362,24 @@ def _getter(name: str) -> Any:
 #: Columns of the table of passings.
 PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
-        Column("time_gpst", "time of the passing by the filter; or of a contradicting reading", _getter("time"),
+        Column("time_gpst", "time of the passing from the filter, or time of a contradicting reading", _getter("time"),
                dtype=_TIME),
-        Column("earliest_gpst", "start of the passing's interval by the level; the train was not at the point before",
+        Column("earliest_gpst", "earliest time of the passing that the level allows",
                _getter("earliest"), dtype=_TIME),
-        Column("latest_gpst", "its end", _getter("latest"), dtype=_TIME),
+        Column("latest_gpst", "latest time of the passing that the level allows", _getter("latest"), dtype=_TIME),
         EPOCH[1],
-        Column("balise", "name in the list, or identity read", _getter("balise"), dtype=pl.String()),
+        Column("balise", "name in the list, or identity that was read", _getter("balise"), dtype=pl.String()),
         Column(
             "verdict",
             "`virtual`: no balise; `read`, `missing`: passed with and without a reading; `contradicts`: read where the "
             "filter excludes it; `not_listed`",
             _getter("verdict"), words=VERDICTS,
         ),
-        Column("chainage_m", "as listed", _getter("chainage_m")),
+        Column("chainage_m", "chainage in the list", _getter("chainage_m")),
         Column("read_gpst", "time of the reading", _getter("read"), dtype=_TIME),
         Column("read_error_m", "for a contradicting reading, listed chainage less the filter's",
                _getter("read_error_m")),
-        Column("speed_mps", "at the passing, + toward rising chainage", _getter("speed_mps")),
+        Column("speed_mps", "speed at the passing, + toward rising chainage", _getter("speed_mps")),
         Column("protection_level_m", "protection level of the position at the passing", _getter("level_m")),
         Column("doubt_over_m", "largest distance of the train behind the position: `L_DOUBTOVER` less `Q_LOCACC`",
                _getter("amount_m")),

@@ -93,7 +93,7 @@ class Explanation:
 
 
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
-    """Explain the epoch of one antenna that is nearest to the GPS time `at`, ``hh:mm:ss`` or with a date before it.
+    """Explain the epoch of one antenna that is nearest to the GPS time `at`: ``hh:mm:ss``, optionally after a date.
 
     The default antenna is the first. A time without a date may be on any day of the run. Raise InputFileError if the
     run wrote no observations. Raise SettingsError if the antenna or the time is invalid. Raise MismatchError if no

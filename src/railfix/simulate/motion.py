@@ -44,7 +44,7 @@ class Motion:
     jerk_mps3: Floats | float = 0.0  #: Jerk of each piece, shape (P,) [m/s^3].
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the chainage [m] and speed [m/s] at times; before time 0, the chainage and speed at 0."""
+        """Return the chainage [m] and speed [m/s] at times; before time 0, the values at time 0."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.maximum(np.searchsorted(self.time_s, time, side="right") - 1, 0)
         since = np.maximum(time - self.time_s[piece], 0.0)

@@ -80,9 +80,9 @@ def fast_in_force(
 def _factors(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Integers, Floats, Masks]:
-    """Return the indicator of type 7, the largest indicator of its message, and the latency; and where it is missing.
+    """Return the indicator of type 7, the largest indicator of its message, the latency, and a mask of missing values.
 
-    Both indicators are the worst where type 7 is missing.
+    Where type 7 is missing, both indicators have the worst value.
     """
     table = tables.fast_degradation
     row, worst = table.newest(number, time), len(_ACCELERATION) - 1

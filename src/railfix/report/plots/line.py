@@ -133,7 +133,7 @@ class LocalFrame:
 
     @classmethod
     def around(cls, ecef_m: Floats) -> LocalFrame:
-        """Return the frame at the mean of points, ECEF, shape (P, 3) [m]."""
+        """Return the frame with its origin at the mean of points, shape (P, 3), ECEF [m]."""
         origin = ecef_m.mean(axis=0)
         latitude, longitude, height = (float(value) for value in geodetic_from_ecef(origin))
         axes = enu_axes(latitude, longitude)
