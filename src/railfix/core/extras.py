@@ -1,4 +1,4 @@
-"""Message on optional packages that are not installed."""
+"""Error for optional packages that are not installed."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from railfix.core.settings import Checked, is_number
 
 
 class Message(Checked):
-    """Base of messages between programs, validated in one pass over all values because they are numerous."""
+    """Base of messages between programs, validated in one pass over all values for speed."""
 
     _numbers: ClassVar[frozenset[str]] = frozenset()
 

@@ -32,7 +32,7 @@ def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Return the GPS times with given seconds of week [s] nearest to reference times, which may err by half a week."""
+    """Return the GPS times with given seconds of week [s] nearest to reference times within half a week."""
     week, sow = to_week(near)
     shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)
     return from_week(week + shift.astype(np.int64), seconds_of_week)

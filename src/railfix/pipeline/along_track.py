@@ -34,8 +34,7 @@ from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracke
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Rejection reasons with which the filter still uses a code: it weights multipath and faults itself, over several
-#: epochs.
+#: Rejection reasons despite which the filter uses a code, because it weights multipath and faults over several epochs.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -44,23 +43,22 @@ _WEIGHED_BY_FILTER: Final = (
     | Reason.CN0_CURVE
     | Reason.ANTENNA_PAIR
 )
-#: Rejection reasons of the code only: the filter still uses the satellite's phase and Doppler.
+#: Rejection reasons that concern the code only; the filter uses the satellite's phase and Doppler.
 _CODE_ALONE: Final = Reason.GROSS_ERROR
-#: Speed including two sigmas below which the train counts as standing [m/s]: 1 km/h, below which tachometers give no
-#: output either.
+#: Largest speed, two sigmas included, at standstill [m/s]: 1 km/h, below which tachometers give no output.
 STANDSTILL_MPS: Final = 1.0 / 3.6
 #: Number of sigmas, and distance [m], up to which positions beyond an end of the line are moved to the end.
 _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
-#: Gate of two-way ranges around the predicted range, in standard deviations; minimum width toward long ranges [m]:
-#: echoes arrive late, and are separable from 0.3 m on (P2, table 3).
+#: Gate of two-way ranges around the predicted range, in standard deviations, and its minimum width toward long ranges
+#: [m]. Echoes arrive late, and are separable from 0.3 m on (P2, table 3).
 _GATE_SIGMAS: Final = 3.0
 _LATE_M: Final = 0.6
 #: Vertical error of the ionospheric model for which the filter's displacements (`slow_code_m`, `TILT_M`) are set [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
-#: With sensors, the filter processes blocks of this much GPS time [ns].
+#: Length of the blocks of GPS time that the filter processes if there are sensors [ns].
 _BLOCK_NS: Final = 5_000_000_000
-#: Number of sigmas of the speed beyond which a direction is reported.
+#: Ratio of the speed to its sigma above which a direction is reported.
 _DIRECTION_SIGMAS: Final = 3.0
 
 
@@ -75,14 +73,14 @@ def along_track(
     samples: SensorSamples | None = None,
     references: LineReferences | None = None,
 ) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
-    """Return filtered positions of one antenna, the filter's input, and its state.
+    """Return the filtered positions of one antenna, the filter's input, and the filter's state.
 
-    Codes that screens or single-epoch exclusions have rejected for certain reasons are used, weighted by the filter
-    itself; codes rejected for other reasons are left out (`gnss_epochs`).
+    Codes rejected for reasons in `_WEIGHED_BY_FILTER` are used with the filter's own weights; codes rejected for other
+    reasons are left out (`gnss_epochs`).
 
-    The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
-    `samples` are the on-board sensor samples since the previous chunk; `references` has the line's features, ground
-    units and balises.
+    `railfix.tracking.levels.track_with_levels` computes positions and levels; docs/filter-equations.md has the
+    equations. `samples` are the on-board sensor samples since the previous chunk; `references` has the line's features,
+    ground units and balises.
     """
     epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m, tilt_scale=single.tilt_scale)
@@ -105,7 +103,7 @@ def along_track(
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
             of_filter, filter_wheel = _against_wheel(replays, tracked.arc_m, sure, after.filter_wheel, config)
             after, tracked = replace(after, filter_wheel=filter_wheel), _bound_by_wheel(tracked, of_filter.bound_m)
-        # a named cause outranks a doubt without a cause; a time-tag error outranks both
+        # spoofing outranks a doubt without a named cause; a time-tag error outranks both
         unnamed = (tracked.status == TrackStatus.DOUBTFUL) & (single.suspicion != Suspicion.TIME_TAGS)
         parted = wheel.parted & (is_bounded(tracked.status) | unnamed)
         tracked = mark_doubtful(tracked, parted, TrackStatus.SPOOFING_SUSPECTED)
@@ -120,7 +118,7 @@ def along_track(
 
 
 def single_epochs(solution: Solution, interference: Interference | None, config: Config) -> SingleEpochs:
-    """Return the results of an antenna's single epochs that its filter uses."""
+    """Return the single-epoch results of an antenna that its filter uses."""
     has = with_coordinates(config.failed_checks)[solution.status]
     return SingleEpochs(
         noise_scale=solution.noise_scale,
@@ -134,7 +132,7 @@ def single_epochs(solution: Solution, interference: Interference | None, config:
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
-    """Return positions with finite levels raised to the largest error of an undetected pull."""
+    """Raise finite levels to `bound_m`, the largest position error that the wheel distance does not reveal."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
         tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
@@ -144,7 +142,7 @@ def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
 def _against_wheel(
     replays: Sequence[Replay], arc_m: Floats, sigma_m: Floats, state: WheelState, config: Config
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare positions with the wheel distance."""
+    """Compare the distances between positions with wheel distances."""
     parts = [(replay.epochs.time, replay.sensors.wheel_m) for replay in replays]
     rolled = np.concatenate([np.full(len(time), np.nan) if distance is None else distance for time, distance in parts])
     return wheel_signs(
@@ -158,7 +156,7 @@ def apply_spacing_verdict(
 ) -> tuple[AlongTrack, FilterState]:
     """Check distance and speed against the other antenna; return the positions with the verdict, and the state.
 
-    A verdict of shape (T,), None without any, lasts for `held_s` after it.
+    `spacing` has the screen's verdicts, shape (T,), or is None. A rejection applies until `held_s` after its epoch.
     """
     time, error = result.tracked.time, result.spacing_error_m
     disagreed = np.full(len(time) + 1, state.disagreed)
@@ -178,7 +176,7 @@ def with_passings(
     samples: SensorSamples | None,
     limits: BaliseLimits,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions with the passed balises, and the state; after the last verdict on the positions."""
+    """Return the positions, whose statuses must be final, with the passings of balises, and the state."""
     if listed is None:
         return result, state
     readings = samples.balises if samples else BaliseReadings()
@@ -187,7 +185,7 @@ def with_passings(
 
 
 def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
-    """Return positions with a doubtful status at some epochs, where their error is not bounded."""
+    """Return positions with `status` and infinite levels at doubtful epochs; NaN levels are kept."""
     if not doubtful.any():
         return tracked
     reported = np.where(doubtful, np.int8(status), tracked.status)
@@ -210,8 +208,8 @@ def _run_filter(
 
     `single` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
 
-    With sensors the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks: the wheel
-    position, which gives the gradient, starts each block at the filter's position.
+    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, whose limits do not depend on the
+    chunks. The wheel position, at which the gradient of the map is taken, starts each block at the filter's position.
     """
 
     def sine_at(arc_m: Floats) -> Floats:
@@ -261,7 +259,7 @@ def _gate(
     state: FilterState,
     config: Config,
 ) -> tuple[GnssEpochs, ReturnState]:
-    """Return epochs without codes that are doubtful after an outage."""
+    """Return the epochs without the codes that `gated_codes` withholds after an outage, and the gate's state."""
     distance = np.full(len(epochs), np.nan)
     for other in (sensors.radar_m, sensors.wheel_m):
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
@@ -274,11 +272,10 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return ranges that match the filter's position: echoes arrive late, a wrongly surveyed unit matches nowhere (P2
-    3.3).
+    """Return the two-way ranges, NaN where inconsistent with the filter's position or without it (P2 3.3).
 
-    The position is predicted with the filter's speed since the start of the block, so that the gate widens with the
-    square of time.
+    Echoes arrive late, and ranges to a wrongly surveyed unit are inconsistent. The position is predicted from the start
+    of the block with the filter's speed, so that the gate widens with the square of the elapsed time.
     """
     fixed = state.anchor
     if fixed is None:
@@ -301,7 +298,7 @@ def _block(time: np.datetime64) -> int:
 
 
 def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:
-    """Return the state at the start of a block: dead reckoning starts at the filter's position."""
+    """Return the state at the start of a block, where dead reckoning restarts from the filter's position."""
     sensors = state.sensors
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
@@ -320,8 +317,8 @@ def _find_fix(tracked: Tracked) -> FilterFix:
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:
     """Return arc lengths on the trajectory, shape (T,) [m].
 
-    A position beyond an end within its errors (four sigmas, or 30 m as for codes at a start) is moved to that end; NaN
-    further out.
+    A position beyond an end by at most the larger of four sigmas and 30 m is moved to that end. Positions further out
+    are NaN.
     """
     arc, end = tracked.arc_m, trajectory.arc_m[-1]
     near = np.clip(arc, 0.0, end)
@@ -338,11 +335,11 @@ def gnss_epochs(
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the filter's measurements, and the state of the slip detection.
 
-    A code is the corrected pseudorange, NaN where it has a rejection reason that the filter does not weigh itself; its
-    standard deviation is the range sigma times `noise_scale`, shape (T,).
+    A code is the corrected pseudorange, NaN at unsure epochs and where it has a rejection reason outside
+    `_WEIGHED_BY_FILTER`. Its standard deviation is the range sigma times `noise_scale`, shape (T,).
 
-    Dopplers still contain satellite clock drift and tropospheric rate, which are below 5 mm/s above 10 degrees; both
-    are subtracted from the carrier-phase change.
+    Carrier phases are corrected for satellite clock and troposphere. Dopplers are not; the clock drift and tropospheric
+    rate are below 5 mm/s above 10 degrees of elevation.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state

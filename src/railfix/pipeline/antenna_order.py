@@ -17,11 +17,11 @@ from railfix.core.arrays import Datetimes
 from railfix.screens.pairs import pair_epochs
 from railfix.track.trajectory import Trajectory
 
-#: Length of a line stretch whose pairs of positions share their reflections and count as one sample [m].
+#: Length of a stretch of the line [m]; its pairs of positions count as one sample, as they share reflections.
 _STRETCH_M: Final = 50.0
 #: Minimum number of stretches for a verdict; a train at rest has too few.
 _LEAST_STRETCHES: Final = 4
-#: Number of sigmas by which the distance must be below zero.
+#: Number of sigmas below zero beyond which the antennas are in the wrong order.
 _CERTAIN: Final = 5.0
 #: Smallest antenna distance with a defined order [m].
 _LEAST_DISTANCE_M: Final = 0.5
@@ -30,8 +30,8 @@ _LEAST_DISTANCE_M: Final = 0.5
 class AntennaOrder:
     """Mean distance of the front antenna ahead of the rear antenna on one track, from their positions.
 
-    `distance_m` is the distance by the vehicle file [m], in the direction that the vehicle faces; time tags of a pair
-    of epochs differ by at most `tolerance_s`.
+    `distance_m` is the distance of the front antenna ahead of the rear antenna by the vehicle file [m]. The time tags
+    of a pair of epochs differ by at most `tolerance_s`.
     """
 
     def __init__(self, front: Trajectory, rear: Trajectory, *, tolerance_s: float) -> None:
@@ -57,7 +57,7 @@ class AntennaOrder:
         return cls(trajectories["front"], trajectories["rear"], tolerance_s=tolerance_s)
 
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
-        """Add the positions of more epochs; return whether the train is on a new stretch.
+        """Add the positions of more epochs; return whether they include a new stretch.
 
         For each antenna the arguments are time tags, chainage [m] and sigma [m], shape (F,) and (R,); NaN without a
         position.
@@ -82,8 +82,8 @@ class AntennaOrder:
         return len(self._stretches) > seen
 
     def measure(self) -> tuple[float, float]:
-        """Return the mean distance of the front antenna ahead of the rear antenna, and its sigma [m]; NaN before a
-        verdict.
+        """Return the mean distance of the front antenna ahead of the rear antenna, and its sigma [m]; NaN on fewer than
+        four stretches.
 
         A stretch contributes its mean distance with the variance of a single pair, because position errors on a stretch
         do not average out; if the stretches scatter more, the sigma grows.

@@ -1,8 +1,8 @@
 """Balises and virtual balises: filter positions at the readings, and the passing of each balise.
 
-The train was over a balise at arc length m at some time while ``|m - s| <= L``, s the position of the filter and L its
-level along the line. The interval ends when the balise is certainly behind the train. A passing takes the train from
-one side of the balise to the other, in either direction of travel.
+The interval of a passing is the time during which ``|m - s| <= L``, with the arc length m of the balise, the filter's
+position s and its level L along the line. The train certainly changes from one side of the balise to the other in this
+interval, in either direction of travel.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ from railfix.track.passes import short_distance_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import BaliseEpochs, Tracked
 
-#: Readings of the same identity within this time belong to one passing [s]: a second balise of a group, or a standing
-#: train.
+#: Readings of the same identity within this time belong to one passing [s]; a train at rest repeats its reading.
 AGAIN_S: Final = 60.0
 
 
 class BaliseLimits(Settings):
     """Balise reader on the vehicle."""
 
-    #: Position of the reader ahead of the vehicle's middle, or of the antenna without a vehicle file.
+    #: Distance of the reader ahead of the vehicle's middle, or of the antenna without a vehicle file.
     ahead_m: float = 0.0
     #: Minimum standard deviation of a reading along the line: SUBSET-036 requires 1 m for the vital use of a balise's
     #: position.
@@ -43,11 +42,11 @@ class BaliseState:
 
     balise: str = ""  #: Identity; blank before the first reading.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    turn: int = 1  #: Its column in `railfix.tracking.BaliseEpochs`.
+    turn: int = 1  #: Column of the balise in `railfix.tracking.BaliseEpochs`.
 
 
 def arcs_of_balises(listed: ListedBalises, trajectory: Trajectory, limits: BaliseLimits) -> Floats:
-    """Return arc lengths of the antenna at which the reader is over each balise, shape (M,) [m]; NaN off the path."""
+    """Return arc lengths of the antenna with the reader over each balise, shape (M,) [m]; NaN beyond the path."""
     reader = listed.chainage_m - trajectory.front_sign * limits.ahead_m
     along = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
     return np.interp(reader, along, trajectory.arc_m, left=np.nan, right=np.nan)
@@ -61,11 +60,11 @@ def balise_epochs(
     state: BaliseState,
     limits: BaliseLimits,
 ) -> tuple[BaliseEpochs, BaliseState]:
-    """Return the balises at the epoch after each reading, and the state for the next chunk.
+    """Assign each reading to the next epoch; return the measured balise positions, and the state for the next chunk.
 
-    Unlisted balises are left out, and so are repeated readings within `AGAIN_S`. Balises alternate between two columns,
-    so that one of the two sub-filters without a column is correct whichever single balise is wrong. `edges` has the
-    epoch before the chunk and the epochs of the chunk, shape (T + 1,).
+    Unlisted balises and readings repeated within `AGAIN_S` are left out. Successive balises alternate between two
+    columns. A single wrong balise therefore does not affect the sub-filter without its column. `edges` has the epoch
+    before the chunk and the epochs of the chunk, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.find_index(readings.balise), arcs_of_balises(listed, trajectory, limits)
@@ -87,13 +86,11 @@ def balise_epochs(
 #: Possible verdicts on a passing or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
-#: Confidence of an odometer by SUBSET-041 5.2.1.1: a constant, and a fraction of the distance since the last balise
-#: read.
+#: Odometer accuracy by SUBSET-041 5.2.1.1: a constant [m], and a fraction of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
-#: Epochs farther apart are not connected [s]; it is also the largest time between a reading and the interval of its
-#: passing.
+#: Longest time between epochs for interpolation, and between a reading and the interval of its passing [s].
 _APART_S: Final = 2.0
-#: A balise farther than this from the filter's position is wrong [m].
+#: Number of sigmas between a balise and the filter's position beyond which the reading is wrong.
 _CONTRADICTION_SIGMAS: Final = 5.0
 _NEVER: Final = np.datetime64("NaT", "ns")
 #: Filter values at each epoch.
@@ -102,23 +99,22 @@ _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
 
 @dataclass(frozen=True, kw_only=True)
 class Passing:
-    """Passing of a listed point, or reading of a balise that contradicts the filter."""
+    """Passing of a listed point, or wrong reading of a balise."""
 
     balise: str
-    #: Index in `VERDICTS`: point without a balise; balise passed with, or without, a reading; reading that contradicts
-    #: the filter; reading of an unlisted balise.
+    #: Index in `VERDICTS`: virtual balise; balise passed with a reading; balise passed without a reading; reading that
+    #: contradicts the filter; reading of an unlisted balise.
     verdict: int
     chainage_m: float  #: Listed chainage; NaN if unlisted.
-    #: Time of the passing by the filter, with its interval; for a contradicting reading, the time of the reading and
-    #: NaT.
+    #: Time of the passing by the filter, and start and end of its interval; for a wrong reading, its time and NaT.
     time: np.datetime64
     earliest: np.datetime64 = _NEVER
     latest: np.datetime64 = _NEVER
     read: np.datetime64 = _NEVER  #: Time of the reading; NaT without a reading.
     read_error_m: float = float("nan")  #: Listed chainage less the filter's chainage at the reading.
     here: str = ""  #: For a contradicting reading, the listed balise nearest to the filter's position.
-    #: At the passing or reading: speed, standard deviation, level and over- and under-reading amount of the position,
-    #: and the error that SUBSET-041 permits an odometer since the previous balise.
+    #: At the passing or reading: speed; standard deviation, level, and over- and under-reading amount of the position;
+    #: and odometer accuracy of SUBSET-041 since the previous balise.
     speed_mps: float = float("nan")
     sigma_m: float = float("nan")
     level_m: float = float("nan")
@@ -134,14 +130,14 @@ class PassingState:
     values: Floats  #: `_VALUES` of the last epoch with a position; shape (1, 5) or (0, 5).
     #: Last certain side of the train at each point: -1 before the point, 1 beyond, 0 unknown; shape (M,).
     side: Integers
-    #: Time at which that side ended, and time at which the filter's position was last over the point; shape (M,).
+    #: Time at which the train left `side`, and time at which the filter's position was last over the point; shape (M,).
     since: Datetimes
     over: Datetimes
-    over_values: Floats  #: `_VALUES` at that time, and the odometer's confidence; shape (M, 6).
+    over_values: Floats  #: `_VALUES` at the time `over`, and odometer accuracy; shape (M, 6).
     read: Datetimes  #: Last reading, shape (M,).
-    #: Readings not yet compared, because the next epoch is not known.
+    #: Readings after the last epoch, which the next chunk compares.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Correct readings with the filter's position [m], from the last one `_APART_S` before the chunk's end on.
+    #: Times of correct readings with the filter's positions [m], from the last reading older than `_APART_S` on.
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -226,7 +222,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return an odometer's confidence at a point since the previous balise reading [m]; NaN if not given."""
+    """Return the odometer accuracy at a point since the previous correct balise reading [m]; NaN without a reading."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 
@@ -284,7 +280,7 @@ def _pass(
 
 
 def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
-    """Return a sentence on each balise that was missed, or read at a wrong position."""
+    """Return a sentence on each missed balise and each wrong reading."""
     notes = []
     for passing in passings:
         at, name = str(passing.time)[:21], f"{antenna}: balise {passing.balise}"

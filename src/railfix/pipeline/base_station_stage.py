@@ -31,14 +31,14 @@ from railfix.track.trajectory import Trajectory
 
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
-_NO_EPOCH: Final = "base station: no epoch of known position so far, so nothing is subtracted"
-#: Station positions within this distance are equal [m].
+_NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
+#: Station positions within this distance count as equal [m].
 _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed positions: units of two-way ranges, a base station ("stream": by its headers), balises, and the features
-    of the line by antenna.
+    """Surveyed positions of ground units, base station ("stream" takes it from the observation headers) and balises,
+    and line features by antenna.
     """
 
     units: GroundUnits | None = None
@@ -49,14 +49,14 @@ class Stations(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseState:
-    """Errors of a base station so far (None at the start), and state of its carrier-phase stages."""
+    """Range errors of a base station so far (None before the first), and state of its carrier-phase stages."""
 
     errors: BaseErrors | None = None
     carrier: CarrierState = field(default_factory=CarrierState)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One sentence on missing data of the station."""
+        """Note that the station has no epoch with a known position; empty otherwise."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
@@ -66,12 +66,12 @@ class BaseState:
 
 
 class BaseStation:
-    """A base station at a known position in the frame of the satellites, shape (3,) [m].
+    """Base station at a known ECEF position, shape (3,) [m], in the reference frame of the satellite orbits.
 
     Its pseudoranges are corrected as the train's, with the same settings, and smoothed by carrier phase where
     available, which reduces the station's noise. The station's multipath remains. With "stream" the position is taken
-    from the headers of its observations; a station that moves by more than a centimetre (the next virtual station)
-    restarts.
+    from the headers of the observations. The state restarts if that position changes by more than a centimetre, as it
+    does with the next virtual station.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
@@ -88,9 +88,7 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Return the state after more observations of the station, without data that is not needed from epoch `began`
-        on.
-        """
+        """Return the state after more observations of the station, without errors too old for epochs from `began`."""
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
@@ -118,7 +116,7 @@ class BaseStation:
     def errors(
         self, obs: Observations, received: Received, carrier: CarrierState, ecef_m: Floats
     ) -> tuple[BaseErrors, CarrierState]:
-        """Return the errors at the given epochs, and the state of the carrier-phase stages after them."""
+        """Return the range errors of the station at its epochs, and the new state of its carrier-phase stages."""
         own = replace(received, base=None)
         channels = self._book.of(obs, received.navigation)
         rows, source = self._rows(ecef_m), correction_source(own, self._config)

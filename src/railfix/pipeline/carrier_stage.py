@@ -39,7 +39,7 @@ from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.track.trajectory import Trajectory
 
-#: Elevation below which the weights of phases no longer fall [deg].
+#: Elevation below which the weights of phases are constant [deg].
 LOWEST_WEIGHTED_DEG = 5.0
 
 
@@ -47,7 +47,7 @@ LOWEST_WEIGHTED_DEG = 5.0
 class CarrierState:
     """Carrier-phase state of one antenna; None before the first epoch.
 
-    `base_arc`: last arc of a base station's phase, by satellite and signal.
+    `base_arc` is the number of the last arc of a base station's phase, by satellite and signal.
     """
 
     slips: CycleSlipState | None = None
@@ -82,7 +82,7 @@ def smooth_ranges(
 ) -> tuple[CorrectedRanges, list[CarrierState]]:
     """Return the ranges with smoothed codes and the weights of raw codes.
 
-    Multipath and the error floor do not average out as white noise does.
+    Smoothing does not raise the weights, because multipath and the error floor do not average out as white noise does.
     """
     obs = corrected.observations
 
@@ -112,7 +112,7 @@ def code_and_phase(
     config: Config,
     state: CarrierState,
 ) -> tuple[PhasePositions, CarrierState]:
-    """Return positions from code and phase, each from its own and earlier epochs, and the state (requirement A5; P4).
+    """Return positions from code and phase of the current and earlier epochs, and the state (requirement A5; P4).
 
     A phase is used if its code is used. `slips` covers all channels of the observations; `arc_m` has positions from
     codes only, shape (T,).
@@ -152,7 +152,7 @@ def code_and_phase(
 
 
 def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks, dict[tuple[str, str], int]]:
-    """Return the mask of ended arcs of the base station's phase, shape (T, K), and its last arcs."""
+    """Return the epochs at which the arc of the base station's phase changes, shape (T, K), and its last arcs."""
     assert corrected.base is not None
     keys = list(zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True))
     before = np.array([state.base_arc.get(key, -1) for key in keys], dtype=np.int64)
@@ -176,7 +176,7 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return wavelengths, and the channels that share a clock and a signal; GLONASS: no integers."""
+    """Return wavelengths, and groups of channels with a common clock and signal; -1 for GLONASS, which is not fixed."""
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

@@ -1,7 +1,6 @@
 """Channels of a log that the settings allow.
 
-The allowed channels are computed once for each set of channels, because a daily log has few sets, and most live
-epochs have the same set.
+The selection is computed once for each set of observed channels, because most epochs have the same set.
 """
 
 from __future__ import annotations

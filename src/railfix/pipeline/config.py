@@ -1,4 +1,4 @@
-"""Settings of a run: one frozen model, from Python or from TOML; misspelt keys are rejected.
+"""Settings of a run, from Python or from TOML; misspelt keys are rejected.
 
 Each package defines its own limits; this module collects them under their names in the configuration file::
 
@@ -99,7 +99,7 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
-#: Time off the map after which the filter drops its position, and time on the map after which it restarts. On the
+#: Time off the map after which the filter drops its position, and time on the map after which it restarts [s]. On the
 #: recordings, with a correct map, no two consecutive positions are off the map.
 OFF_MAP_S: Final = 10.0
 
@@ -110,7 +110,7 @@ class Config(ScreenSettings):
     Attributes
     ----------
     elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
-        Limits of the weights and the screens.
+        Limits of the screens.
     """
 
     #: Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz and 10
@@ -118,13 +118,13 @@ class Config(ScreenSettings):
     #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. Settings that P1 does not
     #: specify (weights, noise, inter-system biases, ambiguous sections) are as in "default".
     preset: Literal["default", "strict", "p1"] = "default"
-    #: Constellations used. GLONASS is left out by default: its channels have code biases of metres between them.
+    #: Constellations used. GLONASS is left out by default, because code biases between its channels are metres.
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     #: Satellites ("G07") and constellations ("C") left out.
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first observed signal is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    #: Number of codes per satellite that are combined (not with SBAS on L1).
+    #: Number of codes combined per satellite; one with SBAS on L1 or a base station.
     frequencies: Literal["one", "two"] = "one"
     two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of two codes.
     #: Active screens; health and validity of the satellites are always checked.
@@ -147,11 +147,11 @@ class Config(ScreenSettings):
     #: Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
     #: which-track` uses the same limit.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
-    ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the delay.
-    troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the delay.
-    #: Limit on the age of a record, tighter than its validity.
+    ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the ionospheric delay.
+    troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.
+    #: Largest age of a navigation record, in addition to the limit by its validity.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: Map error that replaces the track's own (P1: 0.30 m, 0.60 m).
+    #: Standard deviation of the map that replaces the track's own (P1: 0.30 m in plan, 0.60 m in height).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
@@ -161,7 +161,7 @@ class Config(ScreenSettings):
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
     interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
-    noise: CodeNoise = CodeNoise()  #: Limits of the weights and the screens.
+    noise: CodeNoise = CodeNoise()  #: Range sigmas, from which the weights follow.
     #: Logs of SBAS messages, or "stream" for the receivers' messages. SBAS corrections replace the models, and
     #: satellites without a valid correction are rejected. Empty for no SBAS.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
@@ -173,9 +173,9 @@ class Config(ScreenSettings):
     #: SBAS time-outs, use of message type 0, and treatment of missing degradation data.
     sbas_limits: SbasLimits = SbasLimits()
     base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
-    #: Errors by direction and C/N0 (``railfix error-model``): in the protection level no range sigma is below their
-    #: overbounds. Weights, screens and RAIM still use `noise`. Without it the level is based on `noise` times the scale
-    #: estimated so far, which does not bound the tails.
+    #: File with overbounds of the range errors by direction and C/N0 (``railfix error-model``). In the protection level
+    #: no range sigma is below its overbound; weights, screens and RAIM use `noise`. Without the file, the level is
+    #: based on `noise` times the scale estimated so far, which does not bound the tails.
     error_model: Path | None = None
     #: Satellite and atmospheric errors that are added to a model of local errors without SBAS.
     nominal: NominalErrors = NominalErrors()
@@ -205,8 +205,8 @@ class Config(ScreenSettings):
     smoothing: SmoothingLimits = SmoothingLimits()
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()
-    #: Filter along the track over codes, Dopplers, carrier-phase changes and sensors, from this and earlier epochs.
-    #: `railfix run` and `railfix demo` switch it on.
+    #: Filter along the track, which combines codes, Dopplers, carrier-phase changes and sensors of this and earlier
+    #: epochs. `railfix run` and `railfix demo` switch it on.
     filter: Literal["track", "off"] = "track"
     #: Measurements of the filter: `code`, `phase` and `doppler` of the satellites, and `wheel`, `radar`, `force`,
     #: `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the on-board sensors.
@@ -314,7 +314,7 @@ def load_config(path: str | PathLike[str]) -> Config:
     Raises
     ------
     InputFileError
-        The file is missing, unreadable, or no TOML.
+        The file is missing, unreadable, or not TOML.
     SettingsError
         A setting is misspelt or out of range.
     """

@@ -47,15 +47,15 @@ class LineCoordinates:
 
     @property
     def latitude_deg(self) -> Floats:
-        """Latitude of the antenna, WGS 84, shape (T,)."""
+        """Latitude of the antenna, WGS 84, shape (T,) [deg]."""
         return self.geodetic[0]
 
     @property
     def longitude_deg(self) -> Floats:
-        """Longitude of the antenna, WGS 84, shape (T,)."""
+        """Longitude of the antenna, WGS 84, shape (T,) [deg]."""
         return self.geodetic[1]
 
     @property
     def height_m(self) -> Floats:
-        """Height of the antenna above the ellipsoid, shape (T,)."""
+        """Height of the antenna above the ellipsoid, shape (T,) [m]."""
         return self.geodetic[2]

@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Largest variance ratio of an epoch's ranges that counts as noise: 100 sigmas; larger ratios are errors.
+#: Largest ratio of an epoch's residual variance to the assumed variance that is explained by noise: (100 sigmas)^2.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -52,12 +52,12 @@ def check_ranges(
 ) -> tuple[CorrectedRanges, Ranges, CheckedPositions, list[AntennaState]]:
     """Return the ranges and positions after the exclusion of persistent and then of single faults, and noise scales.
 
-    The robust scale, which RAIM uses, is estimated from mutually consistent ranges; the reported scale from the ranges
-    after RAIM.
+    The robust scale, which RAIM uses, is estimated from mutually consistent ranges. The reported scale is estimated
+    from the ranges that remain after RAIM.
     """
     time, near = corrected.time, corrected.near_ecef_m
     on, noises = "raim" in config.screens, [state.noise for state in states]
-    learning, least = config.noise_scale, 1.0 if config.sbas else 0.0  # SBAS states overbounds
+    learning, least = config.noise_scale, 1.0 if config.sbas else 0.0  # SBAS sigmas are overbounds
     windows = Windows.of(
         time, antennas.parts, [(noise.time, noise.age) for noise in noises],
         window_s=learning.window_s, least_epochs=learning.least_epochs,
@@ -118,10 +118,10 @@ def _chi_square_limit(risk: float, freedom: int) -> float:
 
 
 def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Masks:
-    """Return the epochs whose ranges contradict the map at the position, or move it beyond an end, shape (T,).
+    """Return the epochs whose ranges contradict the map at the position, or lie beyond an end of the map, shape (T,).
 
-    At these epochs the line fits worse than the 3-D position, in units of the residual variance of the 3-D fit (at
-    least 1), so that the misfit of the line does not enter its own unit.
+    Ranges contradict the map if the position on the line fits significantly worse than the 3-D position (chi-square
+    test with `Config.off_map_risk`). The unit is the residual variance of the 3-D fit, at least 1.
     """
     point, constrained = fix.point, fix.constrained
     wsse = constrained.wsse

@@ -25,7 +25,7 @@ from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Least number of whole metres, passed without a break, for a comparison with a feature.
+#: Minimum number of whole metres passed without a break for a comparison with a feature.
 _LEAST_POINTS: Final = 30
 
 
@@ -35,15 +35,15 @@ class LineFeatures:
 
     series: LineSeries
     features: tuple[Feature, ...]
-    #: Arc lengths of the antenna's trajectory, and of the body's middle, about which the body turns, on the line; shape
-    #: (V,).
+    #: Arc lengths of the vertices of the antenna's trajectory, and of the body's middle on the line at each vertex;
+    #: shape (V,).
     antenna_m: Floats
     body_m: Floats
-    line: Line  #: Trajectory, which states whether the line is closed.
+    line: Line  #: Line, which states whether it is closed.
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
-        """Return the features of a track for the vehicle body with an antenna."""
+        """Compute the features of a track for the vehicle body that carries an antenna."""
         line = curved_line(track)
         series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
@@ -58,13 +58,13 @@ class LineFeatures:
         return np.interp(antenna_m, self.antenna_m, self.body_m)
 
 
-#: Minimum standard deviation of a feature's position: the map's, and the body's on its bogies [m].
+#: Minimum standard deviation of a feature's position, by errors of the map and of the body on its bogies [m].
 _FEATURE_SIGMA_M: Final = 0.5
 
 
 @dataclass(frozen=True)
 class TrackFeatures:
-    """Features of a track for the vehicle body with an antenna, computed when the first rates are given."""
+    """Features of a track for the vehicle body that carries an antenna, computed when the first rates are given."""
 
     track: Track
     trajectory: Trajectory
@@ -109,7 +109,7 @@ class _Stretch(NamedTuple):
     sense: float  #: Direction: 1 toward rising arc length, else -1.
     distance_m: Floats  #: Values at all ticks of the chunk, with the preceding tick at index 0.
     body_m: Floats  #: Position of the body's middle at each tick of the stretch.
-    behind_m: Floats  #: Position behind which a feature must be to be compared.
+    behind_m: Floats  #: Position that a feature must be behind to be compared.
     metre: Integers
     heading_rad: Floats
     pitch_rad: Floats
@@ -127,7 +127,7 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the measured profile with a feature; `noise` covers the wheel position and the profile."""
+    """Compare the measured profile with a feature; `noise` has the sigmas of wheel position and profile."""
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
     # Rates are in rising arc length: for a reversing or turned vehicle the sign of the pitch changes, but the sign of
@@ -156,10 +156,10 @@ def feature_fixes(
 ) -> tuple[list[FeatureFix], FeatureState]:
     """Return verdicts on the features that the train has passed, and the state for the next chunk.
 
-    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without slip and faster
-    than 1 m/s are used: heading and pitch are integrals, which a break restarts. `facing` is 1 if the front points to
-    rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise` has the standard
-    deviations of gradient and curvature over one metre.
+    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only ticks without slip and faster than 1
+    m/s are used. Other ticks are breaks, which restart the integration of heading and pitch. `facing` is 1 if the front
+    points to rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise` has the
+    standard deviations of gradient and curvature over one metre.
     """
     distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
     heading, pitch = (
@@ -205,7 +205,7 @@ def feature_fixes(
             fixes.append(fix)
             if fix.located.verdict == "accepted":
                 last = (fix.located.arc_m, fix.located.sigma_m, feature.arc_m - stretch.shift_m(fix.tick))
-        # a position corrected backward passes no feature twice
+        # a feature is not compared twice after a backward correction of the position
         done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > HALF_LENGTH_M else done
     metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
     angles = (float(np.nan_to_num(heading[-1])), float(np.nan_to_num(pitch[-1])))

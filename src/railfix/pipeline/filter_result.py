@@ -35,7 +35,7 @@ class FilterFix:
     speed_mps: float
 
     def arc_at(self, time: np.datetime64) -> float:
-        """Position at a nearby time [m]."""
+        """Return the arc length at a nearby time, by extrapolation with the speed [m]."""
         return self.arc_m + self.speed_mps * float(seconds(time - self.time))
 
 
@@ -43,8 +43,8 @@ class FilterFix:
 class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
-    noise_scale: Floats  #: Ratio of the receiver's code noise to the sigmas.
-    #: Single-epoch position; after an outage codes are used again when it agrees with the dead-reckoned position.
+    noise_scale: Floats  #: Ratio of the receiver's code noise to the range sigmas.
+    #: Single-epoch positions; codes are used again after an outage when these agree with dead reckoning.
     arc_m: Floats
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
@@ -99,7 +99,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
     arc_m: Floats
     #: Direction: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
     direction: Codes
-    standstill: Masks  #: Shape (T,).
+    standstill: Masks  #: True where the speed plus two sigmas is below 1 km/h; shape (T,).
     #: Motion since the previous epoch, and properties of the line under the body, by wheel and inertial unit.
     sensed: SensedMotion
     #: Distance to the other antenna's position less the antenna spacing; NaN where not examined; shape (T,).
@@ -145,10 +145,10 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class SmoothedTrack(NotebookTable):
-    """Positions of T epochs from all measurements before and after them."""
+    """Positions of T epochs, each from all measurements before and after it."""
 
     time: Datetimes  #: Shape (T,).
-    #: Shape (T,).
+    #: Arc length and its standard deviation, shape (T,).
     arc_m: Floats
     sigma_m: Floats
     speed_mps: Floats  #: Shape (T,).

@@ -1,4 +1,4 @@
-"""Combine the codes of two frequencies to one pseudorange per satellite."""
+"""Combine the codes of two frequencies into one pseudorange per satellite."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def combine_frequencies(
         bound_sigma_m=np.hypot(local_m * magnified, nominal_m),
         bias_m=corrected.bias_m * magnified,
     )
-    screened = Screened(metric=found.difference_m, reject=found.suspected)  # each satellite has its own limit
+    screened = Screened(metric=found.difference_m, reject=found.suspected)  # the limit differs between satellites
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
     return corrected, found, verdict, after
 

@@ -1,4 +1,4 @@
-"""Interference of each epoch: signs of `railfix.integrity.interference` in the ranges and positions of a chunk."""
+"""Signs of interference (`railfix.integrity.interference`) in the ranges and positions of a chunk."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ from railfix.ranges.corrected import CorrectedRanges
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
-#: Rejection reasons of satellites with separate errors, if they are few.
+#: Rejection reasons of satellites with individual errors, if few satellites have them.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Largest number of satellites with separate errors by residuals, and per clock by gross errors; a spoofer with a
+#: Largest number of satellites with individual errors, and per clock of satellites with gross errors. A spoofer with a
 #: consistent position affects more.
 _MOST_WRONG: Final = 2
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
-#: Statuses of positions that spoofing outranks, and those that jamming does.
+#: Statuses of positions that suspected spoofing outranks.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET, Status.MAP_END,
 ])  # fmt: skip
-#: Statuses of positions that failed a check by their ranges.
+#: Statuses of positions that failed a check of their ranges.
 _FAILED: Final = np.isin(np.arange(len(Status)), [
     Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
@@ -67,7 +67,7 @@ _STATUS_BY_CAUSE: Final = (
 )
 #: Interval between the checks for interference [ns].
 _SECOND_NS: Final = 1_000_000_000
-#: Start of a second: time tags may be 5 ms before the whole second [ns].
+#: Start of the first second of GPS time, 5 ms early, as time tags may be before the whole second [ns].
 _FIRST_NS: Final = int(GPS_EPOCH.astype(np.int64)) - 5_000_000
 
 
@@ -79,15 +79,15 @@ class InterferenceState:
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
     second: int = -1  #: GPS second of the last checked epoch.
-    #: Break and receiver alarms since then.
+    #: Whether there was a break, and receiver alarms, since the last checked epoch.
     broken: bool = False
     alarm: int = 0
-    latest: Interference | None = None  #: Result at that epoch.
+    latest: Interference | None = None  #: Result at the last checked epoch.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Interference(NotebookTable):
-    """Interference of T epochs."""
+    """Signs of interference at T epochs."""
 
     causes: Bits  #: `Sign` bits, each held for its release time; shape (T,).
     power: PowerSigns
@@ -102,8 +102,8 @@ class Interference(NotebookTable):
 def _motion_inputs(
     corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
-    """Return the inputs of selected epochs, whose ranges have all rejection reasons; `broken` marks breaks since the
-    previous epoch.
+    """Return the inputs of the motion signs at selected epochs, from ranges with all rejection reasons; `broken` marks
+    breaks since the previous selected epoch.
     """
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
@@ -118,7 +118,7 @@ def _motion_inputs(
         inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1]) & np.isfinite(consistent[part, 0])
         off_line[part] = np.where(inside, offset, np.nan)
     usable = (reason & ~_CONTRADICTED) == 0
-    # errors that cannot be identified may be those of a spoofer or of the time tags
+    # errors that cannot be identified may be due to a spoofer or to the time tags
     named = _named_as_wrong(reason, corrected.channels.groups) & ~corrected.unsure[rows, None]
     return MotionInputs(
         time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
@@ -136,7 +136,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites with individual errors, not by a spoofer of a whole clock; shape (T, K)."""
+    """Return the satellites with individual errors, which are too few for a spoofer; shape (T, K)."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -170,7 +170,7 @@ def _find_interference(
 
 
 def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
-    """Return the signs of each epoch before holding, shape (T, causes)."""
+    """Return the signs of each epoch before holding times are applied, shape (T, causes)."""
     sigmas = limits.jump_sigmas
     by_cause = {
         Sign.RECEIVER_JAMMING: (alarm & 1) != 0,
@@ -214,8 +214,8 @@ class _Due(NamedTuple):
 
     rows: Indices  #: Row indices among all antennas, shape (n,).
     group: Indices  #: Number of checked epochs up to each epoch of the antenna, shape (T,).
-    #: Receiver alarms and breaks up to each checked epoch, and alarms and breaks for the next checked epoch; shape (n +
-    #: 1,).
+    #: Receiver alarms and breaks since the previous checked epoch, for each checked epoch and for the next one; shape
+    #: (n + 1,).
     alarm: Bytes
     broken: Masks
     last: int  #: GPS second of the last epoch of the chunk.
@@ -278,8 +278,8 @@ def judge_interference(
 ) -> tuple[Sequence[Interference | None], list[InterferenceState]]:
     """Return the interference and the new state of each antenna; None where `InterferenceLimits.use` is off.
 
-    Interference is checked at the first epoch of each second, whose result applies to the other epochs of the second. A
-    break or an alarm in between counts at the next check.
+    Interference is checked at the first epoch of each second, and the result applies to all epochs of the second. A
+    break or an alarm between two checks is included in the second check.
     """
     if limits.use == "off":
         return [None] * len(states), states

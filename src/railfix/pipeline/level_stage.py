@@ -1,4 +1,4 @@
-"""Protection levels of the positions: their sigmas, biases and fault probabilities."""
+"""Protection levels of single-epoch positions, and ARAIM levels."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Kinds of levels: SBAS integrity with fault hypotheses of local causes; or with hypotheses of satellite faults as well
-#: (ARAIM).
+#: Kinds of levels: with hypotheses of local faults only, as SBAS covers satellite faults; or with hypotheses of
+#: satellite faults as well (solution separation).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
-#: Whether a status raises an alarm, by status number.
+#: True for statuses that raise an alarm, by status number.
 _ALARMING: Final = np.array(
     [status in (*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET) for status in range(max(Status) + 1)]
 )
 
-#: Basis of a level: priors measured on the line, or assumed. For an indicative level no hourly risk is claimed.
+#: Basis of a level: fault priors measured on the line, or assumed. For an indicative level no hourly risk is claimed.
 BASES: Final[tuple[str, str]] = ("measured", "indicative")
 
 
@@ -77,7 +77,7 @@ def choose_kind(config: Config) -> str:
 
 
 def level_facts(config: Config) -> dict[str, Any]:
-    """Return the basis of the levels of a run as plain values; empty where they are off."""
+    """Return the assumptions of the levels of a run as plain values; empty if the levels are off."""
     if config.protection == "off":
         return {}
     risk = get_risk_budget(config)
@@ -109,7 +109,7 @@ def get_risk_budget(config: Config) -> RiskBudget:
 
 
 def level_scale(scale: Floats, config: Config) -> Floats:
-    """Return the noise scale of the levels, shape (T,): at least 1, unless an error model states minimum sigmas."""
+    """Return the noise scale of the levels, shape (T,): at least 1, except with an error model and without SBAS."""
     return np.maximum(scale, 1.0) if config.error_model is None or config.sbas else scale
 
 
@@ -121,7 +121,7 @@ def level_stage(
     offset: MapOffset,
     config: Config,
 ) -> tuple[ProtectionResult | None, Masks]:
-    """Return the protection levels (None if off), and the epochs with possible positions beyond them, (T,)."""
+    """Return protection levels (None if not computed), and the epochs with possible positions beyond them, (T,)."""
     fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
@@ -155,9 +155,9 @@ def protection_levels(
 ) -> ProtectionResult:
     """Return the protection levels of the positions of a chunk, from their model on the line.
 
-    The part of the map's offset beyond its own sigma is a bias of the level; an undetected offset is covered by the
-    hypothesis of a wrong map. Small residuals do not reduce a level: the receiver's noise scale, shape (T,), counts as
-    at least 1, and with an error model no range sigma is below the model's. `sides`: `late_sides`.
+    The part of the map offset beyond its sigma is a bias of the level; an undetected offset is covered by the
+    hypothesis of a wrong map. Small residuals do not reduce a level: `level_scale` limits the receiver's noise scale,
+    shape (T,), and with an error model no range sigma is below the overbound. `sides` is the result of `late_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = protection_level(
@@ -200,9 +200,9 @@ def apply_verdicts(
     """Return the levels with the verdicts on the positions applied.
 
     A level is valid at the position where the ranges were linearised. If another position fits the ranges equally well,
-    or they place it beyond an end of the map, the level is unavailable. A failed check, or a contradiction of ranges
-    and map, is an alarm. Epochs without coordinates (`has`) have no level; a level that reaches a stretch of
-    `Config.no_level_m` is infinite.
+    or the ranges place the antenna beyond an end of the map, the level is unavailable. A failed check, or a
+    contradiction of ranges and map, is an alarm. Epochs without coordinates (`has`) have no level; a level that reaches
+    a stretch of `Config.no_level_m` is infinite.
     """
     level, verdict = protection.level, protection.status
     if config.no_level_m or not has.all():
@@ -241,7 +241,7 @@ def compute_araim(
     """Compute ARAIM levels of positions on the line, shape (T,).
 
     The integrity sigmas combine the message's URA, the atmosphere of `Config.nominal` and the scaled range noise;
-    accuracy and thresholds use URE instead of URA. The ranges have all rejection reasons.
+    accuracy and thresholds use URE instead of URA. `corrected` has the rejection reasons of all stages.
     """
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
@@ -302,7 +302,7 @@ def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
 def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: float) -> AraimGeometry:
     """Return the geometry on a line, axes along, across and up, with the map as two more observations.
 
-    `plan_m`, `height_m`: standard deviations of the map across and up [m]; `prior`: probability that both are wrong.
+    `plan_m` and `height_m` are standard deviations of the map [m]; `prior` is the probability that both are wrong.
     """
     epochs, ranges, unknowns = geometry.design.shape
     rows = np.zeros((epochs, 2, unknowns))

@@ -22,13 +22,13 @@ from railfix.ranges.corrected import CorrectedRanges
 
 #: Minimum range rate of a satellite, relative to its constellation's median, for a factor [m/s].
 _LEAST_RATE_MPS: Final = 100.0
-#: Minimum number of satellites for a factor, and largest deviation of their factors from the median; it applies to all
-#: satellites, or to all except one of at least `_MANY`. With four satellites, one cycle slip moves the median rate, and
-#: with it the factors of the others.
+#: Minimum number of satellites for a factor; number of satellites from which on one may deviate; and largest deviation
+#: of a satellite's factor from the median. With four satellites, one cycle slip moves the median rate, and thereby the
+#: factors of the other three.
 _LEAST_SATELLITES: Final = 3
 _MANY: Final = 6
 _SPREAD: Final = 0.3
-#: Factors within this distance from 1 are correct: they include the train's own speed.
+#: Largest deviation of a correct factor from 1, which the speed of the train causes.
 _RIGHT: Final = 0.5
 #: Phases of epochs farther apart are not compared [s].
 _LONGEST_S: Final = 35.0
@@ -41,8 +41,8 @@ _NAMES: Final = {"G": "GPS", "J": "QZSS", "E": "Galileo", "C": "BeiDou", "R": "G
 class ObservableState:
     """State of the checks of one antenna after a chunk."""
 
-    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), and constellation letters, "" for all
-    #: together, shape (L,).
+    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), and constellation letters, shape
+    #: (L,); "" is for all constellations together.
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
     #: Phases and satellite range rates of the last epoch with factors, shape (K,).
@@ -55,7 +55,8 @@ class ObservableState:
 def check_observables(
     corrected: CorrectedRanges, state: ObservableState
 ) -> tuple[CorrectedRanges, list[str], ObservableState]:
-    """Return the ranges of one antenna without Dopplers and phases of wrong sign or unit, and one sentence on each.
+    """Return an antenna's ranges without Dopplers and phases of wrong sign or unit, a note on each fault, and the
+    state.
 
     The ratio of observed to computed values of a constellation is used until its next ratio is estimated; before its
     first estimate, the ratio over all constellations is used.

@@ -15,7 +15,7 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 #: Time for which the offset of a train off the map is stored [s].
 _REMEMBERED_S: Final = 30.0
 #: A train is back on the line if the mean offset of its positions is below this fraction of the offset while away, or
-#: below this many metres.
+#: below this limit [m].
 _BACK_SHARE: Final = 0.5
 _BACK_M: Final = 1.0
 
@@ -25,7 +25,7 @@ class OffMapState:
     """State of the off-map test after a chunk."""
 
     off: bool = False  #: True if the train was off the map at the last epoch.
-    known: bool = False  #: True once a position has been tested; the first position of a log decides alone.
+    known: bool = False  #: True once a position has been tested; the first position decides alone.
     #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
     #: it.
     since: np.datetime64 = _NEVER
@@ -42,7 +42,7 @@ def off_map_epochs(
 
     The train leaves the map once all positions of the last `least_s` are off the map; a single position can be off the
     map by reflected signals. The train returns once all positions of that time are on the map, and their mean offset is
-    within a metre or half of the earlier offset: beside the line, on an unmapped track, positions are on the map by
+    within a metre or half of the earlier offset. On an unmapped track beside the line, single positions fit the map by
     chance. The first position of a log decides alone. `on_map` and `off_map` mark positions that fit the ranges, and
     that contradict them; `offset_m` is the offset of 3-D positions to the right of the line, NaN if unknown; shapes
     (T,).

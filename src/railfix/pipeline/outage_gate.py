@@ -1,4 +1,4 @@
-"""Gate of codes after an outage: they are used again once single epochs agree with the dead-reckoned position."""
+"""Gate of codes after an outage, until single-epoch positions agree with the dead-reckoned position."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class ReturnState:
-    """State after a chunk."""
+    """State of the gate after a chunk."""
 
     time: np.datetime64 = _NEVER  #: Last epoch whose codes were used; NaT before the first.
     #: Dead-reckoned position at the last epoch and its standard deviation; NaN without a sensor distance.
     place_m: float = float("nan")
     sigma_m: float = float("nan")
-    distance_m: float = 0.0  #: Distance since the filter's own position.
-    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT if there is none.
-    agreeing: int = 0  #: Number of consecutive positions that have agreed since then.
+    distance_m: float = 0.0  #: Sensor distance since the filter's last position.
+    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without an outage.
+    agreeing: int = 0  #: Number of consecutive positions that have agreed since `returned`.
 
 
 def gated_codes(

@@ -57,7 +57,7 @@ def position_stage(
 ) -> tuple[CorrectedRanges, Solution, list[AntennaState]]:
     """Return the ranges with this stage's rejection reasons, the positions, and the new state of each antenna.
 
-    The ranges are given after the observation screens, the states by antenna.
+    `corrected` is the output of the observation screens; `states` has one state for each antenna.
     """
     time = corrected.time
     untied = fit_ranges(corrected)
@@ -140,15 +140,15 @@ def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBias
     return alone
 
 
-#: Ratio of an epoch's range variance in 3-D to the receiver's from which on the ranges are inconsistent.
+#: Ratio of the residual variance of a 3-D fit to the receiver's range variance, above which ranges are inconsistent.
 _CONTRADICT: Final = 25.0
 
 
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions for the test of the map: without the `excluded` satellites where all ranges
-    together are inconsistent, NaN where they still are or the faulty range cannot be identified.
+    """Return ranges and 3-D positions for the test of the map, without `excluded` satellites at inconsistent epochs.
+    Positions are NaN where the other ranges are inconsistent as well, or the faulty range cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
@@ -213,7 +213,7 @@ def _published(
 
 
 def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) -> Floats:
-    """Return the variance along the line by satellite and atmospheric errors, if not in the range sigmas."""
+    """Return the along-line variance by satellite and atmospheric errors that are not in the range sigmas [m^2]."""
     share = (
         model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal_elevation_sigma_m, 0.0), 0.0)
     )
@@ -221,10 +221,11 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the mean square distance to the best alternative position of ambiguous epochs, shape (T,).
+    """Return the squared distance to the best alternative position times its probability (T,) [m^2]; 0 if there is
+    none.
 
-    The alternative fits worse by the excess x, so that it is the true position with the probability ``1/(1 +
-    exp(x/2))`` (normal likelihoods, equal priors).
+    The weighted squares at the alternative are larger by the excess x, so that its probability is ``1/(1 + exp(x/2))``
+    (normal likelihoods, equal priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
@@ -244,7 +245,7 @@ def _status(
     failed: tuple[Masks, Masks, Masks],
     config: Config,
 ) -> Codes:
-    """Return the status of each epoch, shape (T,): the first condition that is true, the most serious first.
+    """Return the status of each epoch, shape (T,), by the most serious condition that is true.
 
     `counts` has the numbers of used and of redundant ranges; `failed` marks ranges that contradict the map,
     inconsistent ranges, and other possible positions; shape (T,) each.

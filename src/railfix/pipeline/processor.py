@@ -1,9 +1,9 @@
-"""Positioning of chunks of epochs: the calls in reading order.
+"""Positioning of chunks of epochs, from observations to the results of the filter.
 
-`EpochProcessor` has the constant data of a run (settings, trajectories, error model). `process` takes a chunk
-of observations with the navigation records, SBAS messages and sensor samples received since the previous chunk, and the
+`EpochProcessor` has the constant data of a run (settings, trajectories, error model). `process` takes a chunk of
+observations with the navigation records, SBAS messages and sensor samples received since the previous chunk, and the
 state after that chunk; it returns every intermediate result and the new state. A live epoch is a chunk of length one;
-any cutting gives the same results.
+the results do not depend on the division into chunks.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ class EpochProcessor:
     Raises
     ------
     SettingsError
-        SBAS is combined with precise ephemerides, or requested without `corrections` or the reverse, or an argument has
-        a wrong type.
+        SBAS is combined with precise ephemerides, `config.sbas` and `corrections` do not match, or an argument has a
+        wrong type.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class EpochProcessor:
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state for the next chunk.
 
-        Each note and each doubt of the result is a `RailfixWarning`, except for default screens that lack their input.
+        Each note and doubt of the result becomes a `RailfixWarning`, except notes on default screens without input.
 
         Parameters
         ----------
@@ -233,14 +233,14 @@ class EpochProcessor:
             SBAS messages received since the previous chunk, for processors with `corrections`.
         sensors : SensorSamples, optional
             On-board sensor samples since the previous chunk, for the filter along the track. For an antenna without
-            observations in this chunk they are used with its next observations.
+            observations in this chunk, the samples are kept for its next epochs.
         base : Observations, optional
             Observations of the base station since the previous chunk, up to the last epoch of this chunk.
 
         Raises
         ------
         ValueError
-            The epochs of an antenna do not rise in time, or begin before the end of `state`.
+            The epochs of an antenna are not in ascending order, or do not begin after the end of `state`.
         SettingsError
             As for the class, or an antenna has no trajectory, or no navigation records were given.
         """
@@ -264,7 +264,7 @@ class EpochProcessor:
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Chunk, State]:
-        """Return the ranges of one chunk after the screens: the first part of `process`; parameters are the same.
+        """Return the ranges of one chunk after the screens, as the first part of `process`, with the same parameters.
 
         Each part uses and replaces its own members of the state, so that the parts of successive chunks can be computed
         at the same time, each with its own state.
@@ -315,7 +315,7 @@ class EpochProcessor:
         return chunk, copy_with(state, received=received, antennas=after, base=base_state)
 
     def position(self, chunk: Chunk, state: State) -> tuple[Chunk, State]:
-        """Return the chunk with the positions of single epochs: the second part of `process`, before the filter."""
+        """Return the chunk with the positions of single epochs, as the second part of `process`."""
         antennas, own_states = chunk.antennas, [state.antennas.get(name) or AntennaState() for name in chunk.names]
         corrected, solution, own_states = position_stage(
             chunk.corrected, chunk.slips, antennas, self.config, own_states
@@ -339,7 +339,7 @@ class EpochProcessor:
         return chunk, copy_with(state, antennas=after)
 
     def along_track(self, chunk: Chunk, state: State) -> tuple[Result, State]:
-        """Return the results of one chunk with those of the filter, where it is on: the third part of `process`.
+        """Return the single-epoch and filter results of one chunk, as the third part of `process`.
 
         Parameters
         ----------

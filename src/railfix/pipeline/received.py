@@ -26,12 +26,12 @@ _ELEMENTS: Final[dict[str, Any]] = {
     "Floats": np.float64,
     "Integers": np.int64,
 }
-#: Shapes of fields with columns, without rows.
+#: Shapes of two-dimensional fields in a table without rows.
 _EMPTY: Final[dict[str, tuple[int, ...]]] = {
     **dict.fromkeys(("position_ecef_m", "velocity_ecef_mps", "acceleration_ecef_mps2"), (0, 3)),
     "inter_signal_s": (0, 6),
 }
-#: Fields that distinguish Keplerian records of one satellite.
+#: Fields that identify a Keplerian record.
 _KEPLER_KEY: Final = ("satellite", "message", "toe", "toc", "iode", "iodc", "health")
 _GLONASS_KEY: Final = ("satellite", "toe", "health")
 
@@ -50,9 +50,9 @@ def no_navigation() -> Navigation:
 
 
 class MessageCorrections(Protocol):
-    """Corrections from messages that are received during a run, as SBAS messages are; a value, which never changes.
+    """Immutable corrections from messages received during a run, such as SBAS messages.
 
-    `railfix.ranges.sbas.SbasState` is the one of SBAS.
+    `railfix.ranges.sbas.SbasState` implements this interface for SBAS.
     """
 
     @property
@@ -61,14 +61,14 @@ class MessageCorrections(Protocol):
 
     @property
     def dual_frequency(self) -> bool:
-        """Whether ionosphere-free codes are corrected; otherwise codes on one frequency are."""
+        """Whether the corrections are for ionosphere-free codes, instead of codes on one frequency."""
 
     @property
     def span(self) -> tuple[np.datetime64, np.datetime64]:
-        """Reception of the first and the last message; NaT without messages."""
+        """Reception times of the first and the last message; NaT without messages."""
 
     def add_messages(self, messages: Any) -> Self:
-        """Return the corrections with further messages; TypeError or SettingsError if they are of another kind."""
+        """Return the corrections with further messages; raise TypeError or SettingsError for other message types."""
 
     def drop_before(self, time: np.datetime64) -> Self:
         """Return the corrections without the messages that no epoch from `time` on can use."""
@@ -120,7 +120,7 @@ def known_from_start(
 ) -> Received:
     """Return the data known before the first epoch: all data when reading files, none on a running train.
 
-    SettingsError: SBAS and precise ephemerides together.
+    Raise SettingsError if SBAS is combined with precise ephemerides.
     """
     return _with_notes(Received(navigation=navigation or no_navigation(), corrections=corrections), config)
 
@@ -146,13 +146,13 @@ def receive(
     navigation: Navigation | None = None,
     messages: Any = None,
 ) -> Received:
-    """Return the received data after new navigation records and messages with corrections; `before` without any.
+    """Return the received data after new navigation records and messages; `before` if neither is given.
 
-    `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are
-    dropped, and so are repeated and expired records, except for a satellite's newest record. Newer coefficients and
-    precise ephemerides replace the older ones. Without any message so far, every satellite is rejected until the
-    corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages of another kind than the
-    corrections, or without corrections to which they are added.
+    `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped, and
+    so are repeated and expired records, except for a satellite's newest record. Newer coefficients and precise
+    ephemerides replace the older ones. With SBAS, every satellite is rejected until its corrections are complete. Raise
+    SettingsError if SBAS is combined with precise ephemerides, if the messages are of another kind than the
+    corrections, or if there are no corrections.
     """
     if navigation is None and messages is None:
         return before

@@ -64,7 +64,7 @@ class Column(Generic[Source]):
         return decimals(self.name)
 
     def of(self, source: Source) -> Any:
-        """Return the values from the source of a table; None if it has none."""
+        """Return the values from the source of a table; None if the source lacks them."""
         if not isinstance(self.values, str):
             return None if self.values is None else self.values(source)
         found: Any = source
@@ -146,7 +146,7 @@ class Observed:
         return self.result.on_all_channels(np.nan if values is None else values)
 
     def innovation(self, kind: Kind) -> Floats:
-        """Return the filter's innovations of one measurement kind per channel, shape (T, M); NaN without it."""
+        """Return the filter's innovations of one measurement kind per channel, shape (T, M); NaN without the filter."""
         return self.on_all_channels(None if self.tracked is None else self.tracked.tracked.innovation[:, kind])
 
 
@@ -160,12 +160,12 @@ ON_LINE: Final[tuple[Column[Any], ...]] = (
     Column("kilometrage_m", "kilometrage as marked on the line, if the track has it"),
 )
 IN_SPACE: Final[tuple[Column[Any], ...]] = (
-    Column("latitude_deg", "antenna, WGS 84"),
-    Column("longitude_deg", "antenna, WGS 84"),
-    Column("height_m", "antenna, above the ellipsoid"),
-    Column("x_m", "antenna, ECEF", lambda r: r.ecef_m[:, 0]),
-    Column("y_m", "antenna, ECEF", lambda r: r.ecef_m[:, 1]),
-    Column("z_m", "antenna, ECEF", lambda r: r.ecef_m[:, 2]),
+    Column("latitude_deg", "latitude of the antenna, WGS 84"),
+    Column("longitude_deg", "longitude of the antenna, WGS 84"),
+    Column("height_m", "height of the antenna above the ellipsoid"),
+    Column("x_m", "ECEF coordinate of the antenna", lambda r: r.ecef_m[:, 0]),
+    Column("y_m", "ECEF coordinate of the antenna", lambda r: r.ecef_m[:, 1]),
+    Column("z_m", "ECEF coordinate of the antenna", lambda r: r.ecef_m[:, 2]),
 )
 #: Columns of the table of positions.
 POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
@@ -415,7 +415,7 @@ OBSERVATION_COLUMNS: Final[Mapping[str, Column[Any]]] = by_name(
         Column("satellite", "`G01`, `J02`", None, dtype=pl.String()),
         Column("signal", "RINEX 3 code without its type letter, `1C`", None, dtype=pl.String()),
         _REASON,
-        Column("reason_text", "names of these reasons joined by `+`, `used` for 0", None, dtype=pl.String()),
+        Column("reason_text", "names of the bits of `reason` joined by `+`, `used` for 0", None, dtype=pl.String()),
         *(column for column in CHANNEL_COLUMNS.values() if column is not _REASON),
     )
 )

@@ -83,7 +83,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def observations_table(result: Result) -> pl.DataFrame:
-    """Return `OBSERVATION_COLUMNS`: a row per epoch, antenna and channel that was observed, in the order of these."""
+    """Return one row per epoch, antenna and observed channel, in this order: `OBSERVATION_COLUMNS`."""
     check_type(result, Result, "result")
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
@@ -214,11 +214,11 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "over_reading_m",
-            "largest distance of the train behind: the level, at least 2 % of the distance since codes were used "
-            "(`L_DOUBTOVER` less `Q_LOCACC`)",
+            "largest distance of the train behind the position: the level, at least 2 % of the distance since codes "
+            "were used (`L_DOUBTOVER` less `Q_LOCACC`)",
             "tracked.amount_m",
         ),
-        Column("under_reading_m", "largest distance of the train ahead, likewise (`L_DOUBTUNDER`)", "tracked.amount_m"),
+        Column("under_reading_m", "largest distance of the train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
         Column(
             "motion",
             "state of motion from tachometer and inertial unit together, see `docs/sensors.md`",
@@ -323,7 +323,7 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
 def train_table(result: Result) -> pl.DataFrame:
     """Return the positions of the filter along the track, one row per epoch and antenna in order of time.
 
-    Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
+    The table has `TRAIN_COLUMNS`, or neither columns nor rows if the filter is off.
     """
     check_type(result, Result, "result")
     parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
@@ -355,7 +355,7 @@ _TIME: Final = pl.Datetime("ns")
 
 
 def _getter(name: str) -> Any:
-    """Return a getter of one field of all passings."""
+    """Return a function that collects one field of passings in an array."""
     return lambda passings: np.array([getattr(passing, name) for passing in passings])
 
 
@@ -385,7 +385,7 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
                _getter("amount_m")),
         Column("doubt_under_m", "largest distance of the train ahead: `L_DOUBTUNDER` less `Q_LOCACC`",
                _getter("amount_m")),
-        Column("odometer_m", "for comparison: 5 m and 5 % of the distance since the last balise read (SUBSET-041)",
+        Column("odometer_m", "for comparison: 5 m plus 5 % of the distance since the last balise read (SUBSET-041)",
                _getter("odometer_m")),
     )
 )  # fmt: skip

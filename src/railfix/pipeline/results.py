@@ -28,10 +28,10 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(Solution, LineCoordinates, NotebookTable):
-    """Results of one antenna at T epochs: positions that the status keeps, and their intermediate results.
+    """Results of one antenna at T epochs: positions, without those that the status drops, and intermediate results.
 
-    Range arrays have the K channels that the settings allow (`corrected`). Arrays of properties have all M channels of
-    the given observations, of all antennas if few epochs of several antennas are given together.
+    Range arrays have the K channels that the settings allow (`corrected`). Properties have all M channels of the
+    observations; these are the channels of all antennas if observations of several antennas are given together.
     """
 
     trajectory: Trajectory  #: Trajectory of the antenna.
@@ -140,12 +140,12 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def conventional_offset_m(self) -> Floats:
-        """Distance of the 3-D single point from that point, shape (T,)."""
+        """Distance of the 3-D single point from the nearest point of the trajectory, shape (T,) [m]."""
         return self._nearest[1]
 
     @property
     def conventional_chainage_m(self) -> Floats:
-        """Chainage of that point, shape (T,)."""
+        """Chainage of the point of the trajectory nearest to the 3-D single point, shape (T,) [m]."""
         return self.trajectory.chainage_at(self.conventional_arc_m)
 
     def __len__(self) -> int:

@@ -69,7 +69,7 @@ class SensedMotion:
 
     state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
     distance_m: Floats  #: Forward distance by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
-    doubt_mps: Floats  #: Largest speed of a slip not yet detected, shape (T,).
+    doubt_mps: Floats  #: Largest slip speed of a slip not yet detected, shape (T,).
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
     #: Properties of the line under the body, toward rising arc length (P2 2.3): gradient from wheel and accelerometer
@@ -85,7 +85,7 @@ class SensedMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class SensedState:
-    """State after a chunk."""
+    """State of the sensed motion after a chunk."""
 
     tick: int = 0  #: Number of the last sample since the start of GPS time; 0 before the first.
     #: Antenna position at that sample, by dead reckoning with the wheel from the last filter position; NaN if unknown.
@@ -120,7 +120,7 @@ def sensed_motion(
     tachometer: TachometerLimits,
     limits: SlipLimits,
 ) -> tuple[SensedMotion, RateSeries | None, SensedState]:
-    """Return the motion between instants, the body rates (None without a sample), and the state for the next chunk.
+    """Return the motion between `edges`, the body rates (None without a sample), and the state for the next chunk.
 
     Signed pulses and inertial samples begin `REACH` before the first of the T + 1 `edges`. `sine_at` gives the sine of
     the gradient in rising arc length at arc lengths; the trajectory of the antenna determines the direction of the

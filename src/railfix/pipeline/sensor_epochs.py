@@ -36,11 +36,12 @@ _LONGEST_S: Final = 5.0
 _COMPLETE: Final = 0.9
 #: Standard deviation of the inertial speed during a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
-#: Standard deviations over one metre of distance: body oscillations of 1 mrad, and of its heading [1/m].
+#: Standard deviations of gradient and curvature [1/m] over one metre of distance: pitch oscillations of the body of 1
+#: mrad, and oscillations of its heading.
 _GRADIENT_NOISE: Final = 1e-3
 _CURVATURE_NOISE_1PM: Final = 1e-4
-#: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: with
-#: a map of 0.3 m features are located to no better than some metres, with one of 0.05 m to half a metre.
+#: Correlation length of map errors, as `railfix.kernels.tracking.constants.MAP_CORRELATION_M` [m]. With map errors of
+#: 0.3 m, features are located to some metres at best; with 0.05 m, to half a metre.
 _MAP_LENGTH_M: Final = 50.0
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
@@ -48,39 +49,40 @@ Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, Sta
 
 @dataclass(frozen=True, kw_only=True)
 class LineReferences:
-    """References of the sensor measurements."""
+    """Line features, ground units and balises to which sensor measurements refer."""
 
     features: FeatureSearch | None = None
     units: GroundUnits | None = None
     balises: ListedBalises | None = None
 
 
-#: Standard deviation of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), with echoes and drifts
-#: of the unit's answering delay.
+#: Minimum standard deviation of a two-way range [m]: 0.19 to 0.24 m (P2 3.3), increased for echoes and for drifts of
+#: the unit's reply delay.
 _RANGE_SIGMA_M: Final = 0.5
 _RADAR_SIGMA_MPS: Final = 0.1
 
 
 class SensorLimits(Settings):
-    """Sensor noise of the filter."""
+    """Settings of the on-board sensors in the filter."""
 
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     #: Detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
-    #: Position of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
-    #: to the right of the antenna's path and above the antenna.
+    #: Position of the vehicle's ranging unit: ahead of the vehicle's middle, or of the antenna without a vehicle file;
+    #: to the right of the antenna's path; and above the antenna.
     range_ahead_m: float = 0.0
     range_right_m: float = 0.0
     range_above_m: float = 0.0
 
     balise: BaliseLimits = Field(default_factory=BaliseLimits)
-    #: After an outage codes are used again when three consecutive positions are within this many sigmas, or after this
-    #: time.
+    #: After an outage, codes are used again when three consecutive positions are within this number of sigmas of the
+    #: dead-reckoned position, or after this time.
     return_sigmas: float = Field(default=4.0, gt=0)
     return_s: float = Field(default=60.0, ge=0)
-    #: Standard deviation of a distance between two epochs in addition to the pulse: creep of a braked or driven wheel.
+    #: Standard deviation of a distance between two epochs due to creep of a braked or driven wheel, in addition to the
+    #: pulse quantisation.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
-    #: Standard deviation of a speed sample, and usual interval of speed samples.
+    #: Usual interval of radar speed samples.
     radar_step_s: float = Field(default=0.1, gt=0)
     #: Standard deviation of a mean force between two epochs: body pitching in addition to the sensor's noise (1 mrad is
     #: 0.01 m/s2), and errors of the map's gradient.
@@ -89,7 +91,7 @@ class SensorLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class SensorState:
-    """Samples needed by the next chunk."""
+    """Samples and states needed by the next chunk."""
 
     time: np.datetime64  #: Last epoch; NaT before the first.
     samples: SensorSamples
@@ -130,10 +132,10 @@ def sensor_epochs(
     """Return distances and forces between the epochs, the combined motion of wheel and inertial unit, and the new
     state.
 
-    Samples are given since the previous chunk, epochs for the antenna, shape (T,). The trajectory determines the
-    direction of the front, `sine_at` the sine of the gradient at arc lengths (None if the line is unknown). `sources`
-    has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and `range`; `references` has features
-    of the line, ground units and listed balises.
+    `samples` are those since the previous chunk, `time` has the antenna's epochs, shape (T,). The trajectory determines
+    the direction of the front; `sine_at` returns the sine of the gradient at arc lengths (None if the line is unknown).
+    `sources` has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and `range`; `references` has
+    features of the line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -199,10 +201,10 @@ def sensor_epochs(
 def _wheel_values(
     pulses: TachometerPulses, edges: Datetimes, sensed: SensedMotion, limits: SensorLimits, *, known: Masks
 ) -> dict[str, Any]:
-    """Return the wheel distances of the intervals toward the front, with their sigmas and the kind of their sign.
+    """Return the forward wheel distances of the intervals, their sigmas, and whether their sign is measured.
 
-    The distances are taken from pulses where the pulses are `known` and usable, and from the inertial unit during
-    slips; otherwise they are NaN.
+    The distances are taken from pulses where the pulses are `known` and usable, and from the inertial unit in the
+    states `CARRIED`; otherwise they are NaN.
     """
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
@@ -260,14 +262,14 @@ def _places(passed: Iterable[PassedFeature], rates: RateSeries, time: Datetimes)
 
 
 def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
-    """Return the ranging unit's position from the antenna: along, right and up of its path, shape (3,)."""
+    """Return the ranging unit's position relative to the antenna: along, right of and above its path (3,) [m]."""
     facing = trajectory.front_sign
     along = facing * limits.range_ahead_m - ahead_m(trajectory)
     return np.array([along, facing * limits.range_right_m, limits.range_above_m])
 
 
 def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_m: Floats) -> RangeEpochs:
-    """Group ranges by the next epoch after each."""
+    """Assign each range to the next epoch."""
     index = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([index.get(str(name), -1) for name in ranging.station], dtype=np.intp)
     epoch = np.searchsorted(edges, ranging.time, side="left") - 1

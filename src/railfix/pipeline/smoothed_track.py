@@ -22,7 +22,7 @@ from railfix.tracking import (
     track,
 )
 
-#: Epochs whose covariances are in memory at a time.
+#: Largest number of epochs whose covariances are in memory together.
 _EPOCHS: Final = 300
 
 
@@ -43,7 +43,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
-    """Return short pieces and the states before them; pieces with sensors are short already."""
+    """Split filter input into short pieces, with the states before them; input with sensors is short already."""
     size = len(replay.epochs)
     sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
     if size <= _EPOCHS or sensed:

@@ -38,7 +38,7 @@ class Solution(NotebookTable):
     point: SinglePoint  #: Conventional position, with one clock per constellation.
     #: 3-D positions of consistent ranges after exclusions; NaN where the ranges are inconsistent; (T, 3).
     consistent_ecef_m: Floats
-    #: `railfix.integrity.PointStatus` of the conventional position, which stays unchanged; shape (T,).
+    #: `railfix.integrity.PointStatus` of the conventional position, shape (T,).
     conventional_status: Codes
     fix: LineFix  #: Positions from codes after exclusions.
     ties: InterSystemBiases  #: Inter-system biases known before each epoch, by `Channels.clocks`.
@@ -48,8 +48,8 @@ class Solution(NotebookTable):
     #: residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
-    #: receiver's noise and the noise of these residuals, widened by Student's t where few ranges are redundant. Also
-    #: given where the position is dropped; shape (T,).
+    #: receiver's noise and the noise by the epoch's residuals, widened by Student's t where few ranges are redundant.
+    #: Also given where the position is dropped; shape (T,).
     epoch_sigma_m: Floats
     #: Position along the antenna's trajectory, from codes or from code and phase; shape (T,).
     arc_m: Floats
@@ -67,6 +67,6 @@ class Solution(NotebookTable):
 
 @lru_cache
 def with_coordinates(failed_checks: str) -> Masks:
-    """Return which statuses have coordinates, by status number, for a value of `Config.failed_checks`."""
+    """Return whether positions have coordinates, by status number, for a value of `Config.failed_checks`."""
     dropped = CHECK_FAILED if failed_checks == "drop" else ()
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))

@@ -32,7 +32,7 @@ _EARTH_RADIUS_M: Final = 6.371e6
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Height range of the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: Root mean square of raw residuals, including atmospheric delays, from which on gross errors are searched for [m].
+#: Root mean square of raw residuals, including atmospheric delays, above which gross errors are searched for [m].
 _QUIET_M: Final = 10.0
 
 
@@ -102,7 +102,7 @@ _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OT
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
     """Return corrected ranges of one antenna without a track: the codes give the approximate position.
 
-    The models correct them, and a base station that has been received; SBAS does not.
+    The ranges are corrected by the delay models and by a received base station, not by SBAS.
     """
     channels = book.of(obs, received.navigation)
     source = with_base_station(replace(broadcast_source(received, config), second="none"), received, config)
@@ -174,7 +174,7 @@ def _at_surface(ecef_m: Floats) -> Floats:
 
 
 def locate(obs: Observations, received: Received, config: Config, book: ChannelBook) -> Located:
-    """Compute the conventional position of every epoch without inconsistent ranges; see `ranges_without_map`."""
+    """Compute the conventional position of every epoch from consistent ranges; see `ranges_without_map`."""
     return locate_ranges(obs.time, ranges_without_map(obs, received, config, book), config)
 
 
@@ -215,7 +215,7 @@ def _below(ranges: Ranges) -> Floats:
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True) * _EARTH_RADIUS_M)
 
 
-#: Largest step, in intervals, with range changes; over longer steps the Dopplers at both ends are not accurate enough.
+#: Longest step with range changes, in survey intervals; over longer steps the mean of two Dopplers is too inaccurate.
 _LONGEST_STEP: Final = 2.5
 #: Standard deviation of a Doppler-derived change due to acceleration [m/s^2].
 _CURVED_MPS2: Final = 0.05

@@ -18,8 +18,7 @@ from railfix.ranges.channels import Channels
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDelays, SourceSatellites
 
 Values = TypeVar("Values", Floats, Integers)
-#: An epoch of the station is also used for epochs of the train up to this time earlier, since receiver clocks differ
-#: [s].
+#: Largest time by which an epoch of the station may be later than the train's epoch, since receiver clocks differ [s].
 _SAME_S: Final = 0.05
 #: Largest ages of the station's codes and phases [s]. Without selective availability, code errors change by centimetres
 #: in 30 s, and phase errors by millimetres in a second.

@@ -15,7 +15,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: Limits of a plausible pseudorange [m]: nearest satellite less, and GEO plus, a receiver clock offset of 33 ms.
+#: Limits of a plausible pseudorange [m], beyond the ranges of all satellites at receiver clock offsets up to 33 ms.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
@@ -46,8 +46,8 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 
 #: Signals with ten times the chip rate of L1 C/A, by constellation and band.
 _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
-#: Noise and multipath of these signals relative to L1 at the same C/N0; measured values are 0.4 on a phone (L5 to L1)
-#: and 0.8 on an F9P (E5b to E1).
+#: Noise and multipath of the signals in `_FAST` relative to L1 at the same C/N0; measured values are 0.4 on a phone (L5
+#: to L1) and 0.8 on an F9P (E5b to E1).
 _FAST_NOISE: Final = 0.5
 
 

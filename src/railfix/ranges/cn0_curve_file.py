@@ -1,4 +1,4 @@
-"""Files of the mean C/N0 over elevation (TOML)."""
+"""Read and write the mean C/N0 over elevation as TOML files."""
 
 from __future__ import annotations
 

@@ -22,13 +22,13 @@ from railfix.io.logs import read_navigation, scan_observations
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
-_SHORT_S: Final = 12 * 3600.0  #: A shorter log causes a note; P1 2.3(1) requires about a day [s].
+_SHORT_S: Final = 12 * 3600.0  #: Duration below which a log causes a note [s]; P1 2.3(1) requires about a day.
 _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
-#: Lowest elevation of the samples compared with this limit [deg]; a larger rejected fraction causes a note.
+#: Lowest elevation of the samples compared with `_DEFICIT_DBHZ` [deg], and largest rejected fraction without a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Largest fraction of tracked satellites below it attributed to faulty navigation records.
+_BELOW_SHARE: Final = 0.05  #: Largest fraction of satellites below `_BELOW_DEG` without an error.
 
 
 @dataclass(frozen=True, kw_only=True)

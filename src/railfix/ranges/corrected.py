@@ -81,7 +81,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: Epochs with a gross error that cannot be identified, not used for noise and map estimates; shape (T,).
+    #: Epochs with a gross error that cannot be identified, which noise and map estimates leave out; shape (T,).
     unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`), where they are used.
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
@@ -120,7 +120,7 @@ def find_satellites(
 ) -> SatelliteRanges:
     """Return satellite positions and clocks at the times of transmission ``t - code / c - dt_sv`` (P1 2.2(2)).
 
-    Of each satellite, the first plausible code in the order of `channels` is used; all other codes have a reason.
+    Of each satellite, the first plausible code in the order of `channels` is used; other codes have a rejection reason.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def corrected_ranges(
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used have a reason; they are kept, or NaN where a correction is missing.
+        Codes that cannot be used have a rejection reason; they are kept, or NaN where a correction is missing.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Settings of a run on which the errors of its pseudoranges depend, for the comparison with those of an error model."""
+"""Settings that affect pseudorange errors, and their comparison between a run and an error model."""
 
 from __future__ import annotations
 

@@ -43,13 +43,13 @@ class ErrorBins(Settings):
 
     #: E + 1 edges in ascending order; values beyond the outer edges belong to the outer bins.
     elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
-        "Edges of the bins of elevation.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
+        "Edges of the elevation bins.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
     )
-    sectors: int = option("Sectors of azimuth, the first centred ahead of the car.", 4, metavar="N", ge=1)
+    sectors: int = option("Number of azimuth sectors; the first is centred ahead of the car.", 4, metavar="N", ge=1)
     #: C + 1 edges in ascending order; values beyond the outer edges belong to the outer bins, and observations without
     #: C/N0 to the lowest bin.
     cn0_dbhz: tuple[float, ...] = option(
-        "Edges of the bins of C/N0; 0,60 puts all into one.",
+        "Edges of the C/N0 bins; 0,60 makes a single bin.",
         (0.0, 30.0, 35.0, 40.0, 45.0, 60.0),
         name="--cn0",
         metavar="DBHZ,...",
@@ -96,14 +96,14 @@ class BinStatistics:
     #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
-    #: `error_model_fit.gaussian_overbound` of the same samples.
+    #: Bias and sigma of the overbound of these samples (`error_model_fit.gaussian_overbound`).
     bound_bias_m: Floats
     bound_sigma_m: Floats
-    pooled: Integers  #: Index into `POOLED` of the samples used: of a wider set of bins if the bin has too few blocks.
+    pooled: Integers  #: Index into `POOLED`: own samples, or a wider set if the bin has too few blocks.
 
 
 class ErrorModelSource(Settings):
-    """Runs to which a model was fitted, for its file."""
+    """Runs to which a model was fitted."""
 
     runs: tuple[str, ...] = ()
     base: str = ""  #: Marker of the reference station.
@@ -114,7 +114,7 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each file.
 
 
-LARGEST_PRIOR: Final = 0.05  #: A larger bound of a prior is from too few blocks for a finite protection level.
+LARGEST_PRIOR: Final = 0.05  #: Largest upper bound of a prior that permits a finite protection level.
 
 
 class FaultRate(Settings):

@@ -65,7 +65,7 @@ class ErrorSamples:
     """Errors of single pseudoranges, n samples."""
 
     error_m: Floats  #: Shape (n,).
-    #: Shape (n,).
+    #: Direction of the satellite, with the azimuth from the car's front, and C/N0; shape (n,).
     elevation_deg: Floats
     relative_azimuth_deg: Floats
     cn0_dbhz: Floats
@@ -76,7 +76,7 @@ class ErrorSamples:
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
-    """Return the statistics of the bins from some of the samples, a mask of shape (n,).
+    """Return the statistics of the bins from the samples `which`, a mask of shape (n,).
 
     A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of a wider set of bins, the first of the
     following sets with enough blocks: all azimuths of its elevation and C/N0; all azimuths and C/N0 of its elevation;
@@ -171,8 +171,7 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-#: A range that passed the screens is faulty if its error exceeds this multiple of its sigma. Confidence of upper bounds
-#: of rates.
+#: Multiple of its sigma above which the error of a range is a fault; confidence level of the bounds of rates.
 _BEYOND_SIGMA: Final = 5.0
 _CONFIDENCE: Final = 0.95
 #: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
@@ -250,7 +249,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Return the number of blocks of time with two or more faulty satellites, relative to independent satellites."""
+    """Return the ratio of observed to expected blocks of time with two or more faulty satellites; 0 without faults."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.core.settings import Settings
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: C/N0 of `zenith_sigma_m`, and C/N0 above which sigma does not decrease further.
+#: C/N0 to which `zenith_sigma_m` refers, and C/N0 above which sigma does not decrease further.
 _CN0_REFERENCE_DBHZ: Final = 45.0
 _CN0_CAP_DBHZ: Final = 50.0
 

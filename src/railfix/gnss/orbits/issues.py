@@ -55,7 +55,7 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
     """Return the row of `navigation.kepler` with the given issue and the nearest toe, shape (T, M); -1 if none is
     valid.
 
-    The times of transmission are not considered.
+    `time` has the epochs, shape (T,); the records are not selected at the times of transmission.
     """
     table = _index_issues(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)

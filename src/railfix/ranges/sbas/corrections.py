@@ -44,7 +44,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return the PRN with the most usable fast corrections, the smallest of equal PRNs, and a sentence on the choice.
+    """Return the PRN with the most usable fast corrections (of several, the smallest), and a sentence on the choice.
 
     The choice uses all messages, so it is made from recorded messages before positioning begins. For live messages the
     PRN must be given.
@@ -67,7 +67,7 @@ class SbasCorrections:
 
     A message is used from its time of reception on (`SbasMessages.time`), never before. Results are independent of the
     other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn`, which is
-    chosen beforehand (`best_prn`), are left out; `notes` on their origin precede the notes on the corrections.
+    chosen beforehand (`best_prn`), are left out; `notes` on the messages precede the notes on the corrections.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SbasCorrections:
         self._tables = SatelliteTables(of_prn, self.limits)
         self._grid = GridTables(of_prn, self.limits, self._tables.stops)
         self._service = ServiceTable(of_prn, self.limits)
-        #: Corrections without a mask of their issue, by kind.
+        #: Number of corrections without a mask of their issue, by kind.
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
@@ -165,7 +165,7 @@ class SbasCorrections:
         inflated: Masks,
         covariance: Integers,
     ) -> SatelliteCorrections:
-        """Combine the parts; NaN where the state is not OK."""
+        """Combine the fast, long-term and degradation terms; values are NaN where the state is not OK."""
         used = state == SatelliteState.OK
         table = self._tables.long_term
         has = used & (long.row >= 0)
@@ -214,8 +214,8 @@ class SbasCorrections:
     ) -> Floats:
         """Return the factor on sigma UDRE from service regions (type 27) or covariances (type 28), shape (T, K).
 
-        `corrections` are the corrections at these epochs, `line_of_sight`, shape (T, K, 3), are unit vectors to the
-        satellites in the Earth-fixed frame, and the receiver coordinates have shape (T,). The factor is 1 where the GEO
+        `corrections` are the corrections at these epochs; `line_of_sight`, shape (T, K, 3), has unit vectors to the
+        satellites in the Earth-fixed frame; the receiver coordinates have shape (T,). The factor is 1 where the GEO
         sends neither type, and NaN where service messages are incomplete and incomplete data are rejected.
         """
         factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)

@@ -42,7 +42,7 @@ def _read_signed(first: int, length: int, scale: float | None = None, number: in
     return BitField(first, length, scale, True, number)
 
 
-#: Fields of a message or of a part of it; a sequence of fields becomes one array of as many columns.
+#: Fields of a message or of a part of a message; a sequence of fields becomes one array with a column per field.
 Layout = Mapping[str, BitField | Sequence[BitField]]
 
 #: Complete messages by type, and parts of messages, whose bits are counted from the beginning of the part.
@@ -186,7 +186,7 @@ def decode(messages: SbasMessages, kind: int) -> Decoded:
 
 
 def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
-    """Return the instants with a given time of day that are nearest to other instants; NaT where it is NaN."""
+    """Return the instants with given times of day that are nearest to `near`; NaT where the time of day is NaN."""
     midnight = near.astype("datetime64[D]").astype("datetime64[ns]")
     offset = time_of_day_s - seconds(near - midnight)
     return np.asarray(near + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY)), "datetime64[ns]")
@@ -274,7 +274,7 @@ def long_term(messages: SbasMessages) -> Decoded:
 
 
 def grid_delays(messages: SbasMessages) -> Decoded:
-    """Return type 26: `band`, `block`, `iodi` (n,); `delay_m` (n, 15), NaN for "do not use"; `givei` (n, 15)."""
+    """Return fields of type 26: `band`, `block`, `iodi` (n,); `delay_m`, NaN for "do not use", `givei` (n, 15)."""
     decoded = decode(messages, 26)
     delay = decoded["delay_m"]
     return {**decoded, "delay_m": np.where(delay == _DO_NOT_USE_DELAY_M, np.nan, delay)}
@@ -288,7 +288,7 @@ def covariance_factor(sent: Decoded) -> Floats:
 
 
 def covariance(messages: SbasMessages) -> Decoded:
-    """Return type 28, one row per satellite: `slot`, `iodp`, `scale` (n,); `factor` (n, 4, 4), upper triangular."""
+    """Return fields of type 28 by satellite: `slot`, `iodp`, `scale` (n,), upper triangular `factor` (n, 4, 4)."""
     decoded = decode(messages, 28)
     row, parts = decoded["row"], []
     for start in (16, 121):
@@ -299,7 +299,7 @@ def covariance(messages: SbasMessages) -> Decoded:
 
 
 def service(messages: SbasMessages) -> Decoded:
-    """Return type 27: `issue`, `messages`, `message`, `regions`, `priority`, `inside`, `outside`; corners (n, 5)."""
+    """Return the fields of type 27, with message numbers from 1; the corners of regions have shape (n, 5)."""
     decoded = decode(messages, 27)
     return {
         **decoded,

@@ -1,23 +1,23 @@
 """Dual-frequency SBAS on L5 (ICAO Annex 10, 8th edition, appendix B, 3.5.14; ED-259A): corrections of satellites.
 
-Messages of 250 bits with preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
+Messages have 250 bits and preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
 (integrity) and 37 (degradation and the scale of the integrity indicator) are decoded. The corrections are for
-ionosphere-free ranges of L1 C/A and L5, E1 and E5a, where biases between the signals are in the clock correction, and
-of B1C and B2a, less the group delays of B-CNAV1. GLONASS has slots, but its corrections are for L1OC and L3OC, which
-are not read.
+ionosphere-free ranges. For L1 C/A and L5, and for E1 and E5a, the clock correction includes biases between the signals;
+from ranges of B1C and B2a, the group delays of B-CNAV1 must be subtracted. GLONASS has slots, but its corrections are
+for L1OC and L3OC, which are not read.
 
 The standard was not available. Layouts are taken from cssrlib (sbas.py), least values and degradation from MAAST
 (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots from both and from Wireshark (packet-sbas_l5.c). An hour of
 SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that slot and fraction of the rate have 8 and 4 bits, as in cssrlib, and
-that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays
-differ by metres: they are not in its corrections.
+that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres. Group delays differ
+by metres, so that its corrections do not include them.
 
 Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), are used for a note
-only. Layouts and scales are common to cssrlib and MAAST (L5_decodeMT39.m, 40, 47). Messages of SouthPAN of three days
-(`test_sbas_orbits.py`) determine the rest: the semi-major axis is counted from 6370 km, and the node from the meridian
-of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is 7 pi / 6 or 7 pi times
-2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit with another rate. BDSBAS has a different
-layout and is left out.
+only. Layouts and scales are common to cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of three days
+(`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370 km, and the node from
+the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is 7 pi / 6 or
+7 pi times 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit with another rate. BDSBAS has a
+different layout and is left out.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
 _ONE_MORE: Final = -2  #: Value of an indicator that type 34 increases by one.
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 in order.
-#: Validity of a mask, and of an indicator [s]; type 0 stops the use of its sender for the last value.
+#: Validity of a mask and of an indicator, and time for which type 0 stops the use of its sender [s].
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
 #: Time, covariance and indicator, at the same bits of types 32 and 40.
@@ -121,7 +121,7 @@ class DfmcCorrections:
         sight = np.concatenate([line_of_sight, np.ones((*self.state.shape, 1))], axis=-1)
         projected = np.einsum("tkij,tkj->tki", self.factor, sight)
         ratio = np.sqrt(np.einsum("tki,tki->tk", projected, projected)) + self.constant
-        # the degradation is added to sigma, which is never less than the root of the sum of squares
+        # the sum of sigma and degradation is never less than the root of the sum of squares
         return np.asarray(self.sigma_m * ratio + self.growth_m)
 
 
@@ -143,7 +143,7 @@ def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
 
 
 def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
-    """Return the row of the newest of some messages at epochs, and its age [s]; -1 and infinity without a message."""
+    """Return the row and the age [s] of the newest message at each epoch; -1 and infinity without a message."""
     row = np.searchsorted(sent, time, side="right") - 1
     ages = seconds(time - np.append(sent, np.datetime64("NaT", "ns"))[row])
     return row, np.where(row >= 0, ages, np.inf)
@@ -238,7 +238,7 @@ class DfmcService:
     def _correct(
         self, own: dict[str, Floats], good: Integers, at: tuple[Datetimes, Integers, Integers, Integers], name: str
     ) -> None:
-        """Fill in the corrections of one satellite at the epochs that have one."""
+        """Write the corrections of one satellite into `own` at the epochs `good`."""
         time, (row, ten, dfrei) = at[0][good], (values[good] for values in at[1:])
         sent, scale = {key: values[row] for key, values in self._read[32].items()}, self._read[37]
         moved_s = seconds(time - time_near(sent["time_of_day_s"], self._time[32][row]))
@@ -294,7 +294,7 @@ class DfmcService:
         return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
 
     def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
-        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 where it is too old."""
+        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 if it is too old."""
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)
@@ -387,7 +387,7 @@ class SbasOrbits:
 
 
 def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
-    """Return the ephemerides of one sender, from messages of types 39 and 40 of one issue within `valid_s`."""
+    """Return the ephemerides of one sender, from pairs of types 39 and 40 of one issue, at most `valid_s` apart."""
     rows = {kind: np.flatnonzero(messages.type == kind) for kind in (39, 40)}
     sent = {kind: read_fields(messages.bits[at], _ORBIT_LAYOUTS[kind]) for kind, at in rows.items()}
     newest: dict[tuple[int, int], int] = {}

@@ -192,7 +192,7 @@ _SHORT: Final = 58  #: Number of digits of a message cut after its 226 data bits
 
 @dataclass
 class _Gathered:
-    """Messages of all files during reading."""
+    """Messages collected from all files so far."""
 
     raw: list[RawMessage] = field(default_factory=list)
     source: list[int] = field(default_factory=list)
@@ -246,7 +246,7 @@ def read_sbas(
 def from_receiver(frames: SbasFrames, *, source: str = "receiver", band: Band = "L1") -> SbasMessages:
     """Return SBAS messages forwarded by a receiver, with parity and preamble checked; `source` is named in notes.
 
-    Messages from before the receiver had the time are left out and counted under "line".
+    Messages without a time tag are left out and counted under "line".
     """
     gathered = _Gathered()
     _gather_frames(frames, 0, gathered, band)
@@ -325,8 +325,8 @@ def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMes
 def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
     """Return the number of parity bits of each message: 24 in complete messages, 6 or 0 in cut messages.
 
-    A cut message ends with 6 bits that RTKLIB sets to zero and other programs leave as received. In files of the latter
-    these bits equal the first bits of the parity in most messages; by chance they do in 1 of 64.
+    A cut message ends with 6 bits that RTKLIB sets to zero and other programs leave as received. In files of other
+    programs these bits equal the first bits of the parity in most messages; by chance they are equal in 1 of 64.
     """
     carried = np.full(len(digits), 24, dtype=np.int64)
     short = digits == _SHORT
@@ -352,7 +352,7 @@ def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers)
 
 
 def _order_notes(log: SbasMessages) -> list[str]:
-    """Return notes on messages whose preamble does not fit the sequence by seconds, which shows a wrong time tag."""
+    """Return notes on messages whose preamble does not match their second, which indicates a wrong time tag."""
     notes = []
     second = log.time.astype("datetime64[s]").astype(np.int64)
     number, turn = preamble_number(log.bits, log.band), len(PREAMBLES[log.band])

@@ -141,7 +141,7 @@ class Spans:
         self._edges = np.unique(np.concatenate(ends)) if len(time) else time
 
     def number(self, time: Datetimes) -> Integers:
-        """Return the number of the span of instants; an instant at an edge has a separate number."""
+        """Return the number of the span of each instant; an instant at an edge has a separate number."""
         before = np.searchsorted(self._edges, time, side="left")
         return np.asarray(before + np.searchsorted(self._edges, time, side="right"), dtype=np.int64)
 
@@ -219,7 +219,7 @@ def _square_weights(x: Floats, y: Floats) -> Floats:
 
 
 def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], tuple[Floats, ...]]]:
-    """Yield the south-west corners and sizes of the cells to try, in order (A.4.4.10.2): small, then 10 by 10."""
+    """Yield functions for the south-west corners and sizes of cells in the order of trial (A.4.4.10.2)."""
 
     def small(at: Indices) -> tuple[Floats, ...]:
         lat, lon = latitude[at], longitude[at]
@@ -273,7 +273,7 @@ def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0
-    # Points at 85 degrees every 30 degrees where the polar band is sent, else every 90.
+    # Points at 85 degrees are 30 degrees apart where the polar band is sent, otherwise 90 degrees.
     origin = np.where(north, -180.0, -170.0)
     fine = np.floor((longitude - origin) / 30.0) * 30.0 + origin
     pole = np.stack([point_number(sign * 85.0, fine), point_number(sign * 85.0, fine + 30.0)], axis=1)

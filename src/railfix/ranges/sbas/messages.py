@@ -74,7 +74,7 @@ class SbasMessages(RowArrays, NotebookTable):
     #: GPS time at which the message was completely received, from which it is used; shape (N,).
     time: Datetimes
     prn: Integers  #: Shape (N,).
-    type: Integers  #: 0 to 63, shape (N,).
+    type: Integers  #: Message type, 0 to 63, shape (N,).
     #: Message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains it,
     #: then zeros; shape (N, 32).
     bits: Bytes
@@ -84,7 +84,7 @@ class SbasMessages(RowArrays, NotebookTable):
     sources: tuple[str, ...] = ()  #: Names of the files.
     #: Messages left out, by reason: "parity", "preamble", "line", "duplicate".
     rejected: Mapping[str, int] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()  #: Warnings for the reader of the results, one sentence each.
+    notes: tuple[str, ...] = ()  #: Warnings about the messages, one sentence each.
     band: Band = "L1"
 
     def __post_init__(self) -> None:
@@ -135,7 +135,7 @@ class SbasMessages(RowArrays, NotebookTable):
         return joined.take(np.argsort(both.time, kind="stable"))
 
     def repeated(self) -> Masks:
-        """Return messages already forwarded by another receiver (the same bits of one PRN within 1 s), shape (N,).
+        """Return the mask of messages that repeat an earlier message (same bits and PRN within 1 s), shape (N,).
 
         The preambles of successive messages differ, so no GEO sends the same 250 bits twice in succession.
         """

@@ -28,7 +28,8 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 class FastInForce:
     """Fast corrections in force, all (T, K)."""
 
-    #: In this order: no fast correction; too old, or of an inactive mask; no type 7; a required rate is missing.
+    #: True where, in this order: a fast correction is missing; it is too old, or of an inactive mask; type 7 is
+    #: missing; a required range rate is missing.
     missing: Masks
     timed_out: Masks
     no_factor: Masks
@@ -104,7 +105,7 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range-rate correction, its degradation per second, time between its corrections, and where missing.
+    """Return the range rate, its degradation per second, the time between its two corrections, and where it is missing.
 
     After an alarm (IODF 3) the earlier correction is the one nearest to half the time-out before the newest.
     """
@@ -129,7 +130,7 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Return the earlier row of the satellite that is nearest to the time `before` ahead of a row; the later of two."""
+    """Return the satellite's row nearest to the time `before` ahead of each row; of two equally near, the later."""
     wanted = fast.time[row] - before
     first = fast["fresh"][row]
     low = np.maximum(fast.newest(fast.series[row], wanted), first)
@@ -158,7 +159,7 @@ def long_term_in_force(
     stop: Datetimes,
     navigation: Navigation | None,
 ) -> LongTermInForce:
-    """Find the newest long-term corrections whose issue of data a record has; SBAS satellites do not require one.
+    """Find the newest long-term corrections with a record of their issue of data; SBAS satellites do not need any.
 
     `number`, shape (K,), is the number in the PRN mask. Without `navigation` the newest correction is used unchecked.
     """

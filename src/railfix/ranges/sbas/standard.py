@@ -78,13 +78,13 @@ STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for thi
 #: Messages older than this are not used, even if type 6 renews a fast correction: the longest time-out, without service
 #: regions [s].
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
-#: Types that affect messages received later (stops and masks), and are therefore kept for twice that time.
+#: Types that affect messages received later (stops and masks), and are therefore kept for twice `OLDEST_S`.
 LEANT_ON: Final = (0, 1, 18)
 INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 
 
 class SatelliteState(IntEnum):
-    """Whether a satellite may be used, or the first reason that applies, in this order."""
+    """State of a satellite: usable, or the first reason that applies, in this order."""
 
     OK = 0
     GEO_STOPPED = 1  #: Type 0 was received within the last 60 s.
@@ -98,7 +98,7 @@ class SatelliteState(IntEnum):
     NO_LONG_TERM = 9
     IODE_MISMATCH = 10  #: No navigation record has the issue of data of the long-term correction.
     NO_DEGRADATION = 11  #: Degradation data (types 7, 10; 28 where it is sent) are missing.
-    NO_RANGE_RATE = 12  #: Two fast corrections that determine a rate are missing.
+    NO_RANGE_RATE = 12  #: No two fast corrections determine a rate.
 
 
 class IonosphereState(IntEnum):

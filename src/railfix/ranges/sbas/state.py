@@ -34,7 +34,7 @@ class SbasState:
         state = state.drop_before(time[-1])  # what later epochs need
     """
 
-    prn: int  #: Chosen beforehand, because the best GEO is known only after all messages were received.
+    prn: int  #: PRN of the GEO, given beforehand; the best is known only after all messages.
     limits: SbasLimits = field(default_factory=SbasLimits)
     #: Messages of that PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
@@ -69,7 +69,7 @@ class SbasState:
     def add_messages(self, messages: SbasMessages) -> SbasState:
         """Return the state after more messages, without other PRNs and messages repeated by a second receiver.
 
-        SettingsError: `messages` are no `SbasMessages`.
+        Raise SettingsError if `messages` are not `SbasMessages`.
         """
         check_type(messages, SbasMessages, "messages")
         joined = self.messages.merge(messages.of(self.prn))
@@ -104,7 +104,7 @@ class SbasState:
     def drop_before(self, time: np.datetime64) -> SbasState:
         """Return the state without the messages that no epoch from `time` on can use."""
         kind, age = self.messages.type, seconds(time - self.messages.time)
-        if self.band == "L5":  # the newest of each type, and corrections with all indicators since
+        if self.band == "L5":  # keep the newest message of each type, and those of the last `MASK_S`
             newest = len(kind) - 1 - np.unique(kind[::-1], return_index=True)[1]
             kept = (age <= MASK_S) | np.isin(np.arange(len(kind)), newest)
             return self if kept.all() else replace(self, messages=self.messages.take(kept))

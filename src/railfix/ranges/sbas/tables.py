@@ -138,7 +138,7 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return whether there is an active mask (T,), and whether the newest contains the satellites (T, K)."""
+        """Return whether there is an active mask (T,), and whether the newest mask contains the satellites (T, K)."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]

@@ -8,7 +8,8 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
 
-#: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravity [m/s^2].
+#: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravity of the air and at the surface
+#: [m/s^2].
 _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of table A-2 [deg].
 #: Mean, then seasonal variation, of pressure [mbar], temperature [K], vapour pressure [mbar], temperature lapse rate
