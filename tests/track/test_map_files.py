@@ -108,7 +108,7 @@ def test_a_wrong_grid_is_refused(tmp_path: Path, wrong: str) -> None:
     assert len(read_track(right, height_datum="ellipsoidal")) == 20
     path = geojson(tmp_path / "b.geojson", {"1": {}}, points, **named(wrong))
     if wrong == "EPSG:3857":
-        with pytest.raises(InputFileError, match=r"design is 200 m long, on the map 1[0-9][0-9] m"):
+        with pytest.raises(InputFileError, match=r"design is 200 m long, but 1[0-9][0-9] m on the map"):
             read_ifc_segments(ifc(tmp_path / "a.ifc"), MapReading(crs=wrong, height_datum="ellipsoidal"))
         return
     with pytest.raises(InputFileError, match=r"outside the area of use|another grid"):

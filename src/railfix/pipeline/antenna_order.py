@@ -70,7 +70,7 @@ class AntennaOrder:
         measured = self._facing * (place - other - self._reference_m)
         variance = sigma**2 + other_sigma**2
         known = np.isfinite(measured) & np.isfinite(variance)
-        # a gross error is clipped to three times the distance of the antennas
+        # a gross error is clipped to three times the distance between the antennas
         bound = 3.0 * abs(self.distance_m)
         measured, variance = np.clip(measured[known], -bound, bound), variance[known]
         stretch, which = np.unique(np.floor(place[known] / _STRETCH_M).astype(np.int64), return_inverse=True)

@@ -58,7 +58,7 @@ class ReferenceSettings(Settings):
     #: Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
     lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
     height_m: float = _limit("Largest distance above or below the antenna's trajectory.", 2.0, "M", "--height")
-    #: Constant part of the largest difference between the distance of two fixes and the distance travelled (P2 3.3).
+    #: Constant part of the largest difference between the straight and the travelled distance of two fixes (P2 3.3).
     travel_m: float = _positive(0.10)
     #: Largest speed of a train; where the line passes a point several times, only passes within reach are considered.
     max_speed_mps: float = _positive(100.0)

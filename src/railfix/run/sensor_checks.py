@@ -191,12 +191,12 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
     if abs(size - 1.0) < _GRAVITY_SHARE:
         yield "inertial: its forces are in g, not in m/s2; multiply them by 9.80665"
     elif abs(size / GRAVITY_MPS2 - 1.0) > _GRAVITY_SHARE:
-        yield f"inertial: its mean force is {size:.2f} m/s2, gravity {GRAVITY_MPS2:.2f}; specific forces are expected"
+        yield f"inertial: its mean force is {size:.2f} m/s2, not {GRAVITY_MPS2:.2f}; specific forces are expected"
     elif abs(down) < 0.8 * size:
         axis = "force_forward_mps2" if abs(forward) > abs(right) else "force_right_mps2"
         yield f"inertial: gravity is in {axis}, not in force_down_mps2; swap the columns of the axes"
     elif down > 0.0:
-        yield f"inertial: force_down_mps2 is {down:+.1f} in the mean, -9.8 was expected; the unit is upside down"
+        yield f"inertial: force_down_mps2 is {down:+.1f} on average, -9.8 was expected; the unit is upside down"
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
@@ -311,7 +311,7 @@ def range_notes(
         fits = limits.range_ahead_m + trajectory.front_sign * moved
         which = "ahead of" if moved > 0 else "behind"
         yield (
-            f"ranging: positions by the ranges are {abs(moved):.1f} m {which} satellite positions in rising chainage; "
+            f"ranging: range positions are {abs(moved):.1f} m {which} satellite positions in rising chainage; "
             f"sensors.range_ahead_m = {fits:.1f} would fit, or the units' surveyed positions are displaced"
         )
     if abs(excess) > _RANGE_M:

@@ -83,7 +83,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     columns = (
         ScreenColumn(
             name="metric_antenna_spacing_m",
-            meaning="screen `antenna_spacing`: distance of the two positions less the antenna spacing",
+            meaning="screen `antenna_spacing`: distance between the two positions less the antenna spacing",
             verdict="antenna_spacing",
             table="positions",
         ),

@@ -390,7 +390,7 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
     if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
         raise InputFileError(
             path,
-            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right crs (--crs), or "
+            f"the design is {designed:.0f} m long, but {found:.0f} m on the map; give the right crs (--crs), or "
             "correct the elements that do not meet",
         )
 

@@ -140,7 +140,7 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
                 plan = _leaning(plan, [(height or 0.0) * scale / gauge for height in heights], cant)
         except (TypeError, IndexError, ValueError):
             raise InputFileError(
-                path, f"alignment {name!r}: a number that IFC 4.3 requires is missing in a segment, or is not a number"
+                path, f"alignment {name!r}: a number that IFC 4.3 requires in a segment is missing or invalid"
             ) from None
         uneven = sum(_is_uneven(e) for e in elements.get("IFCALIGNMENTCANT", []))
         notes: tuple[str, ...] = ()

@@ -98,7 +98,7 @@ def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Seg
         except (TypeError, ValueError, AttributeError):
             raise InputFileError(
                 path,
-                f"alignment {name!r}: a number that LandXML 1.2 requires is missing in an element, or is not a number",
+                f"alignment {name!r}: a number that LandXML 1.2 requires in an element is missing or invalid",
             ) from None
         segments.append(
             segment_of_design(

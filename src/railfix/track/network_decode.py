@@ -47,7 +47,7 @@ _OPEN_COST: Final = 2.0
 _BEYOND_SIGMAS: Final = 5.0
 _BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
-#: Excess of the path length over the straight distance of two positions that is allowed, for example in a bend:
+#: Excess of the path length over the straight distance between two positions that is allowed, for example in a bend:
 #: constant part [m], and fraction of the distance.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2

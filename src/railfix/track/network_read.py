@@ -23,7 +23,7 @@ from railfix.track.route import MapReading, Segment, check_order, first_gap, ori
 from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
-TOLERANCE_M: Final = 0.5  #: Largest distance of two connected ends if the file states no connections [m].
+TOLERANCE_M: Final = 0.5  #: Largest distance between connected ends if the file states no connections [m].
 #: Largest change of direction between two tracks that a train passes [rad]; the legs of a switch differ by about pi.
 _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
@@ -79,7 +79,7 @@ def _of_nodes(tracks: list[Segment]) -> Network:
             crosses = node.startswith(CROSSING) and way_of_part[a] != way_of_part[b]
             navigable = ahead and a != b and not crosses
             links.append(Link(first=a, first_end=first, second=b, second_end=second, navigable=navigable))
-    note = f"connections at the nodes that ways share; {sum(map(bool, inner))} ways divided at inner nodes"
+    note = f"tracks are connected at the nodes that ways share; {sum(map(bool, inner))} ways are divided at inner nodes"
     return network.connect(tuple(links), note)
 
 
@@ -118,7 +118,7 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
     if not known:
         raise InputFileError(path, f"none of its {len(relations)} net relations names a track of the file")
     links = tuple(Link(**{**vars(r), "first": number[r.first], "second": number[r.second]}) for r in known)
-    note = f"connections as {len(known)} net relations of the file state them"
+    note = f"tracks are connected as {len(known)} net relations of the file state"
     if len(known) < len(relations):
         note += f"; {len(relations) - len(known)} relations name a track that is not in the file"
     return Network(tracks=tuple(tracks), links=links, notes=(note,))
@@ -203,7 +203,7 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
 
 
 _GAP_M: Final = 5.0  #: Distance of two unconnected ends below which they are a gap in one track [m].
-_JOINT_M: Final = 0.5  #: Largest distance of two connected ends that is not reported [m].
+_JOINT_M: Final = 0.5  #: Largest distance between connected ends that is not reported [m].
 #: Largest change of direction over a navigable connection [deg]; a 1:4.5 switch turns by 12.5 deg over its length.
 _KINK_DEG: Final = 15.0
 #: Smallest spacing of parallel tracks [m], which leaves clearance between vehicles.

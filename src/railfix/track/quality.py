@@ -151,7 +151,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres"),
     "small cant": (
         "error",
-        "cant of {value:.2g} m, and nowhere more; check whether it is in metres, where millimetres are expected",
+        "cant of {value:.2g} m is the largest; check whether it is in metres, where millimetres are expected",
     ),
     "cant side": (
         "error",

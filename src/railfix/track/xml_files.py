@@ -103,7 +103,7 @@ def read_railml_relations(path: FilePath) -> list[Relation]:
     for item in root.iterfind(".//{*}netRelation"):
         first, second = item.find("{*}elementA"), item.find("{*}elementB")
         if first is None or second is None:
-            raise InputFileError(path, f"netRelation {item.get('id')} names no two elements")
+            raise InputFileError(path, f"netRelation {item.get('id')} does not name two elements")
         try:
             ends = [int(float(str(item.get(key)))) for key in ("positionOnA", "positionOnB")]
         except ValueError:

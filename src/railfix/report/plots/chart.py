@@ -49,7 +49,7 @@ class _Layer:
         """Raise ValueError if the arrays differ in length."""
         lengths = [len(value) for value in vars(self).values() if isinstance(value, np.ndarray | tuple)]
         if len(set(lengths)) > 1:
-            raise ValueError(f"{self.label}: arrays of lengths {lengths}, expected equal ones")
+            raise ValueError(f"{self.label}: arrays of lengths {lengths}, expected equal lengths")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -388,9 +388,11 @@ def _notes(
     length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())
     notes = [
         ANTENNA_PATH,
-        f"surveyed from {plural(runs, 'run')} of {driven:,.0f} m together, {driven / length:.1f} times the line, "
-        f"{against:.0%} of it against its direction; each point is passed {count.min()} to {count.max()} times",
-        f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height: 95th percentiles along it",
+        f"surveyed from {plural(runs, 'run')} of {driven:,.0f} m in total, {driven / length:.1f} times the length of "
+        f"the line, {against:.0%} of the distance against its direction; each point is passed {count.min()} to "
+        f"{count.max()} times",
+        f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height (95th percentiles along the "
+        f"line)",
     ]
     steps = np.concatenate([np.diff(leg.arc_m) for leg in legs])
     if len(bridged := steps[steps > _TURN_M]):
