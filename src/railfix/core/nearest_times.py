@@ -1,4 +1,4 @@
-"""Nearest of given times, and times of day or week nearest to a reference."""
+"""Indices of nearest times, and times of day or week resolved by a reference time."""
 
 from __future__ import annotations
 

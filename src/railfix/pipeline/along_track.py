@@ -154,7 +154,7 @@ def _against_wheel(
 def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
-    """Check distance and speed against the other antenna; return the positions with the verdict, and the state.
+    """Return the positions with the verdict on distance and speed of the two antennas, and the state.
 
     `spacing` has the screen's verdicts, shape (T,), or is None. A rejection applies until `held_s` after its epoch.
     """

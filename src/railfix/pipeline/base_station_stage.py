@@ -31,7 +31,7 @@ from railfix.track.trajectory import Trajectory
 
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
-_NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
+_NO_EPOCH: Final = "base station: no epoch of known position so far, so nothing is subtracted"
 #: Station positions within this distance count as equal [m].
 _SAME_PLACE_M: Final = 0.01
 
@@ -56,7 +56,7 @@ class BaseState:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Note that the station has no epoch with a known position; empty otherwise."""
+        """Note on a station without an epoch of known position; empty for other stations."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
@@ -68,10 +68,10 @@ class BaseState:
 class BaseStation:
     """Base station at a known ECEF position, shape (3,) [m], in the reference frame of the satellite orbits.
 
-    Its pseudoranges are corrected as the train's, with the same settings, and smoothed by carrier phase where
-    available, which reduces the station's noise. The station's multipath remains. With "stream" the position is taken
-    from the headers of the observations. The state restarts if that position changes by more than a centimetre, as it
-    does with the next virtual station.
+    Its pseudoranges are corrected as those of the train, and smoothed by carrier phase where available, which reduces
+    the station's noise. The station's multipath remains. With "stream" the position is taken from the headers of the
+    observations. The state restarts if that position changes by more than a centimetre, as it does with the next
+    virtual station.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:

@@ -222,7 +222,7 @@ class Config(ScreenSettings):
     @model_validator(mode="before")
     @classmethod
     def _on_preset(cls, values: Any) -> Any:
-        """Merge the given settings over the preset; an unknown preset is rejected by its own field."""
+        """Merge the given settings over the preset; the validation of the field `preset` rejects an unknown preset."""
         if not isinstance(values, dict):
             return values
         return _over(PRESETS.get(str(values.get("preset", "default")), {}), values)

@@ -102,7 +102,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
     standstill: Masks  #: True where the speed plus two sigmas is below 1 km/h; shape (T,).
     #: Motion since the previous epoch, and properties of the line under the body, by wheel and inertial unit.
     sensed: SensedMotion
-    #: Distance to the other antenna's position less the antenna spacing; NaN where not examined; shape (T,).
+    #: Distance between the positions of both antennas less the antenna spacing; NaN where not compared; shape (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Comparison of satellite with wheel distances; None without a wheel.
     passings: tuple[Passing, ...] = ()  #: Passed balises and virtual balises, and wrong readings.
@@ -140,7 +140,7 @@ class Replay:
 
     epochs: GnssEpochs
     sensors: SensorEpochs
-    before: TrackState | None  #: Filter state before these epochs.
+    before: TrackState | None  #: Filter state before the epochs.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

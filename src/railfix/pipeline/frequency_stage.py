@@ -35,8 +35,8 @@ def combine_frequencies(
     ionosphere_sigma_m: float,
     states: Sequence[TwoFrequencyState],
 ) -> tuple[CorrectedRanges, Combined, Verdict, list[TwoFrequencyState]]:
-    """Return the ranges with two codes combined, the combination, a verdict that lowers weights of inconsistent codes,
-    and states.
+    """Return ranges with combined codes, the combination, a verdict that lowers weights of inconsistent codes, and
+    states.
     """
     usable, second = corrected.reason == 0, corrected.second
     assert second is not None

@@ -257,7 +257,7 @@ def _on_all_epochs(
 
 
 def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
-    """Return the statuses of positions (T,), replaced by interference statuses where these are more serious.
+    """Return the statuses of positions (T,), replaced by interference statuses where interference is more serious.
 
     `suspected` is the `Suspicion` of all antennas' epochs, concatenated; empty if the check is off.
     """

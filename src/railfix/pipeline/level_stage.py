@@ -55,7 +55,7 @@ def choose_basis(config: Config) -> str:
 
 
 def prior_basis_text(facts: Mapping[str, Any]) -> str:
-    """Return a sentence on the priors of a run's levels (`level_facts`): measured or assumed, supported or not."""
+    """Return a sentence that states whether the priors of a run's levels (`level_facts`) are measured and supported."""
     words = {
         "indicative": "indicative: priors of faults are assumed, not measured on this line; no hourly risk is claimed",
         "measured": "priors of local faults are measured on this line, risk.map_prior is assumed",
@@ -104,7 +104,7 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 
 def get_risk_budget(config: Config) -> RiskBudget:
-    """Return the risk budget in use; SBAS covers satellite faults, so that only local faults remain with it."""
+    """Return the risk budget in use, which with SBAS has local faults only, because SBAS covers satellite faults."""
     return config.risk if choose_kind(config) == "separation" else config.local_risk
 
 

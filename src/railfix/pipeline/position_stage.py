@@ -148,7 +148,7 @@ def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
     """Return ranges and 3-D positions for the test of the map, without `excluded` satellites at inconsistent epochs.
-    Positions are NaN where the other ranges are inconsistent as well, or the faulty range cannot be identified.
+    Positions are NaN where the remaining ranges are inconsistent, or the faulty range cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))

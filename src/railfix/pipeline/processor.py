@@ -76,7 +76,7 @@ class EpochProcessor:
         The files named in it are not read here; pass their contents, as
         `railfix.run.processor_setup.make_processor` does.
     trajectories : mapping of str to Trajectory
-        The trajectory of each antenna, one or two ("front", "rear").
+        Trajectories of the antennas "front", "rear", or both.
     navigation : Navigation, optional
         Navigation records known from the start; others may be given with each chunk. Without any, the first chunk must
         have some, otherwise `process` raises.
@@ -86,8 +86,8 @@ class EpochProcessor:
     models : Models, optional
     stations : Stations, optional
     screens : sequence of Screen, optional
-        User-defined screens, used with their limits in addition to those of `config`; their verdicts are in
-        `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
+        User-defined screens, used with their limits in addition to the screens of `config`. Their verdicts are in
+        `AntennaResult.screens`; only screens of installed packages have columns in the tables.
 
     Attributes
     ----------
@@ -397,7 +397,7 @@ class EpochProcessor:
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))
 
     def _line_references(self, name: str) -> LineReferences:
-        """Return ground units, balises, and the features of the line where these are a source of the filter."""
+        """Return ground units, balises, and, if the filter uses them, the features of the line."""
         features = self._features.get(name) if "feature" in self.config.filter_sources else None
         return LineReferences(features=features, units=self.units, balises=self.balises)
 

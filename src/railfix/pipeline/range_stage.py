@@ -110,7 +110,7 @@ def apply_verdict(corrected: CorrectedRanges, verdict: Verdict) -> CorrectedRang
 def _apply_error_model(
     model: RangeErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
 ) -> CorrectedRanges:
-    """Return the ranges with overbounding sigma and bias by an error model; unbounded ranges are rejected."""
+    """Return the ranges with overbounding sigmas and biases of an error model; ranges without a sigma are rejected."""
     front_deg = antennas.each(lambda index, rows: index.trajectory.body_azimuth_deg(arc_m[rows]))
     turned = corrected.azimuth_deg - front_deg[:, None]
     bound, bias = model.at(corrected.elevation_deg, turned, corrected.cn0_dbhz)
@@ -133,7 +133,7 @@ def error_model_notes(model: RangeErrorModel | None, config: Config) -> tuple[st
 
 
 def collect_conditions(config: Config) -> Conditions:
-    """Collect settings that affect range errors: the conditions of an error model fitted on such a run."""
+    """Collect the settings that affect range errors, which are the conditions of an error model fitted to the run."""
     return Conditions(
         systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
         screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,

@@ -107,7 +107,7 @@ def correction_source(received: Received, config: Config) -> CorrectionSource:
 
 
 def with_base_station(source: CorrectionSource, received: Received, config: Config) -> CorrectionSource:
-    """Return a source with the errors that a base station has measured; the source itself without a station."""
+    """Return the source with the errors that a base station has measured; without a station, return it unchanged."""
     if received.base is None:
         return source
     return BaseStationSource(

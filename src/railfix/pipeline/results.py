@@ -28,7 +28,7 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(Solution, LineCoordinates, NotebookTable):
-    """Results of one antenna at T epochs: positions, without those that the status drops, and intermediate results.
+    """Results of one antenna at T epochs: positions, without positions that the status drops, and intermediate results.
 
     Range arrays have the K channels that the settings allow (`corrected`). Properties have all M channels of the
     observations; these are the channels of all antennas if observations of several antennas are given together.

@@ -27,7 +27,7 @@ _EPOCHS: Final = 300
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
-    """Return the smoothed positions of all epochs from the filter's input, last piece first."""
+    """Return the smoothed positions of all epochs from the filter's input, given in reverse order of time."""
     parts: list[SmoothedTrack] = []
     later: BackwardInformation | None = None
     for replay in backward:

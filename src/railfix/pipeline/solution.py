@@ -24,7 +24,7 @@ from railfix.positioning.range_arrays import InterSystemBiases
 class ProtectionResult(NotebookTable):
     """Protection levels of T epochs."""
 
-    #: Levels, NaN without a position and with a fault remaining after RAIM. The channels are those of the ranges.
+    #: Levels on the channels of the ranges; NaN without a position, and with a fault that remains after RAIM.
     level: ProtectionLevel
     status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
     kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).

@@ -155,7 +155,7 @@ def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, M
 
 
 def _rms_m(ranges: Ranges, point: SinglePoint) -> Floats:
-    """Return the root mean square of the residuals over the degrees of freedom, shape (T,) [m]; 0 without any."""
+    """Return the square root of the residuals' sum of squares over the redundancy (T,) [m]; 0 without redundancy."""
     freedom = ranges.space_redundancy
     square = np.where(ranges.weight > 0, point.residual_m, 0.0) ** 2
     return np.asarray(np.where(freedom >= 1, np.sqrt(square.sum(axis=1) / np.maximum(freedom, 1)), 0.0))

@@ -56,7 +56,7 @@ class BaseErrors:
         return len(self.time)
 
     def merge(self, later: BaseErrors) -> BaseErrors:
-        """Return these errors joined with later errors, with the channels of both."""
+        """Return the errors joined with later errors, with all channels of both tables."""
         parts = (self, later)
         keys = sorted({key for part in parts for key in part.keys})
         return replace(
@@ -119,7 +119,7 @@ class BaseErrors:
 
 
 def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Values:
-    """Return values of the channels `own` in the order of `keys`, `blank` for other channels."""
+    """Return values of the channels `own` in the order of `keys`; `blank` for channels that are not in `own`."""
     place = {key: k for k, key in enumerate(keys)}
     columns: Indices = np.array([place[key] for key in own], dtype=np.intp)
     full = np.full((len(values), len(keys)), blank, dtype=values.dtype)
@@ -145,11 +145,11 @@ class BaseStationSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites of the other source."""
+        """Return the satellites of the source `other`."""
         return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the other source and the station's errors, with the sigma of the corrected ranges."""
+        """Return the delays of the source `other` and the station's errors, with the sigma of the corrected ranges."""
         given = self.other.delays(time, channels, satellites, seen)
         base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
         differenced = np.isfinite(base.code_m)

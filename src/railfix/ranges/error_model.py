@@ -161,7 +161,7 @@ class ErrorModel:
     #: difference is the effect of the screens.
     before: BinStatistics
     after: BinStatistics
-    #: "local": only multipath and receiver noise, because a reference station removed the other errors.
+    #: "local": only multipath and receiver noise, because a reference station removed satellite and atmospheric errors.
     #: "satellite_and_atmosphere": in addition, satellite and atmospheric errors of the recorded days.
     covers: Literal["local", "satellite_and_atmosphere"]
     #: Settings under which the model is valid; None if unknown, so that they are not compared with a run's settings.

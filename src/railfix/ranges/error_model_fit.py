@@ -29,8 +29,8 @@ def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
 
     The k-th of n samples from either end is the quantile of probability ``k / (n + 1)``. Sigma is the least value that
     bounds both tails (beyond one standard score) for a bias equal to the absolute median; the bias is then the least
-    value that bounds the other samples. Beyond the largest sample the bound is an extrapolation by the normal
-    distribution. Raises ValueError for fewer than three samples, or a sample that is not finite.
+    value that bounds all samples. Beyond the largest sample the bound is an extrapolation by the normal distribution.
+    Raises ValueError for fewer than three samples, or a sample that is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")

@@ -20,7 +20,7 @@ _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 
 
 class _Issues:
-    """Index of records by satellite and issue, each used from half-way between the previous toe and its own toe.
+    """Index of records by satellite and issue, each used from half-way between the previous toe and the record's toe.
 
     With the same toe, F/NAV takes precedence over I/NAV.
     """

@@ -51,7 +51,7 @@ _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 i
 #: Validity of a mask and of an indicator, and time for which type 0 stops the use of its sender [s].
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
-#: Time, covariance and indicator, at the same bits of types 32 and 40.
+#: Time, covariance and indicator, which have equal bit positions in types 32 and 40.
 _COVARIANCE: Final[Layout] = {
     "time_of_day_s": BitField(106, 13, 16.0),
     "exponent": BitField(119, 3, 1.0),
@@ -372,7 +372,7 @@ class SbasOrbits:
     usable: Masks  #: Whether the inclination rate is 0, shape (n,).
 
     def position_ecef_m(self, time: Datetimes) -> Floats:
-        """Compute the position of each satellite at its time of `time`, shape (n, 3) [m]; NaN where not `usable`."""
+        """Compute each satellite's position at its element of `time`, shape (n, 3) [m]; NaN where not `usable`."""
         position = np.stack(kepler_state(self.orbits, seconds(time - self.reference))[0], axis=1)
         return np.where(self.usable[:, None], position, np.nan)
 

@@ -215,7 +215,7 @@ def read_sbas(
         message with a wrong parity or preamble is damaged; it is left out and counted in both cases.
 
     band : {"L1", "L5"}
-        Frequency of the messages; messages of the other band have another preamble and are left out.
+        Frequency of the messages; messages of other bands have different preambles and are left out.
 
     Returns
     -------

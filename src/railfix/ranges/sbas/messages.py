@@ -117,7 +117,7 @@ class SbasMessages(RowArrays, NotebookTable):
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
     def merge(self, later: SbasMessages) -> SbasMessages:
-        """Return these and later messages in the order of reception; counts are added, repeated notes dropped."""
+        """Return the messages with later messages, in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
         both = join_rows([self, later])

@@ -118,7 +118,7 @@ DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(
 def apply_dfmc(
     states: SatelliteStates, fixes: DfmcCorrections, satellite: Strings, signal: Strings
 ) -> tuple[SatelliteStates, Bits]:
-    """Return satellites with the corrections of SBAS on L5 applied, and the reasons of the others, shape (T, K)."""
+    """Return satellites with the corrections of SBAS on L5 applied, and rejection reasons, shape (T, K)."""
     covered = [code in DFMC_SIGNALS.get(name[0], ((),))[0] for name, code in zip(satellite, signal, strict=True)]
     moved, clock = states.position_ecef_m + fixes.position_m, states.clock_m + fixes.clock_m
     reason = np.where(covered, DFMC_REASONS[fixes.state], int(Reason.SBAS_NOT_COVERED))
@@ -129,7 +129,7 @@ def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelle
     """Return the troposphere of DO-229D and the modelled ionosphere, with the sigma of corrected ionosphere-free codes.
 
     ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without receiver noise. The
-    modelled ionosphere cancels in these codes.
+    modelled ionosphere cancels in ionosphere-free codes.
     """
     sight = seen.satellite_ecef_m - seen.receiver_ecef_m[:, None, :]
     along = fixes.sigma_along_m(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
@@ -144,7 +144,7 @@ def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelle
 
 
 def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Return satellites with long-term corrections applied, and the rejection reasons of the others, shape (T, K)."""
+    """Return satellites with long-term corrections applied, and rejection reasons, shape (T, K)."""
     moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
     clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
     return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]

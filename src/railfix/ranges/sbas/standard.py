@@ -27,7 +27,7 @@ _SYSTEMS: Final = {
 }
 _SYSTEM_OF: Final = {prn: name for name, prns in _SYSTEMS.items() for prn in prns}
 
-#: PRNs that can send these messages: SBAS, and QZSS L1-SAIF or L1S.
+#: PRNs that can send SBAS messages: SBAS, and QZSS L1-SAIF or L1S.
 GEO_PRNS: Final = (*range(120, 159), *range(183, 203))
 
 
