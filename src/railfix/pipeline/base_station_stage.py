@@ -37,8 +37,8 @@ _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed positions of ground units, base station ("stream" takes it from the observation headers) and balises,
-    and line features by antenna.
+    """Surveyed positions of ground units, base station and balises, and line features by antenna. With "stream", the
+    observation headers give the position of the base station.
     """
 
     units: GroundUnits | None = None
@@ -70,8 +70,8 @@ class BaseStation:
 
     Its pseudoranges are corrected as those of the train, and smoothed by carrier phase where available, which reduces
     the station's noise. The station's multipath remains. With "stream" the position is taken from the headers of the
-    observations. The state restarts if that position changes by more than a centimetre, as it does with the next
-    virtual station.
+    observations. The state restarts if the position changes by more than a centimetre, as it does with the next virtual
+    station.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:

@@ -278,7 +278,7 @@ class Config(ScreenSettings):
 
     @cached_property
     def local_risk(self) -> RiskBudget:
-        """Risk budget of local faults only, as SBAS covers satellite faults."""
+        """Risk budget of local faults only, because SBAS covers satellite faults."""
         none = dict.fromkeys(self.risk.satellite_prior, 0.0)
         return self.risk.replaced(satellite_prior=none, constellation_prior={})
 

@@ -35,7 +35,7 @@ UNITS: Final[Mapping[str, str]] = {
     "m": "m", "mm": "mm", "mps": "m/s", "mps2": "m/s^2", "deg": "deg", "dbhz": "dB-Hz", "permille": "permille",
     "1pm": "1/m", "s": "s", "db": "dB",
 }  # fmt: skip
-#: Decimals in CSV files: of a number, 0.1 mm for lengths, and of an angle.
+#: Decimals of numbers (0.1 mm for lengths) and of angles in CSV files.
 DECIMALS: Final = 4
 DECIMALS_DEG: Final = 9
 

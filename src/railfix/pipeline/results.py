@@ -81,12 +81,12 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def n_used(self) -> Integers:
-        """Satellites used, shape (T,)."""
+        """Number of satellites used, shape (T,)."""
         return np.asarray((self.corrected.reason == 0).sum(axis=1))
 
     @property
     def n_rejected(self) -> Integers:
-        """Satellites with a code but no used signal, shape (T,)."""
+        """Number of satellites with a code but no used signal, shape (T,)."""
         of_satellite = self.corrected.channels.member.astype(np.float32)  # float products are computed in blocks
         seen = ((self.reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
         used = (self.reason == 0).astype(np.float32) @ of_satellite > 0

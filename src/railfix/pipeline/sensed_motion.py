@@ -215,7 +215,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Group samples by interval; `at` is the index of the first sample after each instant, 0 after the first.
+    """Group samples by interval; `at` is the index of the first sample after each instant, 0 for the first instant.
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """

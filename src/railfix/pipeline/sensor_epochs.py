@@ -243,8 +243,8 @@ def _latest_samples(samples: SensorSamples, end: np.datetime64, limits: SensorLi
 def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     """Return the noise of gradient and curvature over one metre, map errors included.
 
-    A lateral map error sigma over a length L causes curvature errors of ``sqrt(3) sigma / L^2`` over about L, as white
-    noise over one metre times ``sqrt(L)``. The gradient error is ``sigma / L``.
+    A lateral map error sigma over a length L causes curvature errors of ``sqrt(3) sigma / L^2``, correlated over about
+    L. As white noise over one metre, these errors are multiplied by ``sqrt(L)``. The gradient error is ``sigma / L``.
     """
     gradient = trajectory.sigma_height_m / np.sqrt(_MAP_LENGTH_M)
     curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / _MAP_LENGTH_M**1.5

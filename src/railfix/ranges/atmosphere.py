@@ -54,9 +54,9 @@ def klobuchar_delay_m(
 ) -> Floats:
     """Return the ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
-    Latitude and longitude of the receiver have shape (T,), elevation and azimuth shape (T, M). `coefficients` are
-    alpha 0 to 3 and beta 0 to 3. The delay on L1 is multiplied by (f1/f)^2 for `frequency_hz`, shape (M,). NaN where an
-    input is NaN, and at or below the horizon.
+    Latitude and longitude of the receiver have shape (T,), elevation and azimuth shape (T, M). `coefficients` are alpha
+    0 to 3 and beta 0 to 3. The delay on L1 is multiplied by (f1/f)^2 for `frequency_hz`, shape (M,). The delay is NaN
+    where an input is NaN, and at or below the horizon.
     """
     _, seconds_of_week = to_week(time)
     alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
@@ -83,8 +83,8 @@ def saastamoinen_delay_m(
 ) -> Floats:
     """Return Saastamoinen's tropospheric delay in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
 
-    The hydrostatic and wet delays are mapped by 1/sin(elevation). Negative ellipsoidal heights are replaced by 0. NaN
-    where an input is NaN, at or below the horizon, and outside -100 m to 10 km.
+    The hydrostatic and wet delays are mapped by 1/sin(elevation). Negative ellipsoidal heights are replaced by 0. The
+    delay is NaN where an input is NaN, at or below the horizon, and outside -100 m to 10 km.
     """
     height = np.where((height_m >= -100.0) & (height_m <= 1e4), np.maximum(height_m, 0.0), np.nan)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568

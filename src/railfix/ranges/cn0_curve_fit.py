@@ -64,7 +64,7 @@ def fit_cn0_curve(
 ) -> Cn0Curve:
     """Fit the mean C/N0 over elevation, one curve per kind and signal with enough bins.
 
-    `samples`, of an antenna under open sky, is a `Cn0Samples`, or parts with C/N0 (T, M), elevation (T, M), satellite
+    `samples` is a `Cn0Samples` of an antenna under open sky, or an iterable of C/N0 (T, M), elevation (T, M), satellite
     and signal (M,). Raises ValueError if no kind and signal has enough samples.
     """
     fit = fit or CurveFit()

@@ -90,10 +90,11 @@ def _delays(
 
 @lru_cache(maxsize=64)
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
-    """Return a signal's group delay, its standard deviation and whether it is unhealthy, by record, shape (n,) [m].
+    """Return a signal's group delay and its standard deviation [m], and whether the signal is unhealthy, by record
+    (n,).
 
     For GPS, QZSS and BeiDou the clocks of all messages refer to the same signals, so a missing delay is taken from the
-    satellite's record of another message with the nearest reference time.
+    satellite's nearest record of another message.
     """
     records = navigation.kepler
     clock = "ionosphere_free" if navigation.precise is not None else "broadcast"

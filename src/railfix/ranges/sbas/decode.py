@@ -193,7 +193,7 @@ def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
 
 
 def prn_masks(messages: SbasMessages) -> Decoded:
-    """Return the masks of type 1: `iodp` (n,), and `number` (n, 51), the mask number of each slot, 0 for none."""
+    """Return the masks of type 1: `iodp` (n,), and `number` (n, 51), the mask number of each slot, 0 if empty."""
     decoded = decode(messages, 1)
     message, bit = np.nonzero(decoded.pop("member"))
     slot = np.arange(len(message)) - np.searchsorted(message, message)

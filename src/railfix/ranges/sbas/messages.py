@@ -99,7 +99,7 @@ class SbasMessages(RowArrays, NotebookTable):
         return tuple(int(prn) for prn in np.unique(self.prn))
 
     def describe_choice(self, prn: int) -> str:
-        """Return a sentence on a requested PRN; raise ValueError if it has no message."""
+        """Return a sentence on a requested PRN; raise ValueError if the PRN has no message."""
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
@@ -117,7 +117,7 @@ class SbasMessages(RowArrays, NotebookTable):
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
     def merge(self, later: SbasMessages) -> SbasMessages:
-        """Return the messages with later messages, in the order of reception; counts are added, repeated notes dropped."""
+        """Return the messages with later messages, in order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
         both = join_rows([self, later])

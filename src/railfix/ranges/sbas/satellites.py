@@ -231,7 +231,7 @@ def degradation_row(
 def growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, fast: FastInForce, long_row: Integers, stop: Datetimes
 ) -> Growth:
-    """Return the degradation terms of satellites at epochs; times and stops of shape (T, 1)."""
+    """Return the degradation terms of satellites at epochs; `time` and `stop` have shape (T, 1)."""
     row, active = degradation_row(tables, limits, time, stop)
     shape, ten = fast.udrei.shape, tables.degradation
     rate = np.where(

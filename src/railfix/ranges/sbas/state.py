@@ -77,7 +77,7 @@ class SbasState:
 
     @property
     def dual_frequency(self) -> bool:
-        """Whether ionosphere-free codes are corrected, as by SBAS on L5."""
+        """Whether the corrections are for ionosphere-free codes, as with SBAS on L5."""
         return self.band == "L5"
 
     @property

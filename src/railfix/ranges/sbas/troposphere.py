@@ -8,8 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
 
-#: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravity of the air and at the surface
-#: [m/s^2].
+#: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravities [m/s^2].
 _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of table A-2 [deg].
 #: Mean, then seasonal variation, of pressure [mbar], temperature [K], vapour pressure [mbar], temperature lapse rate
@@ -52,8 +51,8 @@ def rtca_troposphere_sigma_m(elevation_deg: Floats) -> Floats:
 def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
     """Return the tropospheric slant delay of RTCA DO-229D (A.4.2.4) by latitude and day of year, shape (T, K) [m].
 
-    The model is for heights above mean sea level; with ellipsoidal heights the delay changes by 1 mm per 3 m. NaN below
-    2 degrees, and outside -100 m to 10 km.
+    The model is for heights above mean sea level; with ellipsoidal heights the delay changes by 1 mm per 3 m. The delay
+    is NaN below 2 degrees, and outside -100 m to 10 km.
     """
     year = time.astype("datetime64[Y]").astype("datetime64[ns]")
     day = (time - year) / np.timedelta64(1, "D") + 1.0
