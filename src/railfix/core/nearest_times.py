@@ -10,9 +10,9 @@ from railfix.core.timescale import SECONDS_PER_DAY, SECONDS_PER_WEEK, from_week,
 
 
 def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
-    """Return the index of the nearest of ascending times to each wanted time; -1 if none is within `within_ns` [ns].
+    """Return the index of the time nearest to each wanted time; -1 if none is within `within_ns` [ns].
 
-    Of two equally near times, the earlier time is returned.
+    `time` is in ascending order. Of two equally near times, the earlier time is returned.
     """
     have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
     if not len(have):

@@ -100,7 +100,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         usable[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k])
         states_of.append(states)
     shared = usable.all(axis=0)
-    # the weights are also the same, as otherwise a common error would move each fix differently
+    # all fixes have the same weights, because otherwise a common error would move each fix differently
     square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])

@@ -56,7 +56,7 @@ async def standard_input() -> AsyncIterator[str]:
     A line longer than `LONGEST_LINE` is cut to its beginning, which is not a valid message.
     """
     kind = os.fstat(sys.stdin.fileno()).st_mode
-    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # the lines of a file need no waiting
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file does not wait
         while data := sys.stdin.buffer.readline(LONGEST_LINE):
             yield data.decode(errors="replace")
         return

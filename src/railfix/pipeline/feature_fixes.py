@@ -171,7 +171,7 @@ def feature_fixes(
     metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
     kept, last, done = int(2.5 * HALF_LENGTH_M), state.last, state.done_m
     breaks = np.flatnonzero(~usable)
-    # stretches of usable ticks, each ended by an unusable one
+    # stretches of usable ticks, each ended by an unusable tick
     edges = np.concatenate([[-1], breaks, [len(usable)]])
     for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         if begin >= 0:

@@ -143,7 +143,7 @@ class FaultRate(Settings):
     #: blocks; 1 without such blocks. The value is used for `side_prior` if it is small enough for a finite protection
     #: level.
     side_upper: float = Field(default=1.0, ge=0, le=1)
-    #: Stretches with more frequent local faults than the line (`faulty_stretches`), chainages from and to.
+    #: Stretches with more frequent local faults than the line (`faulty_stretches`): first and last chainage of each.
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property

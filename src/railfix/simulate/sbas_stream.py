@@ -51,7 +51,7 @@ def correction(
     covariance: tuple[int, Floats] = (5, np.eye(4)),
     dfrei: int = 3,
 ) -> Bytes:
-    """Return a type 32 message, the correction of one satellite.
+    """Return a type 32 message with the correction of one satellite.
 
     `moved` has the corrections of position and clock [m], `rates` their rates [m/s]. `covariance` has the scale
     exponent and the upper triangular factor in units of 2^(exponent - 5).
@@ -68,7 +68,7 @@ def correction(
 
 
 def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm: int = 0) -> Bytes:
-    """Return a type 34 message, changes of the DFREI of the satellites in the mask.
+    """Return a type 34 message with changes of the DFREI of the satellites in the mask.
 
     `change` is, for each satellite, 0 for no change, 1 for the next value of `dfrei`, 2 for an increase by one, and 3
     for "do not use".

@@ -189,7 +189,7 @@ class TrackingSettings(ScenarioSettings):
     """Loss of lock and re-acquisition."""
 
     threshold_dbhz: NotNegative | None = None  #: C/N0 below which a signal is lost; None for no such limit.
-    #: C/N0 from which a signal lost by its C/N0 is trackable again; None for `threshold_dbhz`.
+    #: C/N0 above which a signal that was lost because of its C/N0 is trackable again; None for `threshold_dbhz`.
     reacquisition_dbhz: NotNegative | None = None
     reacquisition_s: NotNegative = 0.0  #: Time for which a lost signal remains absent after it is trackable again.
     #: With "after_loss", the phase changes by a random number of whole cycles at each loss of lock, and bit 0 of the

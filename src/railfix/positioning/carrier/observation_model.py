@@ -91,8 +91,8 @@ class Linearised:
     clock_m: Floats
     phase_clock_m: Floats
     known: Floats  #: Prior information on map errors and inter-system biases, shape (T, P, P).
-    inverse: Floats  #: Inverse of the normal matrix of the own unknowns, shape (T, P, P).
-    #: Right-hand side of the own unknowns; before `shift_phases` from the codes alone; shape (T, P).
+    inverse: Floats  #: Inverse of the normal matrix of each epoch's own unknowns, shape (T, P, P).
+    #: Right-hand side of each epoch's own unknowns; before `shift_phases` from the codes alone; shape (T, P).
     right: Floats
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
     prior: Floats  #: Information of the map's errors, shape (2,) [1/m^2].
@@ -192,8 +192,8 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
     prior of the map error, the right-hand side is ``prior_k C^T L^-1 e_k``.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
-    # The sum of squares of the residuals of the own unknowns is never negative, and errors of the inverse enter
-    # squared; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
+    # The sum of squares of the residuals of an epoch's own unknowns is never negative, and errors of the inverse
+    # are squared in it; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
         (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),

@@ -392,7 +392,7 @@ def _weights(
 def _values(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
-    """Return vertical delay and variance of corners (M, 4), and where type 10 is in force (M,), at epochs `t`."""
+    """Return vertical delay and variance of corners, (M, 4), and a mask of type 10 in force, (M,), at epochs `t`."""
     newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
     of_ten, delays, ten = newest[t], grid.delays, tables.degradation
     variance = _GIVE_VARIANCE[delays["givei"][row]]

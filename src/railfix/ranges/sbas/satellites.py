@@ -105,7 +105,7 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range rate, its degradation per second, the time between its two corrections, and where it is missing.
+    """Return the range rate, its degradation per second, the time between its corrections, and a mask of missing rates.
 
     After an alarm (IODF 3) the earlier correction is the one nearest to half the time-out before the newest.
     """
@@ -196,7 +196,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the covariance in force, and where the GEO sends covariances but none for this satellite."""
+    """Return the row of the covariance in force, and a mask of satellites without one although the GEO sends some."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
@@ -223,7 +223,7 @@ class Growth:
 def degradation_row(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the newest message of type 10 at epochs, and where it is in force."""
+    """Return the newest message of type 10 at epochs, and a mask of the epochs at which it is in force."""
     row = tables.degradation.newest(0, time)
     return row, tables.degradation.in_force(row, time, stop, limits.timeout_s("degradation"))
 
@@ -290,7 +290,7 @@ class ServiceTable:
         self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
-        """Return the factor on sigma UDRE at positions, NaN without type 27, and where a set is incomplete, shape (T,).
+        """Return the factor on sigma UDRE at positions, NaN without type 27, and a mask of incomplete sets, shape (T,).
 
         The newest complete set of one issue is used. Inside several regions the factor of the highest priority applies,
         or the smallest factor of equal priorities; outside all regions the factor of the outside applies.

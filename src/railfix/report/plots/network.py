@@ -126,7 +126,7 @@ def _names_beside(
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
-    """Return indices of every n-th and the last point of each track, and where tracks after the first begin in them."""
+    """Return indices of every n-th and the last point of each track, and the start of each further track in them."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
     place = np.arange(len(track)) - first[track]

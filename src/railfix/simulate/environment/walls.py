@@ -141,7 +141,7 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
 
 
 def roof_amplitude(row: Strips, rays: Rays) -> Floats:
-    """Return the amplitude of signals behind the level roofs of a row, relative to that without roofs, shape (N,)."""
+    """Return the ratio of the amplitudes of signals with and without the level roofs of a row, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     least = np.maximum(rays.z, 0.02)
     # Roofs of a row mostly have the same height, so the roof overhead is a good first approximation.
