@@ -132,7 +132,7 @@ def test_semidynamic_files_that_cannot_be_used_are_one_sentence(tmp_path: Path) 
     with pytest.raises(SettingsError, match="are for JGD2011"):
         track_at(europe, time, parameters=path)
     (tmp_path / "text.par").write_text("no parameters\n" * 20)
-    with pytest.raises(InputFileError, match="no parameter file of semi-dynamic correction"):
+    with pytest.raises(InputFileError, match="not a parameter file of semi-dynamic correction"):
         track_at(tokyo, time, parameters=tmp_path / "text.par")
 
 
