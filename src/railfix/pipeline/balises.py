@@ -134,7 +134,7 @@ class PassingState:
     since: Datetimes
     over: Datetimes
     over_values: Floats  #: `_VALUES` at the time `over`, and odometer accuracy; shape (M, 6).
-    read: Datetimes  #: Last reading, shape (M,).
+    read: Datetimes  #: Time of the last reading, shape (M,).
     #: Readings after the last epoch, which the next chunk compares.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
     #: Times of correct readings with the filter's positions [m], from the last reading older than `_APART_S` on.

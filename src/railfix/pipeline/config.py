@@ -118,7 +118,7 @@ class Config(ScreenSettings):
     #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. Settings that P1 does not
     #: specify (weights, noise, inter-system biases, ambiguous sections) are as in "default".
     preset: Literal["default", "strict", "p1"] = "default"
-    #: Constellations used. GLONASS is left out by default, because code biases between its channels are metres.
+    #: Constellations used. GLONASS is left out by default, because code biases between its channels reach metres.
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     #: Satellites ("G07") and constellations ("C") left out.
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
@@ -144,8 +144,8 @@ class Config(ScreenSettings):
     #: Probability that noise alone moves a position off the map; the noise is estimated from the residuals of the 3-D
     #: fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
-    #: Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
-    #: which-track` uses the same limit.
+    #: Probability of another track above which positions on a network are neither `ok` nor `tracking`, and have no
+    #: level. `railfix which-track` uses the same limit.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the ionospheric delay.
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.

@@ -58,7 +58,7 @@ class SingleEpochs:
 class FilterState(NotebookTable):
     """Filter state of one antenna after a chunk."""
 
-    slips: CycleSlipState | None = None  #: State of the carrier phases.
+    slips: CycleSlipState | None = None  #: State of the cycle-slip detection.
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)  #: State of the filter that computes the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
@@ -147,8 +147,8 @@ class Replay:
 class SmoothedTrack(NotebookTable):
     """Positions of T epochs, each from all measurements before and after it."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time tags, shape (T,).
     #: Arc length and its standard deviation, shape (T,).
     arc_m: Floats
     sigma_m: Floats
-    speed_mps: Floats  #: Shape (T,).
+    speed_mps: Floats  #: Speed along the line, shape (T,).

@@ -20,7 +20,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Minimum range rate of a satellite, relative to its constellation's median, for a factor [m/s].
+#: Minimum difference of a satellite's range rate from its constellation's median, for a factor [m/s].
 _LEAST_RATE_MPS: Final = 100.0
 #: Minimum number of satellites for a factor; number of satellites from which on one may deviate; and largest deviation
 #: of a satellite's factor from the median. With four satellites, one cycle slip moves the median rate, and thereby the

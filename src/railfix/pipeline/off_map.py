@@ -27,7 +27,7 @@ class OffMapState:
     off: bool = False  #: True if the train was off the map at the last epoch.
     known: bool = False  #: True once a position has been tested; the first position decides alone.
     #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
-    #: it.
+    #: `off`.
     since: np.datetime64 = _NEVER
     back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of offsets since then.
     #: Decayed sum and number of offsets while the train is away, and time of the last offset.

@@ -48,13 +48,13 @@ def gated_codes(
 ) -> tuple[Masks, ReturnState]:
     """Return the epochs whose codes are not yet used, shape (T,), and the state for the next chunk.
 
-    After an outage single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
+    After an outage, single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
     again with the third consecutive position within `SensorLimits.return_sigmas` of the combined standard deviation,
     and after `SensorLimits.return_s` in any case. Without a sensor distance no code is rejected.
 
-    Arguments of shape (T,): `observed`, epochs with codes; `distance_m`, sensor distance since the previous epoch;
-    `place_m` and `sigma_m`, single-epoch positions; NaN where missing. `state` has the filter's position at the epoch
-    before the first.
+    `observed` marks epochs with codes, `distance_m` is the sensor distance since the previous epoch, `place_m` and
+    `sigma_m` are single-epoch positions; shape (T,) each, NaN where missing. `state` has the filter's position at the
+    epoch before the first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     distances = state.distance_m + np.cumsum(distance_m)

@@ -42,10 +42,10 @@ class Solution(NotebookTable):
     conventional_status: Codes
     fix: LineFix  #: Positions from codes after exclusions.
     ties: InterSystemBiases  #: Inter-system biases known before each epoch, by `Channels.clocks`.
-    raim: RaimResult  #: Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
+    raim: RaimResult  #: Result of RAIM; `outcome` is UNTESTABLE at all epochs if the screen is off.
     status: Codes  #: `reasons.Status`, shape (T,).
-    #: Ratio of the receiver's range standard deviation to the one assumed by the weights: root mean square of the
-    #: residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
+    #: Ratio of the receiver's range standard deviation to the standard deviation assumed by the weights: root mean
+    #: square of the residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
     #: receiver's noise and the noise by the epoch's residuals, widened by Student's t where few ranges are redundant.

@@ -75,12 +75,12 @@ _TEXTS: Final = {
 class Located:
     """3-D positions of one antenna, T epochs."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time tags, shape (T,).
     ecef_m: Floats  #: NaN without a position, shape (T, 3).
     #: Standard deviations north, east and up, from the range sigmas including atmosphere and orbits, scaled up by large
     #: residuals; shape (T, 3).
     sigma_m: Floats
-    n_used: Integers  #: Shape (T,).
+    n_used: Integers  #: Number of satellites used, shape (T,).
     no_position: Codes  #: `NoPosition` of each epoch, shape (T,).
 
 

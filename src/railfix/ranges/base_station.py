@@ -43,7 +43,7 @@ class BaseErrors:
     """Range errors of a base station by channel, B epochs by S channels."""
 
     ecef_m: Floats  #: Position of the station, shape (3,).
-    time: Datetimes  #: Shape (B,).
+    time: Datetimes  #: Time tags of the station, shape (B,).
     #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings

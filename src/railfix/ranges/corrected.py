@@ -27,7 +27,7 @@ ORBITS_M: Final = (2e7, 6e7)
 class AntennaRanges(NotebookTable):
     """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time tags, shape (T,).
     break_before: Masks  #: Epochs that must not be differenced with the previous epoch, shape (T,).
     #: Properties of each channel, shape (K,).
     satellite: Strings
@@ -54,7 +54,7 @@ class SecondCodes:
 
     code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
     noise_m: Floats  #: Standard deviation of noise and multipath assumed by the weights, shape (T, K).
-    cn0_dbhz: Floats  #: Shape (T, K).
+    cn0_dbhz: Floats  #: Carrier-to-noise density, shape (T, K).
     group_delay_m: Floats  #: Group delay subtracted from the code, shape (T, K).
     #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
     #: shape (T, K).

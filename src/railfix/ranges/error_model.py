@@ -91,7 +91,7 @@ class ErrorBins(Settings):
 class BinStatistics:
     """Statistics of every bin, shape (E, A, C); NaN where the pooled samples are fewer than three."""
 
-    count: Integers  #: Number of samples of the bin itself.
+    count: Integers  #: Number of samples in the bin.
     blocks: Integers  #: Number of blocks of time and satellite in the bin; samples of one block are correlated.
     #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats

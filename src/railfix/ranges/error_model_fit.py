@@ -64,7 +64,7 @@ class ErrorModelFit(Settings):
 class ErrorSamples:
     """Errors of single pseudoranges, n samples."""
 
-    error_m: Floats  #: Shape (n,).
+    error_m: Floats  #: Error of the pseudorange, shape (n,).
     #: Direction of the satellite, with the azimuth from the car's front, and C/N0; shape (n,).
     elevation_deg: Floats
     relative_azimuth_deg: Floats

@@ -50,7 +50,7 @@ _USUAL_ACCURACY_M: Final = 5.0
 
 
 class NominalErrors(Settings):
-    """Assumed standard deviations of the errors that a local error model does not cover, where SBAS gives none.
+    """Assumed standard deviations of errors that a local error model does not cover, for ranges without SBAS.
 
     ``sigma^2 = satellite^2 + max(ionosphere F(el), share I)^2 + (troposphere m(el))^2`` with the mappings of DO-229D
     (A.4.4.10.4 and A.4.2.4) and the modelled slant delay I.

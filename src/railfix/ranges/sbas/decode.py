@@ -26,7 +26,7 @@ _UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
-    """One number of a message, or `number` numbers whose first bits are `step` (default `length`) apart."""
+    """Number in a message, or `number` numbers whose first bits are `step` bits apart (default `length`)."""
 
     first: int
     length: int

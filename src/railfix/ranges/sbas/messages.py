@@ -73,7 +73,7 @@ class SbasMessages(RowArrays, NotebookTable):
 
     #: GPS time at which the message was completely received, from which it is used; shape (N,).
     time: Datetimes
-    prn: Integers  #: Shape (N,).
+    prn: Integers  #: PRN of the GEO, shape (N,).
     type: Integers  #: Message type, 0 to 63, shape (N,).
     #: Message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains it,
     #: then zeros; shape (N, 32).

@@ -75,8 +75,8 @@ SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 NOT_MONITORED: Final = 14
 DO_NOT_USE: Final = 15
 STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for this time [s] (DO-229D, A.4.4.1).
-#: Messages older than this are not used, even if type 6 renews a fast correction: the longest time-out, without service
-#: regions [s].
+#: Age above which messages are not used, even if type 6 renews a fast correction: the longest time-out, except for
+#: service messages [s].
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
 #: Types that affect messages received later (stops and masks), and are therefore kept for twice `OLDEST_S`.
 LEANT_ON: Final = (0, 1, 18)
@@ -102,7 +102,7 @@ class SatelliteState(IntEnum):
 
 
 class IonosphereState(IntEnum):
-    """State of the delay at a pierce point: known, or the reason why it is not."""
+    """State of the delay at a pierce point: known, or the reason why the delay is unknown."""
 
     OK = 0
     GEO_STOPPED = 1
@@ -130,12 +130,12 @@ class SatelliteCorrections(FrozenArrays):
     state: Integers  #: `SatelliteState`, shape (T, K).
     fast_m: Floats  #: Correction to be added to the code, including its range-rate part; shape (T, K).
     rate_mps: Floats  #: Range-rate correction, shape (T, K).
-    position_m: Floats  #: Shape (T, K, 3).
-    clock_s: Floats  #: Shape (T, K).
+    position_m: Floats  #: Correction of the satellite position, shape (T, K, 3).
+    clock_s: Floats  #: Correction of the satellite clock, shape (T, K).
     iode: Integers  #: Issue of data of the long-term correction used, -1 if none is used; shape (T, K).
     record: Integers  #: Row of `navigation.kepler` with that issue, -1 without navigation data; shape (T, K).
-    udrei: Integers  #: -1 where none was received, shape (T, K).
-    sigma_udre_m: Floats  #: Shape (T, K).
+    udrei: Integers  #: UDREI, -1 where none was received; shape (T, K).
+    sigma_udre_m: Floats  #: Sigma UDRE, shape (T, K).
     #: Degradation terms (DO-229D, A.4.5.1); 0 where `inflated`; shape (T, K).
     fast_growth_m: Floats
     rate_growth_m: Floats

@@ -44,9 +44,9 @@ class Series:
     up to the millisecond, and instants down, so that no row is used before it was received.
     """
 
-    series: Integers  #: Shape (n,).
-    time: Datetimes  #: Shape (n,).
-    columns: Mapping[str, NDArray[Any]]  #: Shape (n, ...).
+    series: Integers  #: Number of the series, shape (n,).
+    time: Datetimes  #: Time of reception, shape (n,).
+    columns: Mapping[str, NDArray[Any]]  #: Decoded values by name, shape (n, ...).
     key: Integers  #: Series and time in one number, in ascending order; shape (n,).
 
     @classmethod
