@@ -104,8 +104,7 @@ def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordi
     line = {"front": straight_line(log.header.approximate_ecef_m, 45.0)}
     first = EpochProcessor(config, line, navigation=navigation, corrections=SbasState.from_log(messages, prn=137))
     whole, _ = first.process({"front": log})
-    live, state, statuses, taken = make_processor(config, navigation, line), None, [], 0
-    reasons = []
+    live, state, statuses, reasons, taken = make_processor(config, navigation, line), None, [], [], 0
     for first in range(0, len(log), 60):
         piece = log[first : first + 60]
         until = int(np.searchsorted(messages.time, piece.time[-1], side="right"))

@@ -178,9 +178,10 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(recordi
     assert np.nanmin(one.sigma_m[one.reason == 0]) > 1.0
 
 
-def test_a_geo_that_the_log_does_not_have_is_refused(recording: Recording) -> None:
-    with pytest.raises(SettingsError, match="sbas_prn = 120"):
-        make_processor(recording.config(sbas_prn=120), recording.navigation, {"front": recording.line})
+@pytest.mark.parametrize(("prn", "words"), [(120, "sbas_prn = 120"), (999, "sbas_prn: a PRN of SBAS .* was expected")])
+def test_a_geo_that_the_log_does_not_have_is_refused(recording: Recording, prn: int, words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        make_processor(recording.config(sbas_prn=prn), recording.navigation, {"front": recording.line})
 
 
 def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording, tmp_path: Path) -> None:

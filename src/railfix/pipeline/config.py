@@ -251,6 +251,13 @@ class Config(ScreenSettings):
             raise ValueError("give each measurement once, code among them: the filter starts from codes")
         return tuple(name for name in FILTER_SOURCES if name in value)
 
+    @field_validator("sbas_prn")
+    @classmethod
+    def _check_geo(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and not (120 <= value <= 158 or 183 <= value <= 202):
+            raise ValueError("a PRN of SBAS (120 to 158), of QZSS (183 to 202) or 'best' was expected")
+        return value
+
     @model_validator(mode="after")
     def _codes_with_l5(self) -> Self:
         if self.dual_frequency_sbas and self.carrier in ("float", "fixed"):
