@@ -65,7 +65,7 @@ plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainag
 
 
 # %%
-# **Antenna spacing.** The distance between the two positions along the line must be equal to the spacing of the antennas.
+# **Antenna spacing.** The distance between the two positions along the line must equal the spacing of the antennas.
 # The **C/N0** screen needs the open-sky curve of antenna and receiver (``railfix cn0-curve``); it is not run here.
 #
 # Rejected observations

@@ -607,7 +607,7 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
         (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B, C)"),
         (("listen", "lisen"), "unknown setting lisen"),
         ((":", ";"), "HOST:PORT was expected"),
-        (('keys = "keys"', 'keys = "none"'), "railfix ground keys writes it"),
+        (('keys = "keys"', 'keys = "none"'), "create it by railfix ground keys"),
     ],
 )
 def test_a_wrong_file_of_a_centre_is_one_sentence(

@@ -325,7 +325,7 @@ def test_bends_between_two_points_are_kept() -> None:
     ("options", "said"),
     [
         ({"quality": (4,)}, "has quality 4; the log has 1 of quality 1"),
-        ({"max_sigma_m": 0.001}, "left, a track needs two"),
+        ({"max_sigma_m": 0.001}, "left, but a track needs two"),
     ],
 )
 def test_a_log_without_enough_good_positions(tmp_path: Path, options: dict[str, object], said: str) -> None:

@@ -321,7 +321,7 @@ def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:
     words = ["live", "--front", str(demo_files()["front"]), "--track", str(demo_files()["track"])]
     done = RUNNER.invoke(app, [*words, "--send", "etcs@-", "--live", "reference_m=400000"])
     assert done.exit_code == 4
-    assert "one that is nearer to the line" in " ".join(done.output.split())
+    assert "give a location nearer to the line" in " ".join(done.output.split())
     with pytest.raises(SettingsError, match="FORM@TARGET"):
         asyncio.run(open_sink(f"packet0@{tmp_path}/x"))
 

@@ -20,6 +20,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
 from railfix.ranges.base_station import BaseErrors
+from railfix.ranges.sbas import SbasState
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory
 
@@ -160,20 +161,16 @@ def test_integers_without_a_base_station_and_two_kinds_of_corrections_are_refuse
         EpochProcessor(parse_config({"carrier": "fixed"}), {"front": line_trajectory})
     with pytest.raises(SettingsError, match="give one of the two"):
         EpochProcessor(
-            parse_config({"sbas": "stream", "sbas_prn": 137}),
-            {"front": line_trajectory},
-            stations=Stations(base_ecef_m=PLACE),
-        )
+            parse_config({"sbas": "stream", "sbas_prn": 137}), {"front": line_trajectory},
+            corrections=SbasState(prn=137), stations=Stations(base_ecef_m=PLACE),
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("base", "settings", "words"),
-    [
-        (True, {}, "a base station corrects a single frequency"),
-        (False, {"signals": {"G": ["5Q"]}}, "no satellite has a second code"),
-        (False, {}, ""),
-    ],
-)
+    [(True, {}, "a base station corrects a single frequency"), (False, {}, ""),
+     (False, {"signals": {"G": ["5Q"]}}, "no satellite has a second code")],
+)  # fmt: skip
 def test_one_frequency_in_place_of_two_is_told(drive: Drive, base: bool, settings: dict[str, Any], words: str) -> None:
     config = parse_config({"filter": "off", "protection": "off", "frequencies": "two", "systems": ["G"], **settings})
     stations = Stations(base_ecef_m=PLACE if base else None)

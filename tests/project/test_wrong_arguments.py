@@ -63,7 +63,7 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
             lambda m, name=name: railfix.EpochProcessor(m["config"], {"front": m["path"]}, **{name: "file"}),
             f"{name}: expected .*, got str",
         )
-        for name in ("navigation", "messages", "track", "models", "stations")
+        for name in ("navigation", "models", "stations")
     },
     "name of a screen": (
         lambda m: railfix.EpochProcessor(m["config"], {"front": m["path"]}, screens=["cn0"]), "screens: expected Screen"
@@ -82,7 +82,7 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
             lambda m, name=name: m["processor"].process({"front": m["log"]}, **{name: "file"}),
             f"{name}: expected .*, got str",
         )
-        for name in ("navigation", "messages", "sensors", "base")
+        for name in ("navigation", "sensors", "base")
     },
     "vehicle before track": (lambda m: railfix.antenna_trajectory(m["vehicle"], m["track"]), "expected Track, got Veh"),
     "no vehicle": (lambda m: railfix.antenna_trajectory(m["track"], None), "got NoneType; read_vehicle returns one"),

@@ -86,7 +86,7 @@ class _Option:
 def from_models(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command in which each parameter that is a `Settings` model is replaced by one option per field.
 
-    Fields that are not declared by `railfix.core.settings.option`, and fields named by `Without`, have no option.
+    Fields that are not declared by `railfix.core.options.option`, and fields named by `Without`, have no option.
     Fields that are models are replaced in turn. An option that two models share sets the field in both models.
     """
     hints = get_type_hints(command, include_extras=True)

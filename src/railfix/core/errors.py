@@ -11,9 +11,9 @@ code meaning
 2    the command line was misused (unknown option, missing argument)
 3    an input file is missing, unreadable, or malformed
 4    a setting is misspelt, out of range, or contradicts another
-5    the inputs are readable but do not match each other (another day, another location)
+5    the inputs are readable but do not match each other, for example in day or location
 6    the track map was checked and has errors
-7    there is no position: none in the results, or no usable position in the inputs
+7    the results contain no position, or the inputs no usable position
 8    the output cannot be written
 9    two channels of a live session computed different outputs from the same input
 ==== =====================================================================

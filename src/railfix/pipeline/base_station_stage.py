@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -44,7 +43,7 @@ class Stations(NamedTuple):
     units: GroundUnits | None = None
     base_ecef_m: Floats | Literal["stream"] | None = None
     balises: ListedBalises | None = None
-    features: Mapping[str, FeatureSearch] = MappingProxyType({})
+    features: Mapping[str, FeatureSearch] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -165,7 +165,7 @@ class EpochProcessor:
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
             cn0_curve=models.cn0_curve,
         )
-        self.units, self.balises, self._features = stations.units, stations.balises, stations.features
+        self.units, self.balises, self._features = stations.units, stations.balises, stations.features or {}
         self._unasked: list[str] = []
         self._lacking = self._inactive_notes()
 

@@ -29,7 +29,7 @@ DEFAULT_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 #: Second signals in order of preference. L2 comes before L5 for GPS and QZSS: LNAV lacks the delay of L5
-#: (`railfix.gnss.orbits.prepared_records.group_delay_sigma_m`).
+#: (`railfix.ranges.second_codes.group_delay_sigma_m`).
 SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "G": ("2L", "2X", "2S", "2W", "5Q", "5X", "5I"),
     "J": ("2L", "2X", "2S", "5Q", "5X", "5I"),

@@ -14,6 +14,7 @@ from .antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
 from .base import (
     AntennaRanges,
     ObservationScreen,
+    OpenSkyCn0,
     RunTables,
     Screen,
     ScreenColumn,
@@ -51,6 +52,7 @@ __all__ = [
     "ElevationLimits",
     "FilteredMotion",
     "ObservationScreen",
+    "OpenSkyCn0",
     "PairScreen",
     "PairedEpochs",
     "PositionScreen",
