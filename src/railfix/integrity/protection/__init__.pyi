@@ -1,6 +1,6 @@
 # The names of `railfix.integrity.protection`, imported at their first use (lazy-loader).
 
-from .availability import availability
+from .alarm_limit import availability
 from .risk import MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
 from .solution_separation import Cause, LevelStatus, ProtectionLevel, protection_level
 
