@@ -223,7 +223,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("grid.csv", csv(GRID, crs="EPSG:25832"), "refused", "degrees were expected, not metres of a grid"),
     Odd("frame_in_grads.csv", csv(crs="EPSG:4807"), "refused", "in grads, but the columns are in degrees"),
     Odd("longitude_of_371.csv", csv(LINE - [-360.0, 0.0, 0.0]), "refused", "longitude_deg 371 is over 360"),
-    Odd("four_decimals.csv", csv(pattern="{1:.4f},{0:.4f},{2:.1f}"), "found", "five decimals or fewer"),
+    Odd("four_decimals.csv", csv(pattern="{1:.4f},{0:.4f},{2:.1f}"), "found", "at most five decimals"),
     Odd("heights_missing.csv", csv(LINE * [1, 1, 0] - [0, 0, 9999]), "found", "-9,999 m is impossible"),
     Odd("height_of_zero.csv", csv(np.where(np.arange(N)[:, None] == 9, [1, 1, 0], 1) * LINE), "found", "the height"),
     Odd("heights_in_millimetres.csv", csv(LINE * [1, 1, 1000]), "found", "it is in millimetres"),

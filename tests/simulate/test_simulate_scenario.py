@@ -171,7 +171,7 @@ def test_paths_are_relative_to_the_file_that_names_them(tmp_path: Path) -> None:
         ('[[runs]]\nname = "../a"', "unique name"),
         ('seed = 3\n[[runs]]\nname = "a"', "unknown key seed in a recipe"),
         ('base = "p1-commercial"\n[[runs]]\nname = "a"', "recipe itself"),
-        ('[[runs]]\nname = "a"\nparts = ["x"]', "parts has no table 'x'"),
+        ('[[runs]]\nname = "a"\nparts = ["x"]', "has no table 'x'; its tables are"),
         ('[[runs]]\nname = "a"\nsede = 3', "run a: unknown setting sede"),
     ],
 )

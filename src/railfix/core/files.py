@@ -168,7 +168,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
         if content == "text" and head.startswith(_UTF16):
             source = _as_utf8(path, source, held)
         elif content == "text" and b"\0" in head.rstrip(b"\0"):  # zeros at the end are left by a power failure
-            raise InputFileError(path, "is binary, a text file was expected")
+            raise InputFileError(path, "is binary; a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
         if content == "text" and head.startswith(codecs.BOM_UTF8):
@@ -337,7 +337,7 @@ def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> Byte
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
         spool.flush()
         source = spool
-    # the decoder inherits the file descriptor, whose position `source.seek` does not move within its buffer
+    # the decoder inherits the file descriptor, whose position a `source.seek` within the buffer does not move
     os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
     program = held.enter_context(hatanaka_program("crx2rnx"))

@@ -31,7 +31,7 @@ class BrakeLimits(Settings):
     cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most `build_up_s`.
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
-    reaction_s: float = Field(default=3.0, ge=0)  #: Driver's time from the permitted speed to the intervention.
+    reaction_s: float = Field(default=3.0, ge=0)  #: Driver's time between the permitted-speed and intervention curves.
     over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restriction at which the intervention begins.
 
 

@@ -152,7 +152,7 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return the frame if it is to be answered, and the frame if it is to be used; None in place of each otherwise.
+        """Return the frame to answer and the frame to use; either is None if there is no such frame.
 
         A second copy of a frame is answered but not used, so that both links are measured.
         """

@@ -23,8 +23,8 @@ from railfix.track.network import Network
 PointName = tuple[int, int]
 #: Largest number of gradients, and of speed restrictions, in one authority.
 MOST_PARTS: Final = 16
-#: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single line with the points,
-#: 2 k + t is track t of station k.
+#: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single track with the sets of points;
+#: lane 2 k + t is track t of station k.
 Piece = tuple[int, float, float]
 
 

@@ -114,7 +114,7 @@ class Supervision:
         sent_s, first = self.ordered.get(number, (0.0, 0))
         if number in self.ordered and is_obeyed(message, first):
             self.ordered[number] = math.inf, first
-        elif sent_s == math.inf:  # a later start on board has ended the order on board
+        elif sent_s == math.inf:  # the on-board unit has restarted and no longer obeys the order
             self.ordered[number] = -math.inf, first
         elif held is not None and held not in self.issued.get(number, ()):
             reason = "the train obeys an order to brake from before this start"

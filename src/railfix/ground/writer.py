@@ -1,4 +1,4 @@
-"""Sequential commits to the store in a thread, so that a hanging database delays only uncommitted messages."""
+"""Sequential commits to the database in a thread: a slow database delays only messages whose commit is pending."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """Yield the bytes of an NTRIP caster's mount point, by version 2, or by version 1 if the caster answers with it.
+    """Yield the bytes of an NTRIP caster's mount point, by NTRIP 2, or by NTRIP 1 if the caster answers in version 1.
 
     With `LiveSettings.gga_s` the train's position is sent for a virtual station: in the request if the position is
     known (NTRIP 2), and later as lines.

@@ -339,7 +339,7 @@ def gnss_epochs(
     `_WEIGHED_BY_FILTER`. Its standard deviation is the range sigma times `noise_scale`, shape (T,).
 
     Carrier phases are corrected for satellite clock and troposphere. Dopplers are not; the clock drift and tropospheric
-    rate are below 5 mm/s above 10 degrees of elevation.
+    rate are some millimetres per second each.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state

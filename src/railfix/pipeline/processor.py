@@ -87,7 +87,7 @@ class EpochProcessor:
     stations : Stations, optional
     screens : sequence of Screen, optional
         User-defined screens, used with their limits in addition to the screens of `config`. Their verdicts are in
-        `AntennaResult.screens`; only screens of installed packages have columns in the tables.
+        `AntennaResult.screens`; the tables have columns for built-in screens and screens of installed packages only.
 
     Attributes
     ----------

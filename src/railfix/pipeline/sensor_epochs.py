@@ -244,7 +244,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     """Return the noise of gradient and curvature over one metre, map errors included.
 
     A lateral map error sigma over a length L causes curvature errors of ``sqrt(3) sigma / L^2``, correlated over about
-    L. As white noise over one metre, these errors are multiplied by ``sqrt(L)``. The gradient error is ``sigma / L``.
+    L; expressed as white noise over one metre, they are larger by ``sqrt(L)``. The gradient error is ``sigma / L``.
     """
     gradient = trajectory.sigma_height_m / np.sqrt(_MAP_LENGTH_M)
     curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / _MAP_LENGTH_M**1.5

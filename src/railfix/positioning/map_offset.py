@@ -62,7 +62,7 @@ class MapOffsetLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetState:
-    """State after the last epoch: exponentially decayed sums over its window."""
+    """State after the last epoch: sums with exponential forgetting (`MapOffsetLimits.window_s`)."""
 
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))

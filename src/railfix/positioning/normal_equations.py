@@ -31,7 +31,7 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class NormalEquations:
-    """Fit of ranges at a position, with the clocks eliminated."""
+    """Normal equations of a position from ranges, with the receiver clocks eliminated."""
 
     matrix: Floats  #: Normal matrix of the position in ECEF, shape (T, 3, 3) [1/m^2].
     vector: Floats  #: Right-hand side; the least-squares step is ``matrix^-1 vector``; shape (T, 3) [1/m].

@@ -7,8 +7,8 @@ The difference of the two corrected codes of a satellite does not depend on the 
 where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
 receiver. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as prior) and a
 residual of each satellite. I and B are estimated from the mean differences of all satellites by best linear prediction.
-The range is then the least-squares estimate from both codes less the predicted ionosphere, where the remaining
-ionospheric error affects the two codes differently.
+The range is then estimated by least squares from both codes, corrected for the predicted ionospheric delay. The weights
+account for the remaining ionospheric error, which affects the two codes differently.
 """
 
 from __future__ import annotations

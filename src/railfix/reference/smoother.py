@@ -209,7 +209,7 @@ _FIX, _DOPPLER, _WHEEL, _ACCELERATION = range(4)
 def _measurements(
     states: _States, evidence: Evidence, dt: Floats, origin_m: float, settings: ReferenceSettings
 ) -> tuple[Floats, Floats, Floats]:
-    """Return values (N, 4), NaN where missing, their variances (N, 4) and design (N, 4, n).
+    """Return the measurements (N, 4), NaN where missing; their variances (N, 4); and the design matrices (N, 4, n).
 
     Fix = position. Doppler speed = speed + error. Wheel distance = position + difference. Mean acceleration over a step
     times its duration = increase of speed + offset times the duration.

@@ -91,7 +91,8 @@ def list_scenarios() -> dict[str, Path]:
 def find_scenario(name: FilePath) -> Path:
     """Return the path of a scenario file, given by its path or as the name of a shipped scenario.
 
-    Raise InputFileError if the name is neither.
+    Raise InputFileError if the name has no suffix and is neither an existing file nor a shipped scenario. A missing
+    file with a suffix is reported when it is read.
     """
     shipped, path = list_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
@@ -147,7 +148,7 @@ def _run_table(
     """Return the settings of a run: the base, overridden by the parts that the run names, then by its own settings."""
     for name in run.get("parts", []):
         if not isinstance(parts.get(name), dict):
-            raise SettingsError(f"{path}: parts has no table {name!r}; it has {', '.join(parts) or 'none'}")
+            raise SettingsError(f"{path}: [parts] has no table {name!r}; its tables are {', '.join(parts) or 'none'}")
         base = _over(base, _absolute(parts[name], path))
     return _over(base, _absolute({key: run[key] for key in run if key not in ("name", "parts")}, path))
 

@@ -120,7 +120,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),
     "rounded": (
         "warning",
-        "latitude and longitude have five decimals or fewer, so that points are up to 0.6 m off; seven were expected",
+        "latitude and longitude have at most five decimals: points are off by 0.6 m or more; seven were expected",
     ),
     "gap": (
         "error",

@@ -76,7 +76,7 @@ class TrackingLimits(Settings):
     #: Largest acceleration between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes). The
     #: value also limits the next speed after an epoch whose speed was not accepted.
     level_acceleration_mps2: float = Field(default=3.0, ge=0)
-    #: Probability per hour that the error exceeds the level without warning. P1 2.4 has 1e-7 for satellites.
+    #: Probability per hour that the error exceeds the level without warning. P1 2.4 requires 1e-7.
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Number of independent errors per hour. Code errors last about a minute.
     level_samples_per_hour: float = Field(default=60.0, gt=0)

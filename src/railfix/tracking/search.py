@@ -28,7 +28,7 @@ _WORSE: Final = 25.0
 _ANY_SPEED_MPS: Final = 50.0
 _ANY_DRIFT_MPS: Final = 1e3
 _FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement over the interval before the first epoch [m].
-#: Prior standard deviations of wheel scale (diameter), accelerometer offset with mounting, and radar scale (angle).
+#: Prior standard deviations of the scale errors of wheel and radar, and of the accelerometer offset with its mounting.
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02

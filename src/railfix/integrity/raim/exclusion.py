@@ -147,7 +147,7 @@ def _chi_square_table(false_alarm: float, size: int) -> Floats:
 
 
 _ROUNDING: Final = 1e-9  #: Relative difference within which two WSSE count as equal.
-#: Number of elements of a block's array of subsets, which fits approximately into the cache of a core.
+#: Number of elements of the largest array for a block of epochs, so that it fits into the cache of a core.
 _BLOCK_SIZE: Final = 40_000
 
 

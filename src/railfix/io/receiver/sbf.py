@@ -3,7 +3,8 @@
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
 (GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
 GEORawL5, BDSRawB2a), 4.2.8 (PVTGeodetic, PVTCartesian); PolaRx5TR reference guide 5.5.0, page 326 (BDSRawB1C).
-The 72, 1200 and 528 symbols of B-CNAV1 are its three subframes, each with its data bits before the correction bits.
+The 1800 symbols of B-CNAV1 are its three subframes of 72, 1200 and 528 symbols. In each code word the data bits precede
+the parity bits; subframe 1 has two code words, of 21 and 51 symbols.
 """
 
 from __future__ import annotations
@@ -109,8 +110,8 @@ _FRAME: Final = np.dtype(
 _PVT: Final = np.dtype(
     [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
 )
-#: RTKLIB's quality by mode of a PVT block: 1 stand-alone, 2 differential, 3 fixed position, 4 RTK fixed, 5 RTK float,
-#: 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
+#: RTKLIB's quality of each mode of a PVT block. The modes are 1 stand-alone, 2 differential, 3 fixed position, 4 RTK
+#: fixed, 5 RTK float, 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF

@@ -30,7 +30,7 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
-#: Least common change of the codes for which the interval is corrected [m]; smaller changes are noise.
+#: Smallest change common to all codes that is a step of the receiver clock [m], by which the interval is corrected.
 _CLOCK_STEP_M: Final = 1e4
 _COMMON: Final = 3  #: Fewest channels whose median represents the receiver clock.
 

@@ -212,7 +212,7 @@ def read_sbas(
         RXM-SFRBX of SBAS, SBF with GEORawL1 or GEORawL5), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is not a message raises an error, or is counted under "line" in `rejected` and named in `notes`. A
-        message with a wrong parity or preamble is damaged; it is left out and counted in both cases.
+        message with a wrong parity or preamble is left out and counted with either value.
 
     band : {"L1", "L5"}
         Frequency of the messages; messages of other bands have different preambles and are left out.

@@ -219,7 +219,7 @@ def _square_weights(x: Floats, y: Floats) -> Floats:
 
 
 def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], tuple[Floats, ...]]]:
-    """Yield functions for the south-west corners and sizes of cells in the order of trial (A.4.4.10.2)."""
+    """Yield, in the order of A.4.4.10.2, functions that return south-west corners and sizes of the cells to try."""
 
     def small(at: Indices) -> tuple[Floats, ...]:
         lat, lon = latitude[at], longitude[at]

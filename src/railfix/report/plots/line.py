@@ -116,7 +116,7 @@ def _filter_points(
     if len(alone):
         place = frame.plane(points(alone, *ECEF))
         kept = one_per_cell(place[:, 0], place[:, 1], cell=cell)
-        label = f"filter position of epochs without a single-epoch position ({len(alone):,})"
+        label = f"filter positions at epochs without a single-epoch position ({len(alone):,})"
         epoch = since(alone, start)[kept]
         yield Points(label=label, colour=FILTERED, x=place[kept, 0], y=place[kept, 1], size=4.0, epoch_s=epoch)
 

@@ -351,7 +351,7 @@ def without_other_track(
 
 @dataclass(frozen=True, kw_only=True)
 class Ties:
-    """Connections of m positions interpolated in runs to points of the line."""
+    """Assignment of m interpolated positions of runs to points of the line."""
 
     run: Indices  #: Index of the run, shape (m,).
     row: Indices  #: Rows of the run between which the position is interpolated, shape (m, 4).
