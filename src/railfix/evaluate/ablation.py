@@ -65,9 +65,8 @@ class Effect:
     rate: float  #: Fraction of the epochs that have coordinates.
     ok_rate: float  #: Fraction of the epochs with status ok; for the filter, with status tracking.
     n_used: float  #: Mean number of satellites used.
-    sigma_p50_m: (
-        float  #: Median standard deviation along the line of the epochs with coordinates; NaN if there are none.
-    )
+    #: Median standard deviation along the line of the epochs with coordinates; NaN if there are none.
+    sigma_p50_m: float
     coordinates: Score | None = None  #: Errors of all positions; None without a reference.
     ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
     #: Errors of the conventional positions from the same ranges; None without a reference.

@@ -288,9 +288,8 @@ STEADY_EPOCHS: Final = 5
 class Lag:
     """Delay of epochs relative to the shortest observed delay, for which the clocks need not agree."""
 
-    behind_s: (
-        float  #: Delay above which epochs are skipped until the delay is a quarter of this limit [s]; may be infinite.
-    )
+    #: Delay above which epochs are skipped until the delay is a quarter of this limit [s]; may be infinite.
+    behind_s: float
     skipped: int = 0  #: Number of epochs skipped since the delay exceeded the limit.
     reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
     _shortest_ns: float | None = None

@@ -107,6 +107,8 @@ class EpochProcessor:
     SettingsError
         SBAS is combined with precise ephemerides, `config.sbas` and `corrections` do not match, or an argument has a
         wrong type.
+    ValueError
+        The trajectories have different map sigmas, or a screen has the name of a screen of railfix.
     """
 
     def __init__(

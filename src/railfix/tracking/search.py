@@ -145,9 +145,8 @@ class Sought(NamedTuple):
 
     lost: bool  #: True if the track was lost.
     parent: Indices  #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
-    splits: (
-        list[SplitHypothesis | None] | None
-    )  #: Split of each hypothesis, None if it is not split; None for no split.
+    #: Split of each hypothesis, None if it is not split; None for no split.
+    splits: list[SplitHypothesis | None] | None
 
 
 #: Means (H, N), covariances (H, N, N) and records (H,) of H hypotheses.
