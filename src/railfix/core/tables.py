@@ -19,7 +19,10 @@ from railfix.core.errors import InputFileError
 def reading_table(
     path: str | PathLike[str], message: str = "cannot be read as a table ({}); run railfix run again"
 ) -> Iterator[None]:
-    """Convert errors of reading a table in the block to `InputFileError`; `message` has ``{}`` for the reason."""
+    """Convert errors that occur in the with-block while a table is read to `InputFileError`.
+
+    The placeholder ``{}`` of `message` is replaced by the reason.
+    """
     try:
         yield
     except (PolarsError, PanicException, OSError) as error:

@@ -23,7 +23,8 @@ from railfix.ground.layout import PointName
 class InterlockingLimits(Settings):
     """Limits of the interlocking."""
 
-    margin_m: float = Field(default=20.0, ge=0)  #: Margin between the end of an authority and its limit.
+    #: Distance by which a movement authority ends short of the obstacle or signal that limits it.
+    margin_m: float = Field(default=20.0, ge=0)
     #: Overlap beyond the end of an authority for a train that passes the end at release speed; with 0 there is no
     #: release speed.
     overlap_m: float = Field(default=0.0, ge=0)

@@ -40,7 +40,8 @@ def overlaps_stopped(
 ) -> Interlocking:
     """Return the state with trains stopped if their intervals overlap: the bounds of trains at rest may have grown.
 
-    Trains that are unchanged since `checked`, the trains of an earlier call, are not compared with each other again.
+    `checked` holds the trains as they were at an earlier call; pairs of trains that have not changed since that call
+    are not compared with each other again, in order to save time on a line with many trains.
     """
     nearby, checked = nearby or NearbyTrains(state, layout), checked or {}
     pairs = set()
@@ -106,7 +107,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     points = dict(state.points)
     for name in under:
         points[name] = replace(points[name], locked={**points[name].locked, train: None})
-    direction = known.direction  # if the train ran too far, its authority ends at its front
+    direction = known.direction  # if the train overran its authority, the authority now ends at the front of the train
     end = direction * max(direction * known.end_m, direction * known.front_m)
     station = known.station  # a station behind the train after a wrong change of ends
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):

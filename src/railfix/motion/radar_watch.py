@@ -33,7 +33,8 @@ class RadarAlarm:
 
     kind: Literal["mounting", "silent"]  #: Step of the ratio of the speeds, or no radar speed while the train moves.
     time: np.datetime64  #: Start of the first window with the fault.
-    #: Ratio of radar to satellite speed less 1, before and after a step; NaN for the kind "silent".
+    #: Ratio of the radar speed to the satellite-derived speed, minus 1, before and after a step; NaN if the kind is
+    #: "silent".
     before: float = float("nan")
     after: float = float("nan")
 

@@ -133,7 +133,8 @@ class Transitions:
         share[-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
         # A train beyond an open end is on unmapped track. Since a log begins on unmapped track with `UNMAPPED_PRIOR`,
-        # leaving a track has this factor, too, so that a run and its return are equally probable.
+        # the transition from a track to unmapped track has the same factor, so that a run off the map and the same run
+        # in reverse are equally probable.
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
         share[:m, m:-1][left] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
         share[m:-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))

@@ -168,7 +168,10 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
 
 
 def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, int]] | None:
-    """Return the offset of each sub-block of a block, and of its type-1 sub-block; None if the block is broken."""
+    """Return, for each sub-block of a block, its offset and the offset of the type-1 sub-block that contains it.
+
+    Return None if the block is malformed.
+    """
     cursor, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
     size1, size2 = int(head["size1"]), int(head["size2"])
     places: list[tuple[int, int]] = []
