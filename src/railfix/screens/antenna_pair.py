@@ -4,10 +4,10 @@ The range from the rear antenna to a satellite is longer by ``L (cos el cos(az -
 gradient)``, with L the antenna spacing. A different value indicates multipath at one of the two antennas, but does not
 show at which antenna.
 
-With clocks "common" the receivers must share a clock: where the median difference exceeds `SEPARATE_CLOCKS_M`, no
-satellite is tested (P1 6). With clocks "median" the clock difference is the median over the satellites of a
-constellation. If range rates are given, the satellites' motion between the two time tags is removed (0.8 m in 1 ms at
-most).
+If `clocks` is "common", the receivers must share a clock: at epochs where the median difference exceeds
+`SEPARATE_CLOCKS_M`, no satellite is tested (P1 6). If `clocks` is "median", the clock difference is estimated by the
+median over the satellites of a constellation. If range rates are given, the satellites' motion between the two time
+tags is removed (0.8 m in 1 ms at most).
 
 Errors of gradient, sway and map make the elevation uncertain by 3 deg, and the azimuth relative to the car body by
 3.5 deg (P1). Multipath errors smaller than the effect of these angle errors are not detected.
@@ -43,7 +43,7 @@ CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
     "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
 }
-#: Median pseudorange difference over all satellites [m] that multipath cannot cause and that shows separate clocks.
+#: Median pseudorange difference of all satellites [m] above which the receivers are assumed to have separate clocks.
 SEPARATE_CLOCKS_M: Final = 100.0
 
 
@@ -52,15 +52,15 @@ class AntennaPairLimits(Settings):
 
     #: Largest deviation of the pseudorange difference from the expected difference; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Errors of the satellite's direction relative to the car body; 3 and 3.5 in P1 2.3(3).
+    #: Error of a satellite's elevation relative to the car body; 3 in P1 2.3(3).
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
+    #: Error of a satellite's azimuth relative to the car body; 3.5 in P1 2.3(3).
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
-    #: Whether the receivers share a clock ("common"), or the median of each constellation eliminates the clock
-    #: difference ("median").
+    #: Whether both receivers share a clock ("common"), or the median eliminates the clock difference ("median").
     clocks: Literal["common", "median"] = "median"
-    #: Minimum number of common satellites in a constellation, if clocks are eliminated with the median.
+    #: Minimum number of common satellites in a constellation, with clocks "median".
     least_satellites: int = Field(default=4, ge=3)
-    #: Largest difference of the time tags of a pair of epochs.
+    #: Largest difference between the time tags of two paired epochs.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
     #: Whether the sigma of an inconsistent satellite is increased ("weigh"), or the satellite rejected ("reject"), as
     #: in P1. Both antennas are treated alike, because the faulty antenna is unknown.
@@ -69,17 +69,17 @@ class AntennaPairLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaPairScreened(Screened):
-    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m]."""
+    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured minus expected difference [m]."""
 
-    expected_m: Floats  #: Rear less front pseudorange that follows from the spacing, shape (P, C).
-    #: Eliminated clock difference, rear less front receiver; 0 for a common clock; NaN if unknown; shape (P, C).
+    expected_m: Floats  #: Rear minus front pseudorange expected from the spacing [m], shape (P, C).
+    #: Eliminated clock difference [m], rear minus front; 0 for a common clock; NaN if unknown; shape (P, C).
     clock_m: Floats
     clocks: str  #: Description of the treatment of the clocks, from `CLOCKS`.
     zone: Callable[[], Floats]  #: Function that computes `ambiguity_m`.
 
     @cached_property
     def ambiguity_m(self) -> Floats:
-        """Largest effect of the angle errors, shape (P, C); no smaller metric is rejected."""
+        """Largest effect of the angle errors [m], shape (P, C); metrics up to this effect are not rejected."""
         return self.zone()
 
 
@@ -92,10 +92,10 @@ class Spacing(NamedTuple):
 
 
 class TagDifference(NamedTuple):
-    """Time-tag difference of the two receivers."""
+    """Difference between the time tags of the two receivers, with the range rates to correct for it."""
 
-    later: ArrayLike  #: Rear less front time tags as timedelta64, shape (P,).
-    range_rate_mps: ArrayLike  #: Range rate ``-lambda D``, shape (P, C); NaN, where unknown, counts as 0.
+    later: ArrayLike  #: Time tag of the rear minus the front receiver, timedelta64, shape (P,).
+    range_rate_mps: ArrayLike  #: Range rate ``-lambda D``, shape (P, C); NaN (unknown) counts as 0.
 
 
 def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacing:
@@ -105,7 +105,7 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
         Antenna positions on their trajectories at the same instant. Only the difference of the two positions is used,
-        so that a common error along a straight line has no effect.
+        so that on a straight line a common error has no effect.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
@@ -125,7 +125,7 @@ def expected_difference_m(
     gradient_permille: ArrayLike,
     spacing_m: ArrayLike,
 ) -> Floats:
-    """Return the rear antenna's pseudorange less the front antenna's for equal receiver clocks, shape (P, C) [m].
+    """Return rear minus front pseudorange expected for a common receiver clock, shape (P, C) [m].
 
     Parameters
     ----------
@@ -156,12 +156,12 @@ def ambiguity_m(
     Parameters
     ----------
     elevation_deg, relative_azimuth_deg : array_like, shapes that broadcast [deg]
-        The relative azimuth is the azimuth of the satellite less the heading.
+        The relative azimuth is the azimuth of the satellite minus the heading.
     spacing_m : array_like [m]
     elevation_error_deg, azimuth_error_deg : float [deg]
     """
     angles = np.broadcast_arrays(np.radians(elevation_deg), np.radians(relative_azimuth_deg))
-    shape = angles[0].shape  # scalars become rows of one element; a table may have no channel
+    shape = angles[0].shape  # scalars become rows of one element; there may be no channel
     rows = (math.prod(shape[:-1]), shape[-1]) if len(shape) > 1 else (-1, 1)
     elevation, azimuth = (np.ascontiguousarray(a.reshape(rows)) for a in angles)
     errors = np.radians(elevation_error_deg), np.radians(azimuth_error_deg)
@@ -212,8 +212,9 @@ def antenna_pair_screen(
     Returns
     -------
     AntennaPairScreened
-        The metric is NaN, and nothing is rejected, where a pseudorange or the spacing is missing; with clocks "median"
-        where a constellation has fewer than `least_satellites` satellites; with "common" where clocks are separate.
+        The metric is NaN, and nothing is rejected, where a pseudorange or the spacing is missing. The same applies to
+        constellations with fewer than `least_satellites` satellites (clocks "median"), and to epochs with separate
+        clocks ("common").
     """
     limits = limits or AntennaPairLimits()
     front, rear = np.asarray(code_front_m, dtype=np.float64), np.asarray(code_rear_m, dtype=np.float64)
@@ -222,7 +223,7 @@ def antenna_pair_screen(
     later = np.zeros(len(front)) if tags is None else seconds(tags.later)
     raw = rear - front - expected - rate * later[:, None]
     if limits.clocks == "median":
-        # the receiver clocks also shift the instants of observation
+        # the clock difference also shifts the instants of observation
         timed = raw + rate * clock_medians(raw, satellite) / SPEED_OF_LIGHT
         clock = clock_medians(timed, satellite, least=limits.least_satellites)
         raw = raw + rate * clock / SPEED_OF_LIGHT

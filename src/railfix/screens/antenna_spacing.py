@@ -20,11 +20,11 @@ class AntennaSpacingLimits(Settings):
 
     #: Largest difference between the distance from one position to the other and the antenna spacing; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Smallest rejected difference of filter positions or speeds, in standard deviations. This limit applies in
-    #: addition to the limits in m and m/s, because the filter may predict over gaps.
+    #: Number of standard deviations that a difference of filter positions or speeds must exceed to be rejected, in
+    #: addition to the limit in m or m/s. The standard deviations grow when the filter predicts over a gap.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
     #: Largest difference of the two antennas' filter speeds. Antennas on one vehicle differ in speed by a few cm/s at
-    #: most, where the track curves or its cant changes. A smaller difference at single epochs moves no position by 1 m.
+    #: most, where the track curves or its cant changes. Smaller ones at single epochs change positions by under 1 m.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
     #: Time after a rejection for which neither filter position is used. A wrong speed causes a wrong position, which
     #: pseudoranges correct within about 20 s.
@@ -46,11 +46,11 @@ def antenna_spacing_screen(
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
         Chainages at the same instants along one line; a pair with NaN is not rejected.
     spacing_m : array_like, shape (P,) or scalar [m]
-        Expected front less rear chainage, not negative: the antenna distance if each chainage refers to its antenna, 0
-        if both refer to one reference point.
+        Expected distance from the rear to the front position, not negative: the antenna spacing if each chainage is the
+        chainage of the antenna, 0 if both chainages refer to one reference point.
     facing : array_like of int, shape (P,) or scalar
-        1 if the vehicle's front points to rising chainage, -1 if to falling chainage, 0 if unknown. With 0 the order of
-        the two positions is not tested.
+        Direction of the vehicle's front: 1 towards rising chainage, -1 towards falling chainage, 0 if unknown. With 0
+        the order of the two positions is not tested.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def antenna_spacing_screen(
     Raises
     ------
     ValueError
-        A facing other than -1, 0 and 1, or a negative spacing.
+        `facing` is not -1, 0 or 1, or `spacing_m` is negative.
     """
     limits = limits or AntennaSpacingLimits()
     apart = np.asarray(chainage_front_m, dtype=np.float64) - np.asarray(chainage_rear_m, dtype=np.float64)

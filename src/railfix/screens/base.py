@@ -35,10 +35,10 @@ class Screened(NotebookTable):
 class Verdict:
     """A screen's result on the channels of one antenna."""
 
-    name: str  #: Key in `AntennaResult.screens`: the screen's name, or a name per verdict if the screen has several.
+    name: str  #: Key in `AntennaResult.screens`: name of the screen, or of one of several verdicts of the screen.
     reason: Reason  #: Reason given to the rejected observations.
     screened: Screened  #: Metric and verdict, shape (T, M).
-    #: Measured error that is added to the sigma of a suspected range; None if such ranges are rejected; shape (T, M).
+    #: Measured error that increases the sigma of a suspected range; None to reject the range; shape (T, M).
     error_m: Floats | None = None
 
 
@@ -52,7 +52,7 @@ class OpenSkyCn0(Protocol):
         """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where unknown."""
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return one sentence for each difference of antenna or receiver from a log's header."""
+        """Return one sentence if the antenna in a log's header is not the curve's, and one if the receiver is not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,11 +66,11 @@ class ScreenSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenColumn:
-    """Column of the result tables filled by a screen."""
+    """Column of the result tables that a screen fills."""
 
     name: str  #: Name with its unit: ``metric_doppler_m``.
     meaning: str
-    verdict: str  #: Key in `AntennaResult.screens`.
+    verdict: str  #: Key of the verdict in `AntennaResult.screens`.
     field: str = "metric"  #: Name of the array in `Verdict.screened` that fills the column.
     table: Literal["observations", "positions"] = "observations"
 
@@ -84,7 +84,7 @@ class ScreenPicture:
     metric: Floats  #: Shape (T, M).
     reject: Masks  #: Shape (T, M).
     limit: Floats | float  #: Broadcasts to (T, M).
-    #: Which values are rejected: values whose magnitude exceeds the limit ("both"), values above, or values below it.
+    #: Values that are rejected: above the limit, below the limit, or with a magnitude above the limit ("both").
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -96,7 +96,7 @@ class ObservationPicture(NamedTuple):
     label: str
     metric: str  #: Column of the observations.
     reason: Reason  #: Reason of the rejected observations.
-    limit: str  #: Field of the screen's limits (no picture if the field is None), or column of the observations.
+    limit: str  #: Field of the screen's limits (no picture if None), or column of the observations.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -117,8 +117,8 @@ class Screen(ABC, Generic[Limits]):
     """Base class of `ObservationScreen`, `PairScreen` and `PositionScreen`, from which a new screen is derived."""
 
     name: ClassVar[str]  #: Name of the screen in `Config.screens`, and of its settings group.
-    limits: Limits  #: Default limits, whose type defines the settings group.
-    needs: ClassVar[str]  #: Data that the screen requires, quoted in the note that the screen was not run.
+    limits: Limits  #: Default limits; the type of this object defines the settings group.
+    needs: ClassVar[str]  #: Data that the screen requires; quoted in the note to the user if the data are missing.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 

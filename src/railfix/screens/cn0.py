@@ -1,6 +1,6 @@
-"""Comparison of C/N0 with its open-sky mean at the same elevation, and with an absolute floor (P1 2.3(1)).
+"""Comparison of C/N0 with the open-sky mean at the same elevation, and with an absolute floor (P1 2.3(1)).
 
-P1 measures the mean C/N0 over elevation for each antenna and receiver on a day with open sky
+P1 measures the mean C/N0 as a function of elevation for each antenna and receiver under open sky
 (`railfix.ranges.cn0_curve`), and rejects observations that are more than 10 dB below this mean, or below 30 dB-Hz.
 """
 
@@ -31,7 +31,7 @@ from railfix.screens.base import (
 class Cn0Limits(Settings):
     """Limits of the C/N0 screen."""
 
-    #: Largest deficit of C/N0 from the mean at the same elevation; 10 in P1 table 6. With None the curve is not used.
+    #: Largest deficit of C/N0 relative to the open-sky mean at the same elevation; 10 in P1 table 6. None: no curve.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
     #: Minimum C/N0; with None, the default, there is no floor. P1 table 6 uses 30 for its receivers. Receivers measure
     #: C/N0 differently: 30 rejects over half of an M8T's signals in a city, where 20 to 25 is suitable.
@@ -43,7 +43,7 @@ class Cn0Screened(Screened):
     """Verdict of the C/N0 screen; the metric is C/N0, and the limit is the higher of floor and curve [dB-Hz]."""
 
     floor: Screened  #: Verdict of the floor; the metric is C/N0 [dB-Hz].
-    #: Verdict of the curve; the metric is the mean C/N0 at the elevation less C/N0 [dB], NaN without a curve.
+    #: Verdict of the curve; the metric is the mean C/N0 at the elevation minus the measured C/N0 [dB], or NaN.
     curve: Screened
 
 

@@ -34,8 +34,8 @@ from railfix.screens.base import ObservationPicture, ObservationScreen, ScreenCo
 from railfix.screens.medians import clock_medians
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
-_FINEST_M: Final = 1e-3  #: Lower bound of the noise scale of one epoch [m], of which the logarithm is taken.
-_LEAST_CHANGES: Final = 5  #: Minimum number of pseudorange changes for the noise scale of one epoch.
+_FINEST_M: Final = 1e-3  #: Lower bound of the noise scale of one epoch, because its logarithm is taken [m].
+_LEAST_CHANGES: Final = 5  #: Minimum number of pseudorange changes to estimate the noise scale of one epoch.
 
 
 class DopplerLimits(Settings):
@@ -43,12 +43,12 @@ class DopplerLimits(Settings):
 
     #: Whether the limit is fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
-    #: Largest difference of pseudorange and Doppler changes up to `short_interval_s`; 1.5 in P1 table 6.
+    #: Largest deviation of a pseudorange change from its Doppler-derived value up to `short_interval_s`; P1 table 6:
+    #: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
-    #: Interval up to which the limit is constant. The default is twice the 0.1 s of P1, so that one lost epoch has no
-    #: effect.
+    #: Interval up to which the limit is constant. The default allows for one lost epoch at the 0.1 s of P1.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
-    #: Time over which the receiver smooths its pseudoranges. With 1 s the limit is 2.9 m at an interval of 1 s.
+    #: Time over which the receiver smooths its pseudoranges. With 1 s, the fixed limit is 2.9 m at an interval of 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
     #: Largest jerk of the vehicle; trains stay below 1 [m/s^3].
     jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
@@ -56,22 +56,22 @@ class DopplerLimits(Settings):
     factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Standard deviation of a range rate from the Doppler, for mode "sigma".
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
-    #: Weight of the fixed limit in the estimate of the noise scale, in epochs, for mode "receiver".
+    #: Weight of the fixed limit in the estimate of the noise scale, as a number of epochs, for mode "receiver".
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Longest interval between two epochs that are compared.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
-    #: Time for which a satellite remains suspected after a jump. With 0 only the epochs of the jump and of its return
-    #: are affected, as in P1.
+    #: Time for which a satellite remains suspected after a jump. With 0, only the epochs of the jump and of the jump
+    #: back are affected, as in P1.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
-    least_satellites: int = Field(default=3, ge=3)  #: Minimum number of satellites to eliminate the step of a clock.
+    least_satellites: int = Field(default=3, ge=3)  #: Minimum number of satellites on a receiver clock for a test.
     #: Whether the sigma of a suspected satellite is increased ("weigh"), or the satellite is rejected ("reject"), as in
     #: P1. The increase follows from the size of the jump (`railfix.screens.suspicion_sigma_m`). With few satellites, a
-    #: rejection can weaken the geometry so much that a position error of a few metres becomes one of a hundred metres.
+    #: rejection can weaken the geometry so much that a position error grows from a few metres to a hundred metres.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
 def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = None) -> Floats:
-    """Return the limit of mode "fixed" at an interval [m]: 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
+    """Return the limit [m] of mode "fixed" at an interval; by default 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
 
     The limit is ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``. In the
     first term dt is at least `short_interval_s`; the second term is 0 up to `short_interval_s`.
@@ -82,7 +82,7 @@ def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = Non
 
 
 def _growth(interval: Floats, limits: DopplerLimits) -> Floats:
-    """Return the ratio of the noise of a pseudorange change to the noise at `short_interval_s`."""
+    """Return the noise of a pseudorange change relative to the noise of a change over `short_interval_s`."""
     long = np.expm1(-np.maximum(interval, limits.short_interval_s) / limits.correlation_s)
     return np.asarray(np.sqrt(long / np.expm1(-limits.short_interval_s / limits.correlation_s)))
 
@@ -95,7 +95,7 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
     """Return the limit of mode "sigma", shape (T, M) [m].
 
     `interval_s` has shape (T,). `sigma_m` are the pseudorange sigmas of T + 1 epochs, the first of which precedes the
-    chunk. The limit is NaN where either sigma is NaN.
+    chunk. The limit is NaN where the sigma of either epoch is NaN.
     """
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
@@ -107,10 +107,10 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
 def receiver_limit_m(
     interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit of mode "receiver", shape (T,) [m], and the sum and number of the log noise scales so far.
+    """Return the limit of mode "receiver", shape (T,) [m], with the sum and number of the logarithmic noise scales.
 
-    The noise scale of an epoch is the median absolute change over the satellites, reduced to `short_interval_s`. The
-    logarithms of the scales are averaged over the epochs, so that an epoch with large multipath errors does not
+    The noise scale of an epoch is the median over the satellites of the absolute metric, scaled to `short_interval_s`.
+    The logarithms of the scales are averaged over the epochs, so that an epoch with large multipath errors does not
     dominate. With a dozen satellites, the scale is too small by a tenth to a seventh, because the median of the same
     changes has been subtracted.
     """
@@ -132,7 +132,7 @@ _NS: Final = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerScreened(Screened):
-    """Verdict of the Doppler screen; the metric is P1's change between successive epochs [m]; shapes (T, M)."""
+    """Verdict of the Doppler screen; the metric is the change between two epochs as in P1 [m]; shapes (T, M)."""
 
     #: Offset of a suspected pseudorange from its value before the jump; 0 if not suspected; NaN without a metric.
     level_m: Floats
@@ -153,9 +153,8 @@ class DopplerState:
     level_m: Floats = field(default_factory=lambda: np.empty(0))  #: Pseudorange offset, as in `DopplerScreened`.
     #: Time of the jump; NaT where the satellite is not suspected.
     since: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Sum of the logarithms of the noise scale, and number of epochs in the sum (mode "receiver").
-    scale_sum: float = 0.0
-    scale_epochs: float = 0.0
+    scale_sum: float = 0.0  #: Sum of the logarithms of the epochs' noise scales (mode "receiver").
+    scale_epochs: float = 0.0  #: Number of epochs in this sum.
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -182,7 +181,7 @@ def doppler_screen(
 ) -> tuple[DopplerScreened, DopplerState]:
     """Reject pseudoranges whose change between epochs disagrees with the Doppler (P1 2.3(2), table 6: 1.5 m).
 
-    The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the channels of one
+    The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` minus its median over the channels of one
     receiver clock (GPS and QZSS share a clock).
 
     A single difference does not show which of its two epochs is faulty. A satellite whose metric exceeds the limit is
@@ -251,7 +250,7 @@ def doppler_screen(
 
 
 def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
-    """Return the state on the channels of this chunk; a channel that is new in the chunk has NaN and NaT."""
+    """Return the state, reordered to the channels of this chunk; NaN and NaT for channels new in the chunk."""
     if state.satellite.tobytes() == satellite.tobytes() and state.signal.tobytes() == signal.tobytes():
         return state
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
@@ -273,9 +272,9 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Return pseudorange changes less the changes by Doppler and the receiver clock step, shape (T, M) [m]."""
+    """Return pseudorange changes minus the Doppler-derived changes and the receiver clock step, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
-    # a step of the receiver clock is not elapsed time
+    # subtract the step of the receiver clock from the difference of the time tags
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT
     raw = change - rate * passed
     return np.asarray(raw - clock_medians(raw, satellite, least=least))
@@ -284,7 +283,7 @@ def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *
 def _limit_m(
     interval: Floats, metric: Floats, sigmas: Floats, before: DopplerState, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit, shape (T, M) or (T, 1) [m], and the sum and number of the receiver's log noise scales."""
+    """Return the limit, shape (T, M) or (T, 1) [m], and the sum and number of the logarithmic noise scales."""
     total, epochs = before.scale_sum, before.scale_epochs
     if limits.mode == "sigma":
         return expected_limit_m(interval, sigmas, limits=limits), total, epochs

@@ -1,4 +1,4 @@
-"""Medians over the channels of one clock."""
+"""Medians over the channels of one receiver clock."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floa
 
 @lru_cache(maxsize=256)
 def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices]:
-    """Return the indices of clock and satellite of each channel, shape (M,) each."""
+    """Return the index of the clock and the index of the satellite of each channel, shape (M,) each."""
     names = np.frombuffer(satellites, dtype=kind).tolist()
     clock, number = (np.unique(of, return_inverse=True)[1] for of in ([CLOCK_GROUP[n[0]] for n in names], names))
     return clock.astype(np.intp), number.astype(np.intp)

@@ -19,7 +19,7 @@ from railfix.track.trajectory import Trajectory
 
 
 def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
-    """Return the indices of matching epochs of two receivers, whose time tags differ by at most `tolerance_s`.
+    """Return the indices of epochs of two receivers with time tags that differ by at most `tolerance_s`.
 
     The time tags must ascend. Two epochs are a pair if each is the nearest to the other, so that no epoch is in two
     pairs.
@@ -36,7 +36,7 @@ def pair_channels(
     satellite_front: Strings, signal_front: Strings, satellite_rear: Strings, signal_rear: Strings
 ) -> tuple[Indices, Indices]:
     """Return the front and rear indices of channels with equal satellite and signal, in the front receiver's order."""
-    # both receivers' epochs are rows of the same arrays
+    # the same arrays mean equal channels
     if satellite_front is satellite_rear and signal_front is signal_rear:
         every = np.arange(len(satellite_front))
         return every, every
@@ -48,7 +48,7 @@ def pair_channels(
 
 
 def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channels: Indices) -> Screened:
-    """Expand a verdict on pairs to one antenna's epochs and channels, shape `shape`; NaN metric outside the pairs."""
+    """Expand a verdict on pairs to one antenna's epochs and channels; the metric is NaN outside the pairs."""
     metric, reject = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     where = (epochs[:, None], channels) if len(shape) > 1 else epochs
     metric[where], reject[where] = screened.metric, screened.reject
@@ -93,7 +93,7 @@ class PairedEpochs:
     #: Approximate positions of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
-    #: Chainage of the front less the rear antenna; negative if the vehicle faces falling chainage; shape (P,).
+    #: Chainage of the front minus the rear antenna; negative if the vehicle faces falling chainage; shape (P,).
     along_m: Floats
 
 
@@ -118,7 +118,7 @@ class PairScreen(_OfTwoAntennas[Limits]):
 
 
 class FilteredMotion(NamedTuple):
-    """Filtered chainages [m], speeds [m/s] and their sigmas of one antenna, shape (T,); NaN where missing."""
+    """One antenna's filtered chainages [m] and speeds [m/s], with their sigmas, shape (T,); NaN where missing."""
 
     chainage_m: Floats
     sigma_m: Floats
@@ -133,7 +133,7 @@ class FilteredMotion(NamedTuple):
 class PositionScreen(_OfTwoAntennas[Limits]):
     """Screen of the positions of two antennas of one vehicle."""
 
-    status: ClassVar[Status]  #: Status of both antennas' epochs whose positions are rejected.
+    status: ClassVar[Status]  #: Status given to both antennas at epochs with rejected positions.
 
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:

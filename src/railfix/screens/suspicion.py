@@ -8,7 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Masks
 
-#: Minimum error of a suspected range, in sigmas; added in quadrature, it leaves at most a fifth of the range's weight.
+#: Minimum assumed error of a suspected range, in sigmas. It reduces the weight of the range to a fifth or less.
 LEAST_SUSPICION: Final = 2.0
 
 
