@@ -148,7 +148,7 @@ def test_each_sensor_alone(sensor: str, largest_m: float, bench: Bench, tmp_path
 def test_what_is_left_out_is_said(bench: Bench, tmp_path: Path) -> None:
     result = bench.run(tmp_path / "out", max_gap=30.0)
     assert result.exit_code == 0, result.output
-    assert "1 gaps of over 30 s are left out, 40 s together: 2024-03-05T03:11:10 (40 s)" in result.output
+    assert "1 gaps of over 30 s are left out, 40 s in total: 2024-03-05T03:11:10 (40 s)" in result.output
     assert "199 long gap" in result.output
 
 

@@ -1,4 +1,4 @@
-"""Reference trajectory of the antennas, from fixed positions and sensors that bridge the gaps (P1 3.1(2), 4.2(2)).
+"""Reference trajectory of the antennas, from RTK fixes and from sensors that bridge the gaps (P1 3.1(2), 4.2(2)).
 
 `build_references` works on arrays, `reference_files` on files.
 """

@@ -1,6 +1,6 @@
-"""Build the reference positions of a run: check fixes, match them to the track, and bridge gaps.
+"""Build the reference positions of a run: check RTK fixes, match the fixes to the track, and bridge gaps.
 
-1. The positions of each antenna are checked separately, in pairs, and against the track (`fixes`).
+1. The positions of each antenna are checked one by one, against the other antenna, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at positions interpolated between fixes.
 3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
 4. All measurements are smoothed (`smoother`). The Dopplers are then solved at the smoothed positions, and all
@@ -41,8 +41,9 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Longest interval between speeds across which distance is known [s], and variance across longer intervals [m2].
+#: Longest interval between speeds across which the distance travelled is known [s].
 LONGEST_STEP_S: Final = 2.5
+#: Variance of the distance travelled across a longer interval [m2].
 UNKNOWN_M2: Final = 1e8
 
 
@@ -55,9 +56,9 @@ class Speeds:
     sigma_mps: Floats
 
     def way(self, time: Datetimes) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to each time (trapezoidal rule) [m] and its variance by white noise [m2].
+        """Return the distance travelled up to each time [m], and the variance of this distance due to white noise [m2].
 
-        Both are NaN outside the time span of the speeds.
+        The speeds are integrated by the trapezoidal rule. Both values are NaN outside the time span of the speeds.
         """
         if len(self.time) < 2:
             return np.full(len(time), np.nan), np.full(len(time), np.nan)
@@ -76,7 +77,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Return the mean speed of all sources weighted by inverse variances, and its sigma, shapes (N,); NaN if none."""
+    """Return the mean of all sources' speeds, weighted by inverse variances, and its sigma, shapes (N,); or NaN."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
@@ -88,37 +89,41 @@ def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, 
         return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
 
 
-SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]  #: Doppler speeds and their solution, by antenna.
+#: By antenna: known Doppler speeds, and the complete solution.
+SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]
 
-_ROUNDS: Final = 3  #: Rounds of Dopplers and smoother; the first assumes a constant speed between fixes.
-_MOVED: Final = 4.0  #: Fixes determine the direction of travel when they are this many standard deviations apart.
+#: Number of rounds of Doppler solution and smoothing; the first assumes a constant speed between fixes.
+_ROUNDS: Final = 3
+_MOVED: Final = 4.0  #: Distance between fixes, in standard deviations, from which they show the direction of travel.
 _TELLING: Final = 2.0  #: Closing errors below this many standard deviations are within the noise.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceData:
-    """Measurements for a reference."""
+    """Measurements from which a reference is built."""
 
     logs: Mapping[str, PositionLog]  #: Positions by antenna, front, rear or both.
-    trajectories: Mapping[str, Trajectory]  #: Trajectories of these antennas, and of the antennas of `dopplers`.
+    trajectories: Mapping[str, Trajectory]  #: Trajectories of the antennas with positions or Dopplers.
     dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: Dopplers by antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
     facing: int = 1  #: 1 if the vehicle's front faces rising chainage, otherwise -1.
-    distance_m: float = float("nan")  #: Distance between the two antennas on the vehicle, NaN if unknown.
+    distance_m: float = float("nan")  #: Distance between the two antennas on the vehicle; NaN if unknown.
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
     """Return the reference positions of every antenna that has a position log.
 
     NoPositionError: an antenna has fewer than two good fixes. MismatchError: there are two position logs without a
-    distance between the antennas, or pulses or accelerations are from another time.
+    distance between the antennas, or the pulses or accelerations have no time in common with the fixes.
     """
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
     if len(judged) == 2:
         if not np.isfinite(data.distance_m):
-            raise MismatchError("two position logs need the vehicle's antennas to check their distance; name a vehicle")
+            raise MismatchError(
+                "two position logs require a vehicle file, from which the antennas' distance is known; name a vehicle"
+            )
         others = reversed(list(judged.values()))
         judged = {
             name: judge_pair(fixes, other, data.distance_m, settings)
@@ -135,7 +140,7 @@ class _ReferenceBuilder:
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """Return the reference from fixes that were checked separately and in pairs."""
+        """Return the reference, built from fixes that were checked one by one and against the other antenna."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
@@ -179,7 +184,11 @@ class _ReferenceBuilder:
         fixes: Fixes,
         settings: ReferenceSettings,
     ) -> Floats:
-        """Return the closing error of each gap in standard deviations of the best sensor, 1 if within the noise."""
+        """Return the closing error of each gap, in standard deviations of the most accurate sensor.
+
+        The closing error is the distance that the sensor measured across the gap, minus the distance between the fixes
+        at both ends. The result is 1 where the closing error is within the noise.
+        """
         good = fixes.good
         fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])
         variance = np.full(len(moved), np.inf)
@@ -240,7 +249,7 @@ class _ReferenceBuilder:
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
-        """Return the Dopplers usable on this antenna's path, including the other antenna's on the same vehicle."""
+        """Return the Dopplers of this antenna, and of the other antenna if the vehicle's geometry is known."""
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 
@@ -260,7 +269,7 @@ class _ReferenceBuilder:
         return speeds_of
 
     def _join(self, speeds: SolvedSpeeds) -> Speeds:
-        """Return the combined speeds of all receivers, empty if there are none."""
+        """Return the combined speeds of all receivers; empty if there are no speeds."""
         own = [part for part, _ in speeds.values()]
         time = np.unique(np.concatenate([np.empty(0, dtype="datetime64[ns]"), *(part.time for part in own)]))
         if len(own) > 1:
@@ -271,7 +280,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to each time and its variance, by wheel if available, else by Dopplers."""
+        """Return the distance travelled up to each time, from the wheel or else from Dopplers, and its variance."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
@@ -282,7 +291,7 @@ class _ReferenceBuilder:
         return way, white + lasting
 
     def _hint(self, time: Datetimes, joined: Speeds, fixes: Fixes) -> Floats:
-        """Return speeds that determine the wheel's direction, from Dopplers, else from close consecutive fixes."""
+        """Return speeds that show the direction of travel, from Dopplers or else from fixes in quick succession."""
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))
@@ -376,7 +385,7 @@ def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:
     if time[-1] < fix_time[0] or time[0] > fix_time[-1]:
         raise MismatchError(
             f"{path}: data from {time[0]} to {time[-1]} and fixes from {fix_time[0]} to {fix_time[-1]} have no time "
-            "in common; give a table of the same run, in GPS time"
+            "in common; use a table of the same run, in GPS time"
         )
 
 

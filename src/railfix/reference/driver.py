@@ -65,10 +65,12 @@ class ReferenceInputs(InputFiles):
     nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; may be repeated.", ())
 
     pulses: Path | None = input_option(
-        "Tachometer: time_gpst with count, distance_m, or one row per pulse; direction if known.", None, metavar="CSV"
+        "Tachometer table: time_gpst and count or distance_m, otherwise one row per pulse; direction if known.",
+        None,
+        metavar="CSV",
     )
     acceleration: Path | None = input_option(
-        "Acceleration: time_gpst with specific_force_mps2 (as an accelerometer measures) or acceleration_mps2.",
+        "Acceleration table: time_gpst and specific_force_mps2 (measured by an accelerometer) or acceleration_mps2.",
         None,
         metavar="CSV",
     )
@@ -157,12 +159,12 @@ def antenna_record(part: Built) -> dict[str, Any]:
 
 SYSTEMS: Final = ("G", "J", "E", "C", "R")  #: Constellations whose Dopplers are used.
 _CHUNK: Final = 3000  #: Epochs of an observation log read at once.
-_NAMED: Final = 5  #: Largest number of gaps named in the notes.
+_NAMED: Final = 5  #: Largest number of gaps listed in the notes.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSummary:
-    """References of a run, with notes and written files."""
+    """References of a run, with notes and the files written."""
 
     built: Mapping[str, Built]  #: Reference by antenna.
     notes: tuple[str, ...]
@@ -185,8 +187,8 @@ def reference_files(
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
 
-    `asked` are the settings that were given explicitly, which are recorded. RailfixError: see `railfix.core.errors`;
-    `out` is then left without new files.
+    `asked` are the settings that the user gave explicitly; they are recorded. If an error is raised (RailfixError, see
+    `railfix.core.errors`), `out` is left without new files.
     """
     began = clock.perf_counter()
     settings, options = settings or ReferenceSettings(), options or ReferenceOptions()
@@ -230,7 +232,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
     }
     notes = [note for log in logs.values() for note in log.notes]
     unrated = [log.path for log in logs.values() if not log.has_quality]
-    notes += [f"{path}: has no qualities; every row is taken as fixed" for path in unrated]
+    notes += [f"{path}: has no column of solution quality; every row is taken as a fix" for path in unrated]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
         navigation = read_navigation(inputs.nav, **options.logs.arguments)
@@ -243,10 +245,12 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
             if np.isfinite(antenna_dopplers.rate_mps).any():
                 dopplers[name] = antenna_dopplers
                 continue
-            problem = "has no Doppler of a satellite with an orbit"
+            problem = "has no Doppler observation of a satellite with a navigation record"
             if inputs.pulses is None and inputs.acceleration is None:
                 raise InputFileError(
-                    paths[0], f"{problem}; give a log with D observations and its navigation file, or another sensor"
+                    paths[0],
+                    f"{problem}; provide a log with Doppler (D) observations and its navigation file, or use another "
+                    "sensor",
                 )
             notes.append(f"{paths[0]}: {problem}; no speed is computed from this log")
     vehicle = line.vehicle
@@ -278,10 +282,12 @@ def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
         total = sum(gap.length_s for gap in long)
         named = [f"{np.datetime_as_string(gap.start, unit='s')} ({gap.length_s:.0f} s)" for gap in long[:_NAMED]]
         more = [f"{len(long) - _NAMED} more"] if len(long) > _NAMED else []
-        limit = f"{len(long)} gaps of over {settings.max_gap_s:g} s are left out, {total:.0f} s together"
+        limit = f"{len(long)} gaps of over {settings.max_gap_s:g} s are left out, {total:.0f} s in total"
         notes.append(f"{name}: {limit}: {', '.join(named + more)}")
     if count := part.left_out["uncertain"]:
-        notes.append(f"{name}: {count} bridged instants less certain than {settings.max_sigma_m:g} m are left out")
+        notes.append(
+            f"{name}: {count} bridged instants with a standard deviation above {settings.max_sigma_m:g} m are left out"
+        )
     if alone := part.bridged_by.get("nothing"):
         notes.append(f"{name}: {alone} instants are bridged by the motion model alone, without a sensor")
     if np.isnan(part.fixes.travel_m).all():

@@ -1,4 +1,4 @@
-"""Settings of a reference, and checks that accept or reject its fixes (P1 3.1(2), 4.2(2), P2 3.3)."""
+"""Settings of a reference, and checks that accept or reject RTK fixes (P1 3.1(2), 4.2(2), P2 3.3)."""
 
 from __future__ import annotations
 
@@ -32,35 +32,38 @@ def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
     return option(text, default, name=name, metavar=metavar, panel="Limits", gt=0.0, allow_inf_nan=False)
 
 
-_TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance that is added to `ReferenceSettings.travel_m`.
-#: Fixes that disagree with their neighbours are rejected up to twice this long; if they disagree for longer, the
-#: distance travelled is assumed to be wrong.
+_TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance travelled that is added to `ReferenceSettings.travel_m`.
+#: Fixes that disagree with their neighbours are rejected for at most twice this time [s]; if the disagreement lasts
+#: longer, the distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
-_FIX_FLOOR_M: Final = 0.01  #: Smallest standard deviation of a fix along the track.
-#: Standard deviation [m/s2] and correlation time [s] of the train's acceleration (R. A. Singer, 1970). Trains
-#: accelerate and brake by 0.5 to 1 m/s2 for some seconds.
+_FIX_FLOOR_M: Final = 0.01  #: Lower bound of the standard deviation of a fix along the track.
+#: Standard deviation of the train's acceleration [m/s2] in the model of R. A. Singer (1970). Trains accelerate and
+#: brake by 0.5 to 1 m/s2 for some seconds.
 MOTION_MPS2: Final = 0.5
-MOTION_S: Final = 5.0
+MOTION_S: Final = 5.0  #: Correlation time of the train's acceleration [s].
 ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer's initial offset.
 
 
 class ReferenceSettings(Settings):
     """Limits and noise of a reference, which are recorded in ``reference.json``."""
 
-    #: Smallest accepted ratio of the ambiguity test of a fix, where the log has the ratio (RTKLIB's default is 3).
+    #: Smallest accepted ratio of a fix in the ambiguity test, if the log has the ratio (RTKLIB's default is 3).
     ratio: float = _limit("Smallest ratio of the ambiguity test, where the log has it.", 3.0, "RATIO", "--ratio")
     #: Largest deviation of the distance between the two antennas from their distance on the vehicle (P2 3.3: 5 cm).
     spacing_m: float = _limit(
-        "Largest deviation of the antennas' distance from their distance on the vehicle.", 0.05, "M", "--spacing"
+        "Largest deviation of the distance between both antennas from its value on the vehicle.", 0.05, "M", "--spacing"
     )
     #: Whether a fix of one antenna is rejected if the other antenna's log has no fix at that time.
     unpaired: Literal["reject", "keep"] = "reject"
     #: Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
     lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
+    #: Largest distance above or below the antenna's trajectory.
     height_m: float = _limit("Largest distance above or below the antenna's trajectory.", 2.0, "M", "--height")
-    #: Constant part of the largest difference between the straight and the travelled distance of two fixes (P2 3.3).
+    #: Constant part of the largest difference between the distance of two fixes along the track and the distance
+    #: travelled between the fixes (P2 3.3).
     travel_m: float = _positive(0.10)
-    #: Largest speed of a train; where the line passes a point several times, only passes within reach are considered.
+    #: Largest speed of a train. Where the line passes a point several times, only the passes that the train can reach
+    #: at this speed are considered.
     max_speed_mps: float = _positive(100.0)
     #: Longest gap between good fixes that is bridged.
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
@@ -70,9 +73,10 @@ class ReferenceSettings(Settings):
     fix_sigma_m: float = _positive(0.03)
 
     doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
-    #: Standard deviation [m/s] and correlation time [s] of the time-correlated error of the Doppler speed. This
-    #: standard deviation is only used if there are too few fixes to estimate it.
+    #: Standard deviation of the time-correlated error of the Doppler speed. The setting is only used if there are too
+    #: few fixes to estimate the standard deviation.
     doppler_bias_mps: float = _positive(0.02)
+    #: Correlation time of the error of the Doppler speed.
     doppler_bias_s: float = _positive(10.0)
     #: Distance per tachometer pulse: wheel circumference over pulses per turn; None to estimate it from the fixes.
     pulse_m: float | None = _limit(
@@ -87,10 +91,10 @@ class ReferenceSettings(Settings):
     acceleration_mps2: float = _positive(0.02)
 
 
-#: Positions of two antennas with time tags no farther apart than this belong to one instant [ns].
+#: Largest difference between the time tags of two antennas' positions that belong to one instant [ns].
 _PAIR_NS: Final = 5_000_000
-_LOOK_BACK: Final = 60  #: Number of preceding runs of agreeing fixes to which a run may be joined.
-#: Largest difference from the distance travelled, in standard deviations.
+_LOOK_BACK: Final = 60  #: Number of preceding runs of agreeing fixes that are tried as the predecessor of a run.
+#: Number of standard deviations of a difference that are added to its limit `ReferenceSettings.travel_m`.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
@@ -127,10 +131,9 @@ class Fixes:
     rejection: Bits  #: `FixRejection` bits; a row rejected in one check is not checked further; shape (n,).
     #: Distance between the antennas minus their distance on the vehicle; NaN where not checked; shape (n,).
     spacing_m: Floats
-    #: Position on the trajectory, and offsets from it to the right and upward; NaN where not checked; shape (n,).
-    arc_m: Floats
-    lateral_m: Floats
-    height_m: Floats
+    arc_m: Floats  #: Arc length on the trajectory; NaN where not checked; shape (n,).
+    lateral_m: Floats  #: Offset from the trajectory to the right; NaN where not checked; shape (n,).
+    height_m: Floats  #: Offset from the trajectory upward; NaN where not checked; shape (n,).
     sigma_m: Floats  #: Standard deviation along the track, shape (n,).
     #: Distance from the previous good fix minus the distance travelled; NaN where no sensor measured it; shape (n,).
     travel_m: Floats
@@ -180,12 +183,12 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
 
 
 def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
-    """Set the reason of the rows in a mask that have no reason yet, in place."""
+    """Set a reason, in place, for those rows of a mask that have no reason yet."""
     rejection[mask & (rejection == 0)] |= reason
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """Check one antenna's rows by the distance to the other antenna at the same time (P2 3.3: 5 cm)."""
+    """Check the distance of one antenna's positions from the other antenna at the same time (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
@@ -206,21 +209,23 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
-#: Rejections of the other antenna's row that do not prevent its use in a pair.
+#: Reasons for rejection of the other antenna's row with which the row is still used to check a distance.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
-_OUT_OF_REACH_M = 1e6  #: Cost of a pass out of reach, above any other choice [m].
-_JITTER_M = 2.0  #: Tolerance for jitter of positions, beyond the distance that the train can travel [m].
+_OUT_OF_REACH_M = 1e6  #: Cost of a pass that the train cannot reach in time; it exceeds all other costs [m].
+_JITTER_M = 2.0  #: Tolerance for the jitter of positions, added to the distance that the train can travel [m].
 
 
 def match(
     time: Datetimes, ecef_m: Floats, trajectory: Trajectory, *, lateral_m: float, height_m: float, max_speed_mps: float
 ) -> tuple[Floats, Floats, Floats, Indices]:
-    """Match F positions in order of time to a trajectory by the shortest chain of passes within `max_speed_mps`.
+    """Match F positions in order of time to a trajectory, by the shortest chain of passes that a train can travel.
+
+    A pass is a stretch of the line near a position; a position at a crossing has several passes.
 
     Returns arc lengths (NaN where no pass is within the limits), offsets to the right and upward, and segments, shapes
-    (F,). Offsets and segments without an arc length refer to the nearest point.
+    (F,). Where the arc length is NaN, the offsets and the segment refer to the nearest point of the trajectory.
     """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)
@@ -230,7 +235,7 @@ def match(
     lateral, height = _beside(offset, trajectory, section)
     passes = find_segments_near(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
     beside, above = _beside(passes.offset_m, trajectory, passes.segment)
-    # beyond the ends of the line there is no position on it
+    # a position beyond an end of the line has no point on the line
     beyond = np.abs(passes.along_m - passes.foot_m) > 0.5
     beyond &= (passes.segment == 0) | (passes.segment == len(trajectory.length_m) - 1)
     within = (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond
@@ -251,7 +256,7 @@ def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[F
 
 
 def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
-    """Return the index of one pass per position, which together form the chain of lowest cost."""
+    """Return the indices of passes, one for each position, that form the chain of lowest cost."""
     found, first = np.unique(position, return_index=True)
     if len(found) == len(position):
         return np.arange(len(found))
@@ -263,7 +268,7 @@ def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, 
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
-    """Check rows by their offsets from the trajectory; return fixes with positions on it and their sigmas."""
+    """Check the offsets of rows from the trajectory; return the fixes with arc lengths and sigmas along the track."""
     rows = fixes.good
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
@@ -289,9 +294,10 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows whose distances disagree with the distance travelled (P2 3.3), and keep the chain of agreeing runs.
+    """Reject rows whose distances from other rows disagree with the distance travelled (P2 3.3).
 
-    `travelled` returns the cumulative distance along rising chainage [m] and its variance [m2] at given times.
+    Successive rows that agree form a run, and the best chain of runs is kept (`_best_chain`). `travelled` returns the
+    cumulative distance along rising chainage [m] and its variance [m2] at given times.
     """
     rows = fixes.good
     if len(rows) < 2:
@@ -314,7 +320,11 @@ def judge_travel(
 
 
 def _best_chain(agrees: Callable[[Indices, Indices], Masks], time_s: Floats, hold_s: float) -> Masks:
-    """Return which fixes are in the chain of runs of the longest duration, minus `hold_s` for each disagreement."""
+    """Return the mask of the fixes in the best chain of runs.
+
+    A run is a sequence of successive fixes that agree with each other. The best chain has the longest total duration of
+    runs, minus `hold_s` for each disagreement between successive runs.
+    """
     count = len(time_s)
     worth = np.minimum(np.diff(time_s, append=time_s[-1] + np.median(np.diff(time_s))), 1.0)
     every = np.arange(count)

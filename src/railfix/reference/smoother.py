@@ -1,8 +1,9 @@
-"""Smooth positions between fixes, with all sensors weighted by their variances, and assemble the reference.
+"""Smooth positions between fixes, with all sensors weighted by inverse variances, and assemble the reference.
 
 The states at each instant are position, speed and acceleration, and slowly varying errors of the sensors: the error of
-the Doppler speed, the difference and scale error of the wheel's distance, and the accelerometer's offset. A
-forward-backward smoother distributes the closing error of a gap in proportion to the variance of each contribution.
+the Doppler speed, the difference between wheel distance and position, the wheel's scale error, and the accelerometer's
+offset. A forward-backward smoother distributes the closing error of a gap in proportion to the variance of each
+contribution.
 """
 
 from __future__ import annotations
@@ -22,25 +23,23 @@ from railfix.motion.singer import singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviations of unknown initial values: speed [m/s], and position and difference of the wheel's distance [m].
-_ANY_SPEED_MPS: Final = 100.0
+_ANY_SPEED_MPS: Final = 100.0  #: Standard deviation of an unknown initial speed [m/s].
+#: Standard deviation of an unknown initial position, or difference between wheel distance and position [m].
 _ANY_DISTANCE_M: Final = 1e4
-#: Residual in standard deviations beyond which Doppler speeds are down-weighted (P. J. Huber, 1964); number of rounds.
+#: Residual in standard deviations beyond which Doppler speeds are down-weighted (P. J. Huber, 1964).
 _HUBER: Final = 2.0
-_ROUNDS: Final = 4
-#: Drift of the wheel's scale [1 per square root of s] and of the accelerometer's offset [m/s2 per square root of s].
-_SCALE_DRIFT: Final = 3e-6
-_OFFSET_DRIFT_MPS2: Final = 1e-3
-#: Smallest standard deviations: of a wheel reading [m], and of process noise over a step [m].
-_LEAST_READING_M: Final = 1e-3
-_LEAST_STEP_M: Final = 1e-4
+_ROUNDS: Final = 4  #: Number of rounds of smoothing and down-weighting.
+_SCALE_DRIFT: Final = 3e-6  #: Drift of the wheel's scale [1 per square root of s].
+_OFFSET_DRIFT_MPS2: Final = 1e-3  #: Drift of the accelerometer's offset [m/s2 per square root of s].
+_LEAST_READING_M: Final = 1e-3  #: Smallest standard deviation of a wheel reading [m].
+_LEAST_STEP_M: Final = 1e-4  #: Smallest standard deviation of process noise over a step [m].
 
 
-SAME_INSTANT_NS: Final = 20_000_000  #: Time tags that differ by no more than this belong to one instant [ns].
+SAME_INSTANT_NS: Final = 20_000_000  #: Largest difference between time tags that belong to one instant [ns].
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
-    """Return the instants of a reference: rows of the log, receiver epochs, and regular steps in gaps."""
+    """Return the instants of a reference: times of the log's rows, receiver epochs, and regular steps in gaps."""
     merged = rows
     for other in others:
         new = other[(other > rows[0]) & (other < rows[-1])]
@@ -58,36 +57,33 @@ class Evidence:
     """Measurements along one antenna's path at N instants; NaN where missing."""
 
     time: Datetimes  #: Increasing, with steps of a few seconds at most; shape (N,).
-    #: Arc length of good fixes, and its standard deviation; shape (N,).
-    fix_m: Floats
-    fix_sigma_m: Floats
-    #: Speed along the path from Dopplers, and its standard deviation; shape (N,).
-    doppler_mps: Floats
-    doppler_sigma_mps: Floats
+    fix_m: Floats  #: Arc length of good fixes, shape (N,).
+    fix_sigma_m: Floats  #: Standard deviation of `fix_m`, shape (N,).
+    doppler_mps: Floats  #: Speed along the path from Dopplers, shape (N,).
+    doppler_sigma_mps: Floats  #: Standard deviation of `doppler_mps`, shape (N,).
     wheel_m: Floats  #: Cumulative wheel distance along rising chainage, from an arbitrary origin; shape (N,).
-    wheel_sigma_m: float  #: Standard deviation of one reading.
-    acceleration_mps2: Floats  #: Mean acceleration over each step along the path, without gravity; shape (N - 1,).
+    wheel_sigma_m: float  #: Standard deviation of one reading of the wheel's distance.
+    acceleration_mps2: Floats  #: Mean acceleration along the path over each step, without gravity; shape (N - 1,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothedReference:
     """Position and speed at every instant."""
 
-    #: Arc length, and its standard deviation; shape (N,).
-    arc_m: Floats
-    sigma_m: Floats
-    #: Speed along the path, and its standard deviation; shape (N,).
-    speed_mps: Floats
-    speed_sigma_mps: Floats
-    wheel_scale: Floats  #: Scale error of the wheel's distance, positive if too long; NaN without a wheel; (N,).
+    arc_m: Floats  #: Arc length, shape (N,).
+    sigma_m: Floats  #: Standard deviation of the arc length, shape (N,).
+    speed_mps: Floats  #: Speed along the path, shape (N,).
+    speed_sigma_mps: Floats  #: Standard deviation of the speed, shape (N,).
+    #: Scale error of the wheel, positive if the wheel's distance is too long; NaN without a wheel; shape (N,).
+    wheel_scale: Floats
 
 
 class _States:
-    """Column of each state that the measurements need; -1 for other states.
+    """Index of each state in the state vector; -1 for a state that no measurement requires.
 
-    The states are position, speed and acceleration of the train; with Dopplers, the time-correlated error of their
-    speed; with a wheel, the difference of its distance from the position, and its scale error; with an accelerometer,
-    its offset and the speed at the previous instant.
+    The states are position, speed and acceleration of the train; with Dopplers, the time-correlated error of the
+    Doppler speed; with a wheel, the difference between wheel distance and position, and the wheel's scale error; with
+    an accelerometer, the accelerometer's offset, and the speed at the previous instant.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -173,11 +169,11 @@ def _first_sigmas(states: _States, settings: ReferenceSettings) -> Floats:
 
 
 def _motion(states: _States, evidence: Evidence, dt: Floats, settings: ReferenceSettings) -> tuple[Floats, Floats]:
-    """Return the transition to each instant from the previous instant and its noise covariance, shapes (N, n, n).
+    """Return the transitions from the previous instant to each instant, and the noise covariances, shapes (N, n, n).
 
     The states are position, speed and a time-correlated acceleration (Singer's model). The Doppler speed's error is a
-    first-order Gauss-Markov process. The difference of wheel distance and position changes with the distance by the
-    wheel's scale-factor error, and randomly by slip. The wheel's scale-factor error and the accelerometer's offset are
+    first-order Gauss-Markov process. The difference between wheel distance and position grows by the scale-factor error
+    times the distance, and changes randomly by slip. The wheel's scale-factor error and the accelerometer's offset are
     random walks.
     """
     count = len(evidence.time)
@@ -237,10 +233,10 @@ def _measurements(
 
 @dataclass(frozen=True, kw_only=True)
 class Closings:
-    """Closing errors of a measured distance between fixes, over W windows."""
+    """Closing errors of a sensor over W windows: measured distance minus distance between two fixes."""
 
     error_m: Floats  #: Measured distance minus distance between the fixes, shape (W,).
-    white_m2: Floats  #: Variance by white noise of the sensor and of the fixes, shape (W,) [m2].
+    white_m2: Floats  #: Variance due to white noise of the sensor and of the fixes, shape (W,) [m2].
     duration_s: Floats  #: Duration of the window, shape (W,).
     distance_m: Floats  #: Distance between the fixes along rising chainage, shape (W,).
 
@@ -248,16 +244,19 @@ class Closings:
         return len(self.error_m)
 
     def excess_m2(self) -> float:
-        """Return the variance in excess of the model, from the 80th percentile of the squared errors [m2]."""
+        """Return the variance of the closing errors minus the variance due to white noise, at least 0 [m2].
+
+        The variance of the closing errors is estimated from the 80th percentile of the squared errors.
+        """
         return max(float(np.quantile(self.error_m**2, 0.8)) / _CHI2_80 - float(np.median(self.white_m2)), 0.0)
 
 
 def closings(
     time: Datetimes, distance_m: Floats, variance_m2: Floats, fix_m: Floats, fix_sigma_m: Floats, *, window_s: float
 ) -> Closings:
-    """Return the closing errors of a measured distance between fixes, over windows of `window_s`.
+    """Return the closing errors of a sensor over windows of `window_s`, from distances measured between fixes.
 
-    `distance_m` and `variance_m2` are cumulative up to each fix.
+    `distance_m` (measured by the sensor) and `variance_m2` are cumulative up to each fix.
     """
     t = seconds(time - time[0])
     end = np.searchsorted(t, t + window_s - 0.5)
@@ -277,7 +276,7 @@ def closings(
 
 
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the sigma of the time-correlated Doppler speed error [m/s], from the closing errors minus their noise.
+    """Return the sigma of the time-correlated Doppler speed error [m/s], from the closing errors.
 
     With fewer than `WINDOWS` windows, the setting is returned.
     """
@@ -331,7 +330,7 @@ class Built:
     #: Number of instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap`` or
     #: ``uncertain``.
     left_out: dict[str, int]
-    bridged_by: dict[str, int]  #: Number of bridged instants by the sensors with measurements.
+    bridged_by: dict[str, int]  #: Number of bridged instants by the combination of sensors with measurements.
     facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
 
 
@@ -347,7 +346,7 @@ def assemble_reference(
 ) -> Built:
     """Return one antenna's reference trajectory: fixes, and smoothed positions between the fixes.
 
-    `excess` is the factor on the standard deviations in each gap between G good fixes, shape (G - 1,).
+    `excess` is the factor by which standard deviations are increased in each gap between G good fixes, shape (G - 1,).
     """
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
@@ -398,7 +397,7 @@ def assemble_reference(
 
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Return the number of bridged instants by the sensors with a measurement at most 1.5 s away."""
+    """Return the number of bridged instants by the combination of sensors with a measurement at most 1.5 s away."""
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),
@@ -415,4 +414,5 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-_NEAR_NS: Final = 1_500_000_000  #: Largest time to a measurement, for 1 Hz sensors with single missing epochs.
+#: Largest time from a bridged instant to a measurement [ns]; it allows for a missing epoch of a 1 Hz sensor.
+_NEAR_NS: Final = 1_500_000_000

@@ -1,4 +1,4 @@
-"""Distance per tachometer pulse from good fixes, and distances along the line from the tachometer table."""
+"""Estimate the distance per tachometer pulse from good fixes, and compute distances from the tachometer table."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.io.reference_log import Pulses
 
-#: Windows for the estimate of the distance per pulse: length [s], smallest distance [m], smallest number.
-_WINDOW_S: Final = 10.0
-_LEAST_DISTANCE_M: Final = 30.0
-_LEAST_WINDOWS: Final = 5
+_WINDOW_S: Final = 10.0  #: Length of a window for the estimate of the distance per pulse [s].
+_LEAST_DISTANCE_M: Final = 30.0  #: Smallest distance travelled in a window that is used [m].
+_LEAST_WINDOWS: Final = 5  #: Smallest number of windows for an estimate.
 _DIRECTION_MPS: Final = 0.3  #: Lowest speed that determines a direction [m/s].
 _FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wheel:
-    """Tachometer with its distance per pulse."""
+    """Tachometer table with the distance per pulse."""
 
     pulses: Pulses
     pulse_m: float
@@ -30,15 +29,15 @@ class Wheel:
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading [m]: of a uniform error within one pulse for a counter, otherwise 0."""
+        """Standard deviation of a reading [m]: for a counter, of a uniform error within one pulse; otherwise 0."""
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
         """Compute the cumulated distance along rising chainage at instants, shape (N,) [m].
 
-        `speed_hint_mps`, from another source, gives the direction of unsigned pulses; between hints of opposite
-        directions, the direction changes at the longest standstill. NaN where the table has no reading, and where the
-        direction is undetermined because of a reversal without a stop.
+        `speed_hint_mps` are speeds from another source, of which the sign gives the direction of unsigned pulses.
+        Between hints of opposite directions, the direction changes at the longest standstill. The distance is NaN where
+        the table has no reading, and where the direction is undetermined because of a reversal without a stop.
         """
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
@@ -51,7 +50,7 @@ class Wheel:
 
 
 def _cumulate(run: Floats, step: Floats) -> Floats:
-    """Return the cumulative sum of signed steps, NaN without a reading and after an unknown step."""
+    """Return the cumulative sum of signed steps; NaN at instants without a reading or after an unknown step."""
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
     open_ = np.isnan(run)
@@ -61,7 +60,7 @@ def _cumulate(run: Floats, step: Floats) -> Floats:
 
 
 def _direction(run: Floats, hint: Floats) -> Floats:
-    """Return the direction of each step, 1 or -1, NaN where undetermined, shape (N - 1,); 1 without hints."""
+    """Return the direction of each step, shape (N - 1,): 1 or -1; NaN where undetermined; all 1 without hints."""
     known = np.where(np.abs(hint) > _DIRECTION_MPS, np.sign(hint), np.nan)
     at = np.flatnonzero(np.isfinite(known))
     if not len(at):
@@ -79,7 +78,10 @@ def _direction(run: Floats, hint: Floats) -> Floats:
 
 
 def _turn(step: Floats, before: float, after: float) -> Floats:
-    """Return the direction of each step of a stretch in which it changes at the longest stop; NaN without a stop."""
+    """Return the direction of each step of a stretch in which the train reverses.
+
+    The train is assumed to reverse at the longest stop; the directions are NaN if there is no stop.
+    """
     standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
     if not standing.any():
         # A train can reverse between two pulses without a step of zero, so that the time of reversal is unknown.
