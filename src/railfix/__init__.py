@@ -1,8 +1,8 @@
 """railfix: satellite train positioning on a 3-D track map.
 
-A train runs on a known line, so its antenna lies on a known 3-D curve and its position is one
-coordinate along it. railfix turns raw receiver logs (RINEX) and a track map into positions along
-the line, with the reason for every rejected observation.
+A train runs on a known line. The antenna of the train therefore lies on a known 3-D curve, and its position is one
+coordinate along this curve. railfix turns raw receiver logs (RINEX) and a track map into positions along the line, with
+the reason for every rejected observation.
 
 Where to begin
 --------------
@@ -23,9 +23,9 @@ The median error of these positions is 0.34 m against the ground truth of the si
 read                         `read_observations`, `read_navigation`, `read_track`, `read_vehicle`,
                              `read_sbas`, `read_sp3`, `read_positions`, `read_reference`
 position in Python           `EpochProcessor` with a `Config` and `Trajectory` objects
-                             (`antenna_trajectory`); the answer is a `Result`
+                             (`antenna_trajectory`); returns a `Result`
 position files               `run_files` with `RunInputs`
-stages by hand               `ranges.find_satellites`, `ranges.corrected_ranges`, the screens of `screens`,
+single stages                `ranges.find_satellites`, `ranges.corrected_ranges`, the screens of `screens`,
                              `positioning.find_section`, `positioning.position_on_line`,
                              `integrity.exclude_faults`, `integrity.protection_level`
 tables                       `train_table` (the filter), `positions_table`, `observations_table`, `to_xarray`
@@ -33,8 +33,8 @@ evaluate and report          `evaluate_runs`, `write_report`
 from and to georinex         `observations_from_xarray`, `observations_to_xarray`
 ============================ =========================================================================
 
-docs/example.md goes from a log to positions with these names; ``railfix --help`` lists the same
-as commands. Every name is imported at its first use, so ``import railfix`` costs next to nothing.
+docs/example.md computes positions from a log with these names; ``railfix --help`` lists the corresponding commands.
+Every name is imported at its first use, so that ``import railfix`` is fast.
 
 Vocabulary
 ----------
@@ -47,12 +47,12 @@ ECEF
 chainage
     Distance along the antenna's trajectory or the track from its first point [m].
 kilometrage
-    The line's own marking [m]; it may jump or run backwards.
+    Distance as marked along the line [m]; it may jump or run backwards.
 GPS time
-    The only time scale inside: ``datetime64[ns]``.
+    The only internal time scale, stored as ``datetime64[ns]``.
 
-Names carry the unit at public edges: ``_m``, ``_deg``, ``_s``, ``_hz``, ``_dbhz``, ``_ecef_m``.
-Absent is NaN (NaT for times); 0 is a value. A rejected observation is True in a mask everywhere.
+Public names end with the unit of the quantity: ``_m``, ``_deg``, ``_s``, ``_hz``, ``_dbhz``, ``_ecef_m``. Absent values
+are NaN (NaT for times); 0 is a value. In every mask of rejections, True means rejected.
 """
 
 import lazy_loader

@@ -6,19 +6,20 @@ import signal
 import sys
 from typing import Final, NoReturn
 
-#: Exit code of a program that Ctrl-C ended, as in a shell.
+#: Exit code of a program that was interrupted with Ctrl-C, as in a shell.
 _INTERRUPTED: Final = 128 + signal.SIGINT
 
 
 def raise_exit(number: int, _frame: object) -> None:
-    """End by an exception, so that staging folders are removed."""
+    """Raise SystemExit on a signal, so that the exception handlers remove staging folders."""
     raise SystemExit(128 + number)
 
 
 def main() -> NoReturn:
-    """Run the program; a signal that comes while its commands are imported ends it like one that comes later.
+    """Run the program; the handlers of signals are installed before the commands are imported, which takes time.
 
-    Signals that the caller has the program ignore, as `nohup` and shells' background jobs do, stay ignored.
+    Signals that are ignored when the program starts, for example under `nohup` or in a shell's background job, stay
+    ignored.
     """
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if (number := getattr(signal, name, None)) and signal.getsignal(number) is not signal.SIG_IGN:
@@ -30,7 +31,7 @@ def main() -> NoReturn:
         run_program(app)
     except SystemExit as end:
         if end.code == _INTERRUPTED:
-            print("railfix: interrupted; what was unfinished is removed, finished files are kept", file=sys.stderr)
+            print("railfix: interrupted; unfinished files were removed, finished files are kept", file=sys.stderr)
         raise
 
 

@@ -18,7 +18,7 @@ from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("G5")
 
-SENTENCE = "railfix: interrupted; what was unfinished is removed, finished files are kept\n"
+SENTENCE = "railfix: interrupted; unfinished files were removed, finished files are kept\n"
 #: Longest time until a command is where it is interrupted, and until it has ended [s].
 PATIENCE_S = 240.0
 

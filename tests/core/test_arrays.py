@@ -34,7 +34,7 @@ def test_rows_with_other_arrays_are_not_joined() -> None:
     both, bare = Points(x_m=np.arange(2.0), y_m=np.ones(2)), Points(x_m=np.arange(3.0))
     assert join_rows([both, both.take(np.array([True, False]))]).x_m.tolist() == [0.0, 1.0, 0.0]
     for parts in ([both, bare], [bare, both]):
-        with pytest.raises(ValueError, match="rows with other arrays than x_m"):
+        with pytest.raises(ValueError, match="dataclasses with different array fields; expected x_m"):
             join_rows(parts)
 
 

@@ -109,7 +109,7 @@ def test_arguments_of_another_type_are_named_with_what_was_expected(demo: dict[s
     with pytest.raises(SettingsError, match="observations of antenna front: expected Observations, got str"):
         processor.process({"front": "front.rnx"})
     for read in (read_observations, read_navigation):
-        with pytest.raises(SettingsError, match="a path, or several, were expected, got NoneType"):
+        with pytest.raises(SettingsError, match="expected a path or several paths, got NoneType"):
             read(None)  # type: ignore[arg-type]
 
 

@@ -58,7 +58,7 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 
 
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
-    """Freeze the arrays of a dataclass; raise ValueError if an array has not as many rows as the array `first`.
+    """Freeze the arrays of a dataclass; raise ValueError if an array differs from the array `first` in length.
 
     `of` names the rows in the message.
     """
@@ -99,7 +99,7 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
         return parts[0]
     tables = [_row_arrays(part) for part in parts]
     if any(table.keys() != tables[0].keys() for table in tables):
-        raise ValueError(f"rows with other arrays than {', '.join(tables[0])}")
+        raise ValueError(f"dataclasses with different array fields; expected {', '.join(tables[0])}")
     return replace(parts[0], **{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
 
 
@@ -134,10 +134,10 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
 
 
 def channel_sums(values: Floats) -> Floats:
-    """Return sums over the channels, axis 1, added in the order of the channels.
+    """Return the sums over the channels (axis 1), with the terms added in the order of the channels.
 
-    Channels of zeros therefore do not change the rounding of a sum, and an epoch has the same sum whether its chunk has
-    only its own channels or the channels of the whole log.
+    Channels of zeros therefore do not change the rounding of a sum. The sum of an epoch is the same in a chunk with the
+    channels of this epoch only and in a chunk with all channels of the log.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
 

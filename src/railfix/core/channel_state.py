@@ -1,7 +1,8 @@
-"""State per channel across chunks, independent of the channels of a chunk.
+"""State of each channel across chunks, also across chunks in which the channel is absent.
 
-A chunk has the channels that were observed in it. A live epoch, for example, may lack a satellite that the previous and
-the next epoch have. A stage with a state per channel therefore processes the channels of both the chunk and the state.
+A chunk has only the channels that were observed in it. A live epoch, for example, may lack a satellite that the
+previous and the next epoch have. A stage with a state per channel therefore processes the channels of both the chunk
+and the state.
 """
 
 from __future__ import annotations
@@ -20,17 +21,15 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedChannels:
-    """Channels of a chunk, followed by the channels of the states that the chunk lacks; U in total."""
+    """Channels of a chunk, followed by the channels that only the states have; U in total."""
 
     channel: Strings  #: Names of the channels, shape (U,).
-    present: int  #: Number of channels of the chunk, which come first.
+    present: int  #: Number of channels of the chunk, which come first in `channel`.
     #: For each state, the index of each channel in that state, shape (U,); -1 if the state lacks the channel.
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
-        """Return values of a state, channels on the last axis, for all U channels; `fill` where the state lacks a
-        channel.
-        """
+        """Return values of a state, channels on the last axis, for all U channels; `fill` for channels not in it."""
         place = self.places[state]
         known = place >= 0
         out: NDArray[Value] = np.full((*values.shape[:-1], len(place)), fill, dtype=values.dtype)

@@ -42,7 +42,7 @@ CARRIER_FREQUENCY: Final[dict[str, dict[str, float]]] = {
 #: Spacing of the GLONASS FDMA channels [Hz] by band digit (GLONASS ICD 5.1, 3.3.1.1).
 GLONASS_STEP: Final[dict[str, float]] = {"1": 0.5625e6, "2": 0.4375e6}
 
-#: Clock group by constellation letter; a group shares one receiver clock, as QZSS with GPS (IS-QZSS-PNT, 3.2.1).
+#: Clock group by constellation letter. One group, such as GPS and QZSS, has one receiver clock (IS-QZSS-PNT, 3.2.1).
 CLOCK_GROUP: Final[dict[str, str]] = {"G": "G", "J": "G", "E": "E", "C": "C", "R": "R", "S": "G", "I": "I"}
 
 # Constants that kernels and their callers share.
@@ -59,7 +59,7 @@ CLEAR_M: Final = 200.0
 #: Largest distance from a tangent at which a point counts as lying on the tangent [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Prior probability of a joint fault of the low satellites on one side of the track. The value is the upper bound, with
-#: 95 % confidence, from the largest data set, with faults in 2 of 30 943 blocks of 30 s in 70 simulated hours in a city
+#: Prior probability of a joint fault of the low satellites on one side of the track. The value is the upper bound with
+#: 95 % confidence from the largest data set: faults in 2 of 30 943 blocks of 30 s, from 70 simulated hours in a city
 #: (docs/level-results.md). The recordings are shorter and support 1e-2 only.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

@@ -12,7 +12,7 @@ import numpy as np
 from railfix.core.arrays import Indices
 
 Value = TypeVar("Value")
-#: Fields without rows, because they depend on the channels only.
+#: Names of fields without rows, which depend on the channels only.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
 EVERY: Final = slice(None)  #: All rows.
 
@@ -46,7 +46,7 @@ def _defaults(kind: Any) -> tuple[str, ...]:
 
 
 def join_epochs(values: Sequence[Value]) -> Value:
-    """Concatenate the rows of arrays, or of the arrays in dataclasses or tuples; other values are from the first."""
+    """Concatenate arrays by rows, also arrays in dataclasses or tuples; other values are those of the first item."""
     first: Any = values[0]
     if len(values) == 1:
         return values[0]

@@ -88,7 +88,7 @@ def check_type(value: object, expected: type, what: str) -> None:
 
 
 class MismatchError(RailfixError):
-    """Inputs are readable but do not match each other (another day, another location)."""
+    """Inputs are readable but do not match each other, for example in day or location."""
 
     exit_code = 5
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from railfix.core.errors import SettingsError
 
-#: Extra of railfix that installs each optional package.
+#: Extra of railfix that installs an optional package, by name of the package.
 _EXTRAS: Final = {
     **dict.fromkeys(("cbor2", "serial", "h11"), "live"),
     "paho": "mqtt",
@@ -21,7 +21,7 @@ _EXTRAS: Final = {
 
 @contextmanager
 def needs_extra(what: object = "this") -> Iterator[None]:
-    """Raise SettingsError if an optional package imported in the block is not installed.
+    """Raise SettingsError if an optional package imported in the with-block is not installed.
 
     The message states that `what` needs the package, and names the extra of railfix that installs it.
     """

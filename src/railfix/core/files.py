@@ -1,8 +1,9 @@
-"""Reading of plain, compressed (gzip, compress (.Z), bzip2, xz, zstd, zip) and Hatanaka files; commit of the source.
+"""Reading of plain, compressed and Hatanaka files; commit of the source code of railfix.
 
-The first bytes of a file determine how it is read, never its name. Memory is bounded: plain files and most compressed
-files are streamed, a compress file is unpacked to a temporary file by `ncompress`, and Hatanaka data are piped through
-``crx2rnx`` (from a temporary file if the CRX file is compressed).
+Compressed files are gzip, compress (.Z), bzip2, xz, zstd and zip files. The first bytes of a file, not its name,
+determine how it is read. Memory is bounded: plain files and most compressed files are streamed, a compress file is
+unpacked to a temporary file by `ncompress`, and Hatanaka data are piped through ``crx2rnx`` (from a temporary file if
+the CRX file is compressed).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ Paths = FilePath | Sequence[FilePath]  #: Path of one file, or paths of several 
 #: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
 Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation files.
-#: Last clause of the message about a broken line: the option with which reading continues.
+#: Last clause of the message about a broken line, with the option that skips such lines.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
 #: Endings of the names of compressed files; the ending before them shows the kind of file.
@@ -44,10 +45,10 @@ _SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
-#: Limits of files that are read as a whole. Text compresses by a factor of 20 to 50; a file with a much larger factor
-#: is not text, and could fill the memory.
+#: Largest ratio of decompressed to compressed size of a file that is read as a whole. Text compresses by a factor of 20
+#: to 50; a file with a much larger factor is not text, and could fill the memory.
 _LARGEST_RATIO: Final = 100
-_LARGEST_BYTES: Final = 64_000_000
+_LARGEST_BYTES: Final = 64_000_000  #: Size that decompressed content may always have [bytes].
 
 
 class ByteStream(io.BufferedIOBase):
@@ -94,7 +95,7 @@ class ByteStream(io.BufferedIOBase):
 
 
 class _HatanakaStream(ByteStream):
-    """Output of the Hatanaka decoder; its exit code is checked at the end of the output."""
+    """Output stream of the Hatanaka decoder; the decoder's exit code is checked at the end of the stream."""
 
     def __init__(
         self, path: FilePath, process: subprocess.Popen[bytes], log: IO[bytes], held: ExitStack, *, disk: IO[bytes]
@@ -129,15 +130,15 @@ def path_names(paths: Paths) -> list[str]:
     if not names:
         raise SettingsError("no file was given")
     if wrong := [name for name in names if not isinstance(name, str | PathLike)]:
-        raise SettingsError(f"a path, or several, were expected, got {type(wrong[0]).__name__}")
+        raise SettingsError(f"expected a path or several paths, got {type(wrong[0]).__name__}")
     return [str(name) for name in names]
 
 
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
     """Open a file as a stream of its decompressed bytes.
 
-    Line ends are as in the file. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed.
-    Raise InputFileError if the file is missing, a folder, unreadable, empty, an archive of another kind, or, with
+    Line ends are as in the file. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed. Raise
+    InputFileError if the file is missing, a folder, unreadable, empty, an archive of a kind that is not read, or, with
     "text", binary.
     """
     held = ExitStack()
@@ -180,8 +181,8 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 def unpacked_file(path: FilePath) -> Iterator[Path]:
     """Yield the path of a file with the decompressed content, for programs that open files themselves.
 
-    The path of a file that is not compressed is the given path. All files of a zip archive are extracted into one
-    folder. The temporary files are removed at the end of the block.
+    For a file that is not compressed, this is the given path. All files of a zip archive are extracted into one folder.
+    The temporary files are removed at the end of the block.
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
@@ -214,7 +215,8 @@ def read_bytes(path: FilePath) -> bytes:
             content += block
             if len(content) > most:
                 raise InputFileError(
-                    path, f"unpacks to more than {most / 1e6:,.0f} MB, which no map or navigation file of its size does"
+                    path,
+                    f"unpacks to more than {most / 1e6:,.0f} MB, more than any map or navigation file of this size",
                 )
     return bytes(content)
 
@@ -330,7 +332,7 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source and return its output as a stream, which takes over the resources `held`."""
+    """Start the Hatanaka decoder on an open file and return the output as a stream; closing it releases `held`."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:
@@ -354,7 +356,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-#: File with the commit, which the build adds to wheels and source archives (``.ci/hatch_build.py``).
+#: File with the commit of the source; the build adds the file to wheels and source archives (``.ci/hatch_build.py``).
 FROM_BUILD: Final = Path(__file__).parents[1] / "_commit.txt"
 
 

@@ -1,4 +1,4 @@
-"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges with the Earth's rotation.
+"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges with the Earth rotation.
 
 Where an input is NaN, the result is NaN.
 """

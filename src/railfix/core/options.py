@@ -16,7 +16,8 @@ def option(
     panel: str = "Choices",
     **limits: Any,
 ) -> Any:
-    """Return a field of a `Settings` model that is also an option of the command line; required without a `default`.
+    """Return a field of a `Settings` model that is also an option of the command line; without a `default` it is
+    required.
 
     The option is called ``--field-name`` unless `name` is given. A field with a `name`, a default and two allowed words
     (`Literal`) becomes a switch. `panel` is the heading in the help text; `limits` are passed to `pydantic.Field`.

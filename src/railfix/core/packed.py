@@ -56,9 +56,8 @@ def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
     raise InputFileError(path, f"is a zip archive of {len(names)} files ({shown}); unpack it, and give the files")
 
 
-#: First bytes of a compress (.Z) file, and of a zip archive.
-COMPRESS: Final = b"\x1f\x9d"
-ZIP: Final = b"PK\x03\x04"
+COMPRESS: Final = b"\x1f\x9d"  #: First bytes of a compress (.Z) file.
+ZIP: Final = b"PK\x03\x04"  #: First bytes of a zip archive.
 #: First bytes of files that are read as streams, with the function that opens them.
 STREAMS: Final[dict[bytes, Callable[[IO[bytes]], Any]]] = {
     b"\x1f\x8b": lambda source: gzip.GzipFile(fileobj=source, mode="rb"),

@@ -12,16 +12,14 @@ from railfix.core.reasons import Reason
 
 _ADDED: dict[str, Reason] = {}  #: Reasons of screens that are added to the package, by name in lower case.
 
-
-#: First bit that no reason uses, and last bit that the 32-bit column of the tables can store.
+#: First bit that no reason of railfix uses.
 _FIRST_FREE_BIT: Final = 23
-
-
+#: Last bit that the 32-bit column of the tables can store.
 _LAST_BIT: Final = 30
 
 
 def screen_reason(name: str) -> Reason:
-    """Return the reason of a screen by its lower-case name.
+    """Return the rejection reason of a screen, given the lower-case name of the reason.
 
     A name that `Reason` does not have receives the next free bit; raise ValueError if no bit is left.
     """
@@ -36,7 +34,7 @@ def screen_reason(name: str) -> Reason:
 
 
 def reason_names() -> dict[int, str]:
-    """Return the lower-case name of every reason by its bit, in ascending order of the bits, without `USED`."""
+    """Return the lower-case names of all reasons by bit, in ascending order of the bits, without `USED`."""
     members = {int(bit): name.lower() for name, bit in Reason.__members__.items() if bit}
     return members | {int(bit): name for name, bit in _ADDED.items()}
 

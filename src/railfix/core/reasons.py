@@ -30,13 +30,13 @@ class Reason(IntFlag):
     UNHEALTHY = 1 << 6
     #: The satellite is below the elevation mask.
     ELEVATION_MASK = 1 << 7
-    #: The only usable satellite of its clock group: its range only determines the clock of that group.
+    #: The satellite is the only usable one of its clock group, so that the range only determines that group's clock.
     ALONE_ON_ITS_CLOCK = 1 << 8
     #: No group delay of the signal is broadcast, or the satellite is at the horizon.
     NO_CORRECTION = 1 << 9
     #: SBAS: the satellite is not in the PRN mask.
     SBAS_NOT_COVERED = 1 << 10
-    #: SBAS: fast or long-term correction, degradation, or record with its issue of data is missing.
+    #: SBAS: fast or long-term correction, degradation, or the record to which the correction refers is missing.
     SBAS_NO_CORRECTION = 1 << 11
     #: SBAS: the corrections have timed out.
     SBAS_TIMED_OUT = 1 << 12
@@ -53,7 +53,7 @@ class Reason(IntFlag):
     DOPPLER = 1 << 17
     #: The pseudorange difference between the two antennas disagrees with their spacing.
     ANTENNA_PAIR = 1 << 18
-    #: Excluded by RAIM: its estimated range error exceeds the limit.
+    #: Excluded by RAIM: the estimated error of the range exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
     #: Persistent range error: the residuals have had the same sign and size for a minute.
     LASTING_ERROR = 1 << 20
@@ -93,9 +93,9 @@ class Status(IntEnum):
     MAP_OFFSET = 10
     #: A position that passed every check, but interference with the signals is suspected: jamming.
     JAMMING_SUSPECTED = 11
-    #: A position, but the signals may be from a spoofer, so that its error has no bound.
+    #: A position, but the signals may be from a spoofer, so that the position error has no bound.
     SPOOFING_SUSPECTED = 12
-    #: A position, but moved to an end of the map: the ranges put it beyond that end, by no more than their noise.
+    #: A position, but moved to an end of the map: the ranges put it beyond that end by no more than the noise.
     MAP_END = 13
 
     @property

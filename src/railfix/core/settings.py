@@ -81,7 +81,7 @@ class Settings(Checked):
     @field_validator("*", mode="before")
     @classmethod
     def _as_written(cls, value: Any, info: ValidationInfo) -> Any:
-        """Reject a truth value for a number, which pydantic accepts as 1 or 0; accept a path or a text for a list.
+        """Reject a truth value for a number (pydantic would accept it as 1 or 0); accept a path or a text for a list.
 
         The items in a text are separated by commas, as in ``systems=G,E``.
         """
@@ -97,7 +97,7 @@ class Settings(Checked):
 
 
 def is_number(kind: Any) -> bool:
-    """Return whether the type of a field allows a number (or a number or None), and no truth value."""
+    """Return whether the type of a field allows numbers, or numbers and None, but no truth value."""
     parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
     return bool not in parts and (int in parts or float in parts)
 
@@ -118,8 +118,8 @@ def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> M
 
 
 def first_fault(model: type[BaseModel], error: ValidationError) -> str:
-    """Return a message on the first fault: the setting with the expected value, or the known and the intended name."""
-    # an unknown name is reported first, because another name may be missing only because it was misspelt
+    """Return a message on the first fault: the setting and the expected value, or the known names and a similar one."""
+    # an unknown name is reported first, because it may be the misspelt name of a setting that is reported as missing
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"] if part != "[key]")
     if first["type"] == "extra_forbidden":
@@ -136,7 +136,7 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> str:
 
 
 def _in_groups(model: type[BaseModel], name: str) -> list[str]:
-    """Return the dotted setting of this name if exactly one group of a model has it; an empty list otherwise."""
+    """Return ``group.name`` if exactly one group of a model has a setting of this name; an empty list otherwise."""
     groups = {key: field.annotation for key, field in model.model_fields.items()}
     found = [
         f"{key}.{name}"
@@ -147,7 +147,7 @@ def _in_groups(model: type[BaseModel], name: str) -> list[str]:
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
-    """Return the names of the settings in the group at a location of a nested model; empty if it is not a group."""
+    """Return the names of the settings in the group at a location of a nested model; empty where there is no group."""
     kind: Any = model
     for part in location:
         if get_origin(kind) is dict:

@@ -25,7 +25,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 @contextmanager
 def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a temporary path in the folder of a file, which replaces the file if the block ends without an error.
+    """Yield a path of a temporary file in the same folder; it replaces the file if the block ends without an error.
 
     Raise OutputError if a system error occurs in the block or while replacing the file.
     """

@@ -52,25 +52,24 @@ def percent(part: float | None) -> str:
     return share(part).removesuffix(" %")
 
 
-#: Format a number without decimals, and a number with its sign.
-count: Final = partial(number, digits=0)
-signed: Final = partial(number, sign="+")
+count: Final = partial(number, digits=0)  #: Format a number without decimals.
+signed: Final = partial(number, sign="+")  #: Format a number with its sign.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Table whose first column names the rows; a page links to the table as a CSV file called `name`."""
+    """Table with the names of the rows in the first column; a page offers the table as a CSV file called `name`."""
 
     kind: ClassVar[str] = "table"
     name: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
-    #: Indices of the columns with numbers, and of the columns with code.
-    numeric: Sequence[int] = ()
-    code: Sequence[int] = ()
+    numeric: Sequence[int] = ()  #: Indices of the columns with numbers.
+    code: Sequence[int] = ()  #: Indices of the columns with code.
     marked: Sequence[int] = ()  #: Indices of the highlighted rows.
-    links: Sequence[str] = ()  #: Address of a page on each row, "" for a row without a page; empty without any page.
+    #: Address of a page about each row, "" for a row without a page; empty if no row has one.
+    links: Sequence[str] = ()
     boxed: bool = False  #: Whether a terminal draws a frame around the table.
 
 

@@ -21,8 +21,8 @@ SECONDS_PER_DAY: Final = 86_400
 _NS: Final = 1_000_000_000
 _NAT: Final = np.iinfo(np.int64).min
 
-#: UTC instants at which GPST - UTC changes: the difference is 0 s from the first, and 1 s more from each later instant
-#: on (IERS Bulletin C).
+#: UTC instants at which GPST - UTC changes: the difference is 0 s after the first instant and increases by 1 s at each
+#: later instant (IERS Bulletin C).
 LEAP_UTC: Final = np.array(
     [
         "1980-01-06", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01",
@@ -88,7 +88,7 @@ def gpst_minus_utc(utc: ArrayLike) -> Integers:
 
 
 def utc_to_gpst(utc: ArrayLike) -> Datetimes:
-    """Convert UTC to GPS time by the table of leap seconds."""
+    """Convert UTC to GPS time with the table of leap seconds."""
     at = np.asarray(utc, dtype="datetime64[ns]")
     leap = gpst_minus_utc(at).astype("timedelta64[s]")
     return np.asarray(at + leap, dtype="datetime64[ns]")

@@ -20,7 +20,7 @@ MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; fu
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
-    """Return whether each channel has an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
+    """Return whether each channel has a value in an array of `kinds` (T, M) or a loss-of-lock digit, shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
         used |= ~np.isnan(array[:1]).all(axis=0)  # nearly all channels have data in the first epoch
@@ -42,8 +42,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Returns
     -------
     Observations
-        Channels sorted by satellite, then signal. The header is the first part's, with the signals and GLONASS channels
-        of the other parts added; problems are concatenated, counters added.
+        Channels sorted by satellite, then signal. The header is that of the first part, extended by the signals and
+        GLONASS channels of the other parts. Problems are concatenated, and counters are summed.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
 
 def stack_parts(parts: Sequence[Observations]) -> Observations:
-    """Stack observations of one or several receivers as `concatenate` does, in any order of time."""
+    """Stack observations of one or several receivers as `concatenate` does; the parts may be in any order of time."""
     if not parts:
         raise ValueError("concatenate needs at least one part")
     of_parts = [list(zip(p.satellite.tolist(), p.signal.tolist(), strict=True)) for p in parts]

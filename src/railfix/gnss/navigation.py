@@ -45,9 +45,10 @@ class KeplerRecords(_NavigationRecords):
     """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows."""
 
     satellite: Strings  #: Name of the satellite, such as "G01"; shape (n,).
-    #: "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3" (BeiDou); shape (n,).
+    #: Name of the message: "LNAV", "CNAV", "CNV2" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2", "CNV1" to "CNV3"
+    #: (BeiDou); shape (n,).
     message: Strings
-    #: Clock and ephemeris reference times, GPS time. The week is resolved from toc; shape (n,).
+    #: Reference times of clock (toc) and ephemeris (toe), GPS time. The week of toe is resolved from toc; shape (n,).
     toc: Datetimes
     toe: Datetimes
     #: Transmission time of the message; NaT where the file has none or an implausible time; shape (n,).
@@ -80,12 +81,13 @@ class KeplerRecords(_NavigationRecords):
     toe_sow_s: Floats
     #: Broadcast health: GPS/QZSS SV health (CNAV: L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS); shape (n,).
     health: Integers
-    #: URA or SISA as written; nominal value of the URA_ED index for CNAV, NaN for CNV1 to CNV3; shape (n,).
+    #: URA or SISA as in the file; nominal value of the URA_ED index for CNAV, NaN for CNV1 to CNV3; shape (n,).
     accuracy_m: Floats
-    #: Issues of ephemeris and clock; IODnav in both for Galileo, AODE and AODC for BeiDou D1 and D2; shape (n,).
+    #: Issues of data of the ephemeris (iode) and the clock (iodc), shape (n,). Both are IODnav for Galileo; for BeiDou
+    #: D1 and D2, they are AODE and AODC.
     iode: Integers
     iodc: Integers
-    data_source: Integers  #: Data sources of Galileo, codes on L2 of GPS and QZSS; 0 for BeiDou; shape (n,).
+    data_source: Integers  #: Data source flags (Galileo) or codes on L2 (GPS, QZSS); 0 for BeiDou; shape (n,).
     #: Group delays, shape (n,). GPS and QZSS: TGD and NaN. Galileo: BGD E5a/E1 and BGD E5b/E1. BeiDou: TGD1 and TGD2
     #: of D1 and D2, TGD_B1Cp and TGD_B2ap of CNV1 and CNV2, TGD_B2bI and NaN of CNV3.
     group_delay_1_s: Floats
@@ -147,7 +149,7 @@ class Navigation(NotebookTable):
     kepler: KeplerRecords
     glonass: GlonassRecords
     #: Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received, shape (8,). Coefficients
-    #: that are all zero were not received, and are left out with a note.
+    #: that are all zero count as not received, and are omitted with a note.
     klobuchar: Mapping[str, Floats] = field(default_factory=dict)
     leap_seconds: int | None = None  #: GPST - UTC [s] from the header.
     #: Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").

@@ -56,9 +56,8 @@ class ObservationHeader:
 
     version: float = float("nan")  #: RINEX version, NaN if the log is not a RINEX file.
     marker: str = ""
-    #: Receiver type and antenna type, as written.
-    receiver: str = ""
-    antenna: str = ""
+    receiver: str = ""  #: Receiver type, as in the file.
+    antenna: str = ""  #: Antenna type, as in the file.
     #: APPROX POSITION XYZ [m], NaN if absent or all zero; shape (3,).
     approximate_ecef_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
     #: Antenna height, and eccentricities east and north [m]; shape (3,).
@@ -91,14 +90,13 @@ class Observations(NotebookTable):
     #: Whether an epoch must not be differenced with the previous epoch: after a power failure (epoch flag 1), at a new
     #: site or with a moving antenna (2, 3), or at the start of another file after a gap; shape (T,).
     break_before: Masks
-    #: Interference indicated by the receiver: 1 jamming, 2 spoofing, 3 both, 0 if none or without such a message;
-    #: shape (T,).
+    #: Interference indicated by the receiver: 1 jamming, 2 spoofing, 3 both, 0 if it indicates none; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     #: Front-end gain, in the receiver's unit, NaN where unknown; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
-    #: Messages about skipped faults (file, line, fault); at most `MAX_PROBLEMS`, then a message with the number of
-    #: further faults. A slice of epochs has no messages.
+    #: Messages on faults of the file that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then a message with
+    #: the number of further faults. A slice of epochs has no messages.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of faults.
     #: Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs, external events,
@@ -140,9 +138,9 @@ class Observations(NotebookTable):
     def __getitem__(self, key: slice | tuple[slice, str | Sequence[str]]) -> Observations:
         """Select epochs (a view), or epochs and satellites: ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
 
-        Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day, which is taken
-        on the day of the first epoch or after midnight. The upper bound is not included. Satellites are names ("G06")
-        or constellations ("G"), one or several.
+        Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day, on the day of
+        the first epoch or the day after. The upper bound is not included. Satellites are names ("G06") or
+        constellations ("G"), one or several.
 
         Raises
         ------

@@ -48,7 +48,7 @@ class EpochOrder:
 
         Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """
-        waiting: list[FileEpochs] = []  # for later epochs, which may precede them
+        waiting: list[FileEpochs] = []  # epochs held back, because epochs later in the file may precede them in time
         for run in runs:
             waiting.append(run)
             if self._rise(epochs.time for _, epochs, _ in waiting):
@@ -64,7 +64,7 @@ class EpochOrder:
         yield self._summary()
 
     def _rise(self, times: Iterable[Datetimes]) -> bool:
-        """Return whether the times of consecutive parts rise strictly, the last time returned included."""
+        """Return whether the times of consecutive parts rise strictly and begin after the last time returned."""
         time = np.concatenate([*(time[-1:] for time in self._times[-1:]), *times, np.empty(0, "datetime64[ns]")])
         return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
 
@@ -80,8 +80,10 @@ class EpochOrder:
         return part
 
     def _sort(self, runs: Sequence[FileEpochs], *, final: bool) -> tuple[Observations, list[FileEpochs]]:
-        """Sort and check the waiting epochs; return the epochs that no later epoch can precede, and the other epochs
-        one by one.
+        """Sort and check the waiting epochs.
+
+        Return the epochs that no epoch later in the file can precede, and a list of the other epochs, each as a part of
+        its own.
         """
         paths, epochs, lines = zip(*runs, strict=True)
         joined, line = stack_parts(list(epochs)), np.concatenate(lines)
@@ -201,7 +203,7 @@ def _is_repeated(time: Datetimes) -> Masks:
 
 
 def _is_lone(time: Datetimes) -> Masks:
-    """Return whether each time tag is over `_LONE` later or earlier than both neighbours, while the neighbours rise."""
+    """Return whether each time tag is over `_LONE` later or earlier than both neighbours, which are in order."""
     lone = np.zeros(len(time), dtype=np.bool_)
     before, this, after = time[:-2], time[1:-1], time[2:]
     lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))

@@ -18,8 +18,9 @@ FileKind = Literal[
 ]  # fmt: skip
 #: Kinds of position logs. A table or GPX file may also be a track map.
 POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", "gpx", "receiver")
-#: Kinds of track maps that are read by GDAL, and all kinds of track maps.
+#: Kinds of track maps that are read by GDAL.
 GDAL: Final[tuple[FileKind, ...]] = ("gpkg", "shp", "fgb", "gml", "dxf", "pbf")
+#: All kinds of track maps.
 MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "osm", "xml", "rdf", "ifc", *GDAL)
 #: Description of each kind for messages, with the option that accepts it.
 KIND_WORDS: Final[dict[FileKind, str]] = {
@@ -70,10 +71,10 @@ _ENDINGS: Final[dict[str, FileKind]] = {
 
 
 def find_kind(path: FilePath) -> FileKind:
-    """Return the kind of a file from its first bytes after unpacking, or from the ending of its name if these fit no
-    kind.
+    """Return the kind of a file, detected from its first decompressed bytes or else from the ending of its name.
 
-    TOML files are recognised by name, EGNSS MATE tables by name or header. The kind is "unknown" if nothing fits.
+    TOML files are recognised by name, and EGNSS MATE tables by name or header. The kind is "unknown" if neither the
+    bytes nor the name fit a kind.
     """
     if mate_table(path):
         return "mate"

@@ -32,8 +32,8 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     -------
     xarray.Dataset
         One variable over ``time`` and ``sv`` for each observation type, NaN where absent. The variables
-        ``break_before`` over ``time`` and ``glonass_channel`` over ``sv`` do not exist in georinex. Attributes hold
-        the header.
+        ``break_before`` over ``time`` and ``glonass_channel`` over ``sv`` are additions to the layout of georinex. The
+        attributes hold the header.
     """
     import xarray as xr
 

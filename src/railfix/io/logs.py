@@ -60,7 +60,8 @@ def read_observations(
     start, end : datetime64 or str, optional
         Time span to read, GPS time; the end is excluded.
     date : datetime64 or str, optional
-        Any time within half a week of the log; needed for RTCM 3 logs without ephemerides, which have no week number.
+        Any time within half a week of the log; needed for RTCM 3 logs without ephemerides, because their observations
+        have no week number.
     reader : {"railfix", "georinex"}
         "georinex" reads RINEX files with georinex, an independent reader, for comparison. georinex is slower, ignores
         events, scale factors and the indicators of bands other than 1 and 2, and does not count broken lines.
@@ -92,7 +93,7 @@ def _by_georinex(
         if find_kind(name) == "receiver":
             raise MismatchError(f"{name} is a receiver log, but georinex reads RINEX only; leave out reader (--reader)")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # a default of xarray that georinex relies on
+            warnings.simplefilter("ignore", FutureWarning)  # caused by georinex's use of xarray, not by the file
             try:
                 part = observations_from_xarray(georinex.load(Path(name), useindicators=True))
             except (ValueError, LookupError, OSError) as error:
@@ -222,7 +223,7 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
 
 
 def _of_systems(run: Observations, letters: list[str] | None) -> Observations:
-    """Return the observations of the constellations `letters`, of all constellations if None."""
+    """Return the observations of the constellations `letters`; None means all constellations."""
     return run if letters is None else without_empty_channels(of_channels(run, np.isin(run.system, letters)))
 
 
@@ -238,7 +239,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
         With "stop", a broken record raises InputFileError. With "count", it is counted in `Navigation.skipped` and
         described in `Navigation.notes`.
     date : datetime64 or str, optional
-        Any time within half a week of RTCM 3 logs, whose records may have no full date.
+        Any time within half a week of the logs; needed for RTCM 3 logs whose records have no full date.
 
     Raises
     ------
@@ -264,7 +265,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 
 def _join(parts: list[Navigation]) -> Navigation:
-    """Join the records of several sources; the first Klobuchar coefficients and leap seconds are used."""
+    """Join the records of several sources; the first Klobuchar coefficients and leap seconds found are used."""
     return Navigation(
         kepler=join_rows([part.kepler for part in parts]),
         glonass=join_rows([part.glonass for part in parts]),

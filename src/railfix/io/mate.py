@@ -80,8 +80,7 @@ def mate_table(path: FilePath) -> str:
 
 
 def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> pl.DataFrame:
-    """Read a table from CSV (also .gz) or Parquet; column names become upper case, and columns not in the file are
-    null.
+    """Read a table from CSV (also .gz) or Parquet; column names become upper case, and missing columns are null.
 
     Without `table_name`, the file name determines the table. Raise InputFileError if the file cannot be read, has an
     unknown column or no rows, or lacks a `needed` column.
@@ -145,7 +144,7 @@ def signal_code(satellite: str | None, signal: str) -> str:
 
 
 def read_mate_observations(path: str) -> Observations:
-    """Read the observations in a table S_GNSS_SAT, of the antenna and device with the most rows.
+    """Read the observations of the antenna and device that have the most rows in a table S_GNSS_SAT.
 
     Raise InputFileError if the file is not such a table, or no row has a known satellite and signal.
     """

@@ -16,8 +16,8 @@ from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Number of rows converted together to columns.
 _SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
-#: Usual column names of positions and maps in other files, as lower-case letters and digits, by railfix name. A height
-#: without a unit is in metres.
+#: Column names that other programs often use in tables of positions and maps, by railfix's name. They are reduced to
+#: lower-case letters and digits. A height without a unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
     "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
     "longitude_deg": ("lon", "long", "lng", "longitude", "londeg", "longitudedegrees", "gpslongitude"),
@@ -26,7 +26,7 @@ _USUAL: Final[dict[str, tuple[str, ...]]] = {
         "elevation", "ellipsoidalheight", "ellipsoidalheightm", "hae",
     ),
 }  # fmt: skip
-#: Endings of column names that give a unit other than railfix's, and this unit.
+#: Unit by ending of a column name, for units other than railfix's.
 _OTHER_UNITS: Final = {
     "ft": "feet", "feet": "feet", "foot": "feet", "usft": "feet", "mm": "millimetres", "cm": "centimetres",
     "km": "kilometres", "rad": "radians", "gon": "gon", "yd": "yards",

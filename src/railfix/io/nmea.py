@@ -57,8 +57,8 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Parameters
     ----------
     path : path
-        Text file, also packed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the ``$``
-        of a sentence is ignored; a sentence may lack its checksum.
+        Text file, plain or compressed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the
+        ``$`` of a sentence is ignored; a sentence may lack its checksum.
     broken_lines : {"stop", "count"}
         With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", it is
         skipped and noted, as a broken last line always is.
@@ -144,7 +144,9 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
 def _sentences(
     path: FilePath, lines: list[str], problems: list[InputFileError], counts: Counter[str]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and the fields of every sentence whose checksum is correct or absent; append `problems`."""
+    """Yield the line number and the fields of every sentence whose checksum is correct or absent; append errors to
+    `problems`.
+    """
     for number, line in enumerate(lines, start=1):
         _, dollar, text = line.partition("$")
         if not dollar:

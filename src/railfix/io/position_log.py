@@ -97,7 +97,7 @@ def skip_broken(
             if broken_lines == "stop" and error.line != cut:
                 raise InputFileError(path, f"{error.message}; {LENIENT}", line=error.line) from None
             if len(notes) == _MOST_BROKEN:
-                raise InputFileError(path, f"over {_MOST_BROKEN} lines are broken; the last one: {error}") from None
+                raise InputFileError(path, f"over {_MOST_BROKEN} lines cannot be read; last error: {error}") from None
             notes.append(f"{error}; the line was skipped")
             lines[error.line - 1] = ""
 
@@ -125,7 +125,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not geodetic and not cartesian:
         raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)} (name the columns to read by columns, --column latitude_deg=NAME)"
+            f"{', '.join(table.cells)} (to read other columns, give columns, --column latitude_deg=NAME)"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
@@ -166,8 +166,9 @@ def qualities_in_words(log: PositionLog) -> str:
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the file's column names by railfix's names from ``NAME=COLUMN`` texts; raise SettingsError for other
-    texts.
+    """Return the column names in the file by railfix's names, from texts ``NAME=COLUMN``.
+
+    Raise SettingsError for a text of another form.
     """
     columns: dict[str, str] = {}
     for pair in pairs:
@@ -275,7 +276,7 @@ def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
     least = max(9 + 1 if sexagesimal else 5 + 1, len(fields[0]))
     for (number, _), row in zip(rows, fields, strict=True):
         if len(row) < least:
-            message = f"{len(row)} fields; time, coordinates, quality and as many as in the first row were expected"
+            message = f"{len(row)} fields; expected time, coordinates, quality and as many fields as in the first row"
             raise InputFileError(path, message, line=number)
     columns = [pl.Series(column, dtype=pl.String) for column in zip(*(row[:least] for row in fields), strict=True)]
     calendar = "/" in fields[0][0]

@@ -120,13 +120,13 @@ def read_positions(
     ----------
     path : path
         An RTKLIB solution, a table with named columns (CSV), NMEA, GPX, NovAtel ASCII, or a receiver log with positions
-        (UBX, SBF); plain or packed.
+        (UBX, SBF); plain or compressed.
     broken_lines : {"stop", "count"}
         With "stop", a broken line raises InputFileError; with "count", it is skipped and noted. An incomplete last line
         is always skipped.
     date : datetime64, optional
-        UTC date of the first position in an NMEA log without dates (see `railfix.io.nmea.read_nmea`); time within half
-        a week of a UBX log whose positions have no date.
+        UTC date of the first position in an NMEA log without dates (see `railfix.io.nmea.read_nmea`). For a UBX log
+        whose positions have no date, any time within half a week of the log.
     columns : mapping of str, optional
         Column names in the file by railfix's names, for tables with other names: ``{"latitude_deg": "Lat"}``.
     heights : {"needed", "optional"}
@@ -176,12 +176,12 @@ def read_positions(
     if np.isnan(log.geodetic[0]).all():
         raise NoPositionError(f"{path}: has {plural(len(log), 'row')}, but none with a position")
     if heights == "needed" and log.plan_deg is not None and np.isnan(log.ecef_m).all():
-        raise InputFileError(path, "its positions have no height; expected heights above the ellipsoid (height_m)")
+        raise InputFileError(path, "the positions have no height; expected heights above the ellipsoid (height_m)")
     return _in_order(log)
 
 
 def _in_order(log: PositionLog) -> PositionLog:
-    """Return the log with slightly late rows sorted, and a note on times that go back."""
+    """Return the log sorted by time if rows are only slightly late, with a note on times that go back."""
     known = np.flatnonzero(~np.isnat(log.time))
     time = log.time[known]
     back = np.flatnonzero(np.diff(time) < np.timedelta64(0, "ns")) + 1

@@ -189,11 +189,11 @@ class Pulses:
 
     path: str
     time: Datetimes
-    #: Count of pulses, or distance [m] for the kind "distance"; falls where the train runs backward, if `signed`; shape
-    #: (P,).
+    #: Count of pulses, or distance [m] for the kind "distance"; shape (P,). If `signed`, the count falls where the
+    #: train runs backward.
     count: Floats
     kind: str  #: Source of the count: "count" (readings of a counter), "pulse" (single pulses) or "distance".
-    signed: bool  #: Whether the table has the running direction, as a column or by a falling count.
+    signed: bool  #: Whether the table states the running direction, by a column or by a falling count.
 
     def at(self, time: Datetimes) -> Floats:
         """Interpolate the count linearly; NaN outside the table and in gaps in which the count changes.
@@ -263,7 +263,7 @@ def read_pulses(path: FilePath) -> Pulses:
 def read_acceleration(path: FilePath) -> Acceleration:
     """Read a table of accelerations toward the front, CSV or Parquet, with ``time_gpst`` and one column of values.
 
-    ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
+    ``specific_force_mps2``, and ``force_forward_mps2`` in tables of the simulator, are measured by an accelerometer and
     include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the train's acceleration
     without gravity. Raise InputFileError if the table has none or several of these columns, or its times do not rise.
     """

@@ -1,4 +1,4 @@
-"""Reader of on-board sensor tables: CSV (also packed), Parquet, and EGNSS MATE tables."""
+"""Reader of on-board sensor tables: CSV (plain or compressed), Parquet, and EGNSS MATE tables."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
 def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     """Read an EGNSS MATE table as a table with `COLUMNS`.
 
-    Raise InputFileError if the table is of another kind, has several devices, or its forces do not include gravity.
+    Raise InputFileError if the table is of another kind, has several devices, or has forces that exclude gravity.
     """
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
@@ -161,7 +161,9 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     columns = _MATE_COLUMNS[name]
     table = only_device(path, read_mate(path, ("TIMESTAMP_UTC", *columns)))
     if name == "S_IMU" and table["COMPENSATED"].cast(pl.Boolean).fill_null(False).any():
-        raise InputFileError(path, "its forces are compensated for gravity; give specific forces, or no such table")
+        raise InputFileError(
+            path, "the forces are compensated for gravity; give specific forces, or leave the table out"
+        )
     codes = [column for column in table.columns if column.endswith("ERROR_CODE")]
     good = table.filter(pl.all_horizontal(pl.col(column).cast(pl.Int64).fill_null(0) == 0 for column in codes))
     values = [pl.col(column).cast(pl.Float64).alias(to) for column, to in columns.items()]

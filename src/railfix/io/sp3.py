@@ -28,7 +28,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     Parameters
     ----------
     paths : path or sequence of paths
-        SP3 files, plain or packed.
+        SP3 files, plain or compressed.
 
     Returns
     -------

@@ -30,7 +30,7 @@ Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
 class MessageStatus(IntEnum):
     """Reliability of a message's position."""
 
-    POSITION = 0  #: Position with every check passed.
+    POSITION = 0  #: Position that passed every check.
     COASTING = 1  #: Position from sensors alone.
     DOUBTFUL = 2  #: Position with a failed check, or several possible tracks or positions.
     NO_POSITION = 3  #: Observations received, but no position computed.
@@ -80,7 +80,7 @@ class TrainMessage(Message):
     sent_ns: Unsigned  #: Time of sending by the sender's clock, GPS time since 1980-01-06.
     line: Unsigned  #: Identity of the line or track.
     chainage_cm: Signed | None = None  #: Chainage of the train's front end; None without a position.
-    #: The front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4).
+    #: The front end is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
     speed_cmps: Signed | None = None  #: Speed, positive toward rising chainage; None where unknown.
@@ -97,10 +97,11 @@ class TrainMessage(Message):
     length_cm: Unsigned = 0  #: Train length.
     complete: bool = False  #: Whether the train's integrity is confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
-    #: Number of the newest movement authority that the train has accepted, which acknowledges it to the ground side.
+    #: Number of the newest movement authority that the train has accepted; it acknowledges this authority to the
+    #: ground.
     authority: Unsigned | None = None
     authority_end_cm: Signed | None = None  #: End of the train's movement authority, rounded away from the train.
-    interference: SuspectedInterference | None = None  #: None from trains without this check.
+    interference: SuspectedInterference | None = None  #: Suspected interference; None from trains without this check.
     #: Safe front end and safe rear end: no part of the train is ahead of the safe front end or behind the safe rear
     #: end, in the direction of `facing`. None without bounds, or where the end or the direction is unknown.
     safe_front_cm: Signed | None = None
@@ -128,7 +129,7 @@ _TRUTHS: Final = ("standstill", "complete")
 
 
 class MessageError(InputFileError):
-    """Error of bytes or text that are not a valid position message."""
+    """Error for bytes or text that are not a valid position message."""
 
     def __init__(self, what: str) -> None:
         super().__init__("position message", what)

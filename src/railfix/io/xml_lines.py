@@ -30,7 +30,7 @@ def read_root(path: FilePath) -> Element:
     content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros behind
     try:
         text: str | bytes = content.decode("utf-8")
-    except UnicodeDecodeError:  # in the encoding that the file declares
+    except UnicodeDecodeError:  # the parser uses the encoding that the file declares
         text = content
     try:
         return ElementTree.fromstring(text)

@@ -119,7 +119,7 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
 
 
 def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Compute the sine and the cosine after adding a small angle: exact to rounding below 1e-3 rad."""
+    """Compute sine and cosine after adding a small angle; below 1e-3 rad, they are exact to rounding."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
     small_cosine = 1.0 - square * (0.5 - square / 24.0)
@@ -197,7 +197,7 @@ _BLOCK: Final = 8192  #: Number of rows integrated at once, so that the arrays s
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
-    """Compute the Earth-fixed acceleration (3, n) [m/s^2] by central force, J2, Earth rotation, Moon and Sun."""
+    """Compute the Earth-fixed acceleration (3, n) [m/s^2] due to central force, J2, Earth rotation, Moon and Sun."""
     omega = EARTH_ROTATION_RATE_GLONASS
     x, y, z = position
     r2 = x * x + y * y + z * z
@@ -229,7 +229,7 @@ def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: 
 
 @dataclass(frozen=True)
 class GlonassStates:
-    """States of all records at multiples of the step from their reference times."""
+    """States of all GLONASS records at multiples of `STEP_S` from the reference time of each record."""
 
     #: States, with the reference time in the middle column, shape (3, records, 2 steps + 1) [m, m/s].
     position: Floats
@@ -251,7 +251,7 @@ class GlonassStates:
         return cls(position, velocity, luni_solar)
 
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
-        """Compute positions and velocities, (3, n), of records at times since their reference (n,) [s].
+        """Compute positions and velocities (3, n) of the records `row` at times since their reference times (n,) [s].
 
         Times are within `reach_s`.
         """
@@ -280,7 +280,7 @@ _STATES: Final = 4096  #: Number of states computed at once, so that the arrays 
 
 
 def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats) -> Floats:
-    """Interpolate the clocks of the file linearly at ``time + offset``, shape (n,) [s]."""
+    """Interpolate the clocks of a precise ephemeris linearly at ``time + offset``, shape (n,) [s]."""
     left = np.clip(np.searchsorted(ephemeris.time, time, side="right") - 1, 0, len(ephemeris.time) - 2)
     step = seconds(ephemeris.time[left + 1] - ephemeris.time[left])
     part = (seconds(time - ephemeris.time[left]) + offset_s) / step

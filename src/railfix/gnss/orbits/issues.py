@@ -20,7 +20,9 @@ _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 
 
 class _Issues:
-    """Index of records by satellite and issue, each used from half-way between the previous toe and the record's toe.
+    """Index of records by satellite and issue.
+
+    Each record is used from the time half-way between the previous toe and the toe of the record.
 
     With the same toe, F/NAV takes precedence over I/NAV.
     """
@@ -52,10 +54,10 @@ def _index_issues(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Return the row of `navigation.kepler` with the given issue and the nearest toe, shape (T, M); -1 if none is
-    valid.
+    """Return the row of `navigation.kepler` with the given issue and the nearest toe, shape (T, M); -1 if invalid.
 
-    `time` has the epochs, shape (T,); the records are not selected at the times of transmission.
+    `time` has the epochs of reception, shape (T,), for which the records are selected; the times of transmission are
+    not computed.
     """
     table = _index_issues(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)

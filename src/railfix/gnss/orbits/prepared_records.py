@@ -30,7 +30,7 @@ from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 #: broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: A record transmitted earlier than this before its validity begins has a wrong transmission time [s].
+#: A transmission time is wrong if it is earlier than the start of the record's validity by more than this [s].
 _EARLY_S: Final = 3600.0
 #: Time span that a lookup key can hold [ms]: 34 years, so that records of another year are kept apart.
 _SPAN: Final = np.int64(2**40)
@@ -39,15 +39,15 @@ _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 @dataclass(frozen=True)
 class Lookup:
-    """Records of all satellites in two sorted lists, each searched by bisection."""
+    """Records of all satellites in two lists for bisection, sorted by time of availability and by start of use."""
 
-    number: Mapping[str, int]  #: Number of a satellite (or of its message: "E01 INAV") in the lists.
+    number: Mapping[str, int]  #: Number in the lists by satellite, or by satellite and message ("E01 INAV").
     first: Integers  #: First record of each satellite in both lists, shape (satellites,).
     #: Satellite and time of availability [ms since `origin`] as one ascending number, and the row of the record table;
     #: shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: Start of use by reference time: half-way between the previous reference time and its own; shape (n,).
+    #: The same for the start of use, half-way between the previous and the record's reference time; shape (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -144,9 +144,9 @@ _ANY: Final = -1  #: All bits.
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
     """Return whether each record flags a signal as unhealthy, shape (n,).
 
-    A signal is flagged by any of the six health bits of GPS LNAV, by the bits of the signal of QZSS and Galileo, by the
-    bit of the band of CNAV, and by SatH1 or HS of BeiDou. A signal is also unhealthy if a Galileo record predicts no
-    accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
+    A signal is flagged by any of the six health bits in GPS LNAV, by the bits of this signal for QZSS and Galileo, by
+    the bit of the band in CNAV, and by SatH1 or HS for BeiDou. A signal is also unhealthy if a Galileo record predicts
+    no accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
     `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
@@ -255,15 +255,15 @@ _CACHED_SETS: Final = 64  #: Number of channel sets cached per navigation.
 class ChannelRecords:
     """Record rows, group delays and health of a set of channels."""
 
-    #: Channels of the constellations with Keplerian records, and of GLONASS; shape (K,), (R,).
+    #: Indices of the channels with Keplerian records, shape (K,), and of the GLONASS channels, shape (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers of the message with clock and delay of the signal, and of an alternative; -1 for none; shape (K,).
+    #: Lookup numbers of the message with the signal's clock and delay, and of another message; -1 for none; shape (K,).
     preferred: Integers
     other: Integers
 
     any_other: bool
-    signal: Integers  #: Row of `group_delay_s` and `unhealthy`, shape (K,).
+    signal: Integers  #: Row of each channel in `group_delay_s` and `unhealthy`, shape (K,).
     group_delay_s: Floats  #: Group delay by signal and record, shape (signals, records).
     unhealthy: Masks  #: Whether a signal is unhealthy by record, shape (signals, records).
     glonass_number: Integers  #: Lookup number of GLONASS channels, -1 for none; shape (R,).
@@ -329,7 +329,7 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
     return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
 
 
-#: Message with the group delay of a signal other than LNAV, D1 and D2, by constellation and signal.
+#: Message with a signal's group delay, by constellation and signal, if it is not LNAV, D1, D2 or a Galileo message.
 _MESSAGE_OF: Final = {
     **dict.fromkeys(("G2S", "G2L", "G2X", "G5I", "G5Q", "G5X", "J2S", "J2L", "J2X", "J5I", "J5Q", "J5X"), "CNAV"),
     **dict.fromkeys(("G1S", "G1L", "G1X", "J1S", "J1L", "J1X"), "CNV2"),
@@ -340,7 +340,7 @@ _MESSAGE_OF: Final = {
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return the preferred and the alternative name in the lookup; F/NAV has the clock of E1/E5a, I/NAV of E1/E5b."""
+    """Return the preferred and the alternative lookup label; F/NAV clocks are of E1/E5a, I/NAV clocks of E1/E5b."""
     if satellite[0] == "E":
         messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
         return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"

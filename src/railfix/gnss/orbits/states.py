@@ -26,7 +26,7 @@ _BLOCK: Final = 4096  #: Number of epochs of a channel computed at once, so that
 class SatelliteStates:
     """Satellite states at the times of transmission, T epochs by M channels.
 
-    NaN where a channel has no code, no record, or only records out of their validity.
+    Values are NaN where a channel has no code, no record or no valid record.
     """
 
     #: Position in the Earth-fixed frame at the time of transmission, not rotated to the time of reception
@@ -78,7 +78,7 @@ def satellite_states(
     result of an epoch and channel does not depend on other epochs and channels, to the last bit.
 
     Galileo channels on E5a use F/NAV records, and other Galileo channels use I/NAV records. Where no such record is
-    valid at an epoch, a valid record of the other message is used, with its clock and group delay.
+    valid at an epoch, a valid record of the other message is used, with the clock and group delay of that message.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 A record needs several subframes of one issue: three for GPS and QZSS, five words (I/NAV) or four pages (F/NAV) for
 Galileo, three (D1, B-CNAV1, B-CNAV2) or ten pages (D2) for BeiDou, and four strings for GLONASS. `assemble_records`
-combines the subframes of a piece with subframes of earlier pieces, so that records do not depend on the division of a
-stream.
+combines the subframes of one piece of a stream with the subframes of earlier pieces, so that the records do not depend
+on the division of the stream into pieces.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
 _STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which its strings 1 to 4 are sent [s].
-_EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch whose time it is assigned [s].
+_EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch that gives the string its time [s].
 #: Duration of a GLONASS frame [s].
 _FRAME_S: Final = 30.0
 
@@ -58,14 +58,14 @@ class Unfinished:
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     #: Issue of the last record by satellite and message, which identifies repetitions.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    #: First epoch after the last string, NaT if not yet received, by GLONASS satellite of which all four strings are
-    #: complete, but perhaps of different frames.
+    #: First epoch after the last string (NaT if not yet received) by GLONASS satellite, for satellites with all four
+    #: strings. The strings may be from different frames.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """Records of a piece of a stream, in order of completion."""
+    """Records assembled from one piece of a stream, in the order in which they were completed."""
 
     records: tuple[RawRecord, ...]
     complete_at: Datetimes  #: Time at which each record was complete, NaT where unknown.
@@ -83,7 +83,7 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides completed by a piece, and the new state.
+    """Return the ephemerides that one piece of a stream completes, and the unfinished records after it.
 
     `time` and `after` are the epochs before and after each subframe, shape (N,), and `first` is the first epoch of the
     piece. Unknown epochs are NaT.
@@ -101,7 +101,8 @@ def assemble_records(
 def assemble_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) without repetitions, and the new state.
+    """Return the ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) without repetitions, and the state after
+    them.
 
     `time` is the time of reception of each message, shape (N,).
     """
@@ -152,7 +153,7 @@ class _EphemerisBuilder:
         self.leap_seconds: int | None = None
 
     def needs_date(self, satellite: str, time: np.datetime64) -> bool:
-        """Return whether a record cannot be dated; if so, add its satellite to `undated`.
+        """Return whether a record cannot be dated; if so, add the satellite to `undated`.
 
         GPS and QZSS send ten bits of the week, and GLONASS sends only the time of day.
         """
@@ -162,7 +163,7 @@ class _EphemerisBuilder:
         return False
 
     def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
-        """Return the records, counts, and the unfinished state."""
+        """Return the completed records with the counts, and the unfinished records."""
         counts.update(f"{raw.satellite[0]} {why}" for raw, why in self.rejected)
         records = Assembled(
             records=tuple(self.records),
@@ -202,8 +203,9 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append records of complete GLONASS strings whose next epoch is known and, unless `until` is None, not after
-        it.
+        """Append the records of complete GLONASS strings for which the next epoch is known.
+
+        Unless `until` is None, only strings with a next epoch not after `until` are used.
         """
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):

@@ -57,7 +57,9 @@ class Frames:
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
     def structures(self, protocol: str, kinds: Iterable[int], layout: np.dtype) -> tuple[Indices, np.ndarray]:
-        """Return the indices of the frames of some kinds that are long enough for a layout, and their first fields."""
+        """Return the indices of frames of the given kinds that are long enough for a layout, and the fields of the
+        layout.
+        """
         chosen = self.of(protocol, *kinds)
         chosen = chosen[self.end[chosen] - self.start[chosen] >= layout.itemsize]
         return chosen, gather_structures(self.data, self.start[chosen], layout)
@@ -236,7 +238,7 @@ def is_receiver_log(head: bytes) -> bool:
 
 
 def read_head(path: FilePath) -> bytes:
-    """Return the first bytes of a file, unpacked."""
+    """Return the first bytes of a file after decompression."""
     with open_stream(path, content="bytes") as stream:
         return stream.read(_HEAD_BYTES)
 
@@ -297,7 +299,7 @@ class Subframes(RowArrays):
     #: Words of 30 or 32 bits, right-aligned; unused words are 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
     order: Integers  #: Offset in the stream, which determines the preceding epoch; shape (N,).
-    skipped: Mapping[str, int] = field(default_factory=dict)  #: Pages left out, by reason.
+    skipped: Mapping[str, int] = field(default_factory=dict)  #: Number of skipped pages by reason.
 
     def __len__(self) -> int:
         return len(self.satellite)

@@ -1,7 +1,7 @@
 """Read receiver logs (UBX, RTCM 3, SBF, also mixed) in pieces, with interference indicators and receiver positions.
 
-Sources: u-blox F9 HPG 1.32 interface description (UBX-22008968), 3.14.5 MON-RF, 3.14.2 MON-HW; u-blox X20 HPG 2.00
-(SEC-SIG, versions 1 and 2; SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
+Sources: u-blox interface descriptions F9 HPG 1.32 (UBX-22008968), sections 3.14.5 (MON-RF), 3.14.2 (MON-HW), and X20
+HPG 2.00 (SEC-SIG 1 and 2, SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, section 4.2.14 (both status blocks).
 """
 
 from __future__ import annotations
@@ -48,9 +48,8 @@ _MON_HW_BYTES: Final = 60
 _BLOCK: Final = 24  #: Bytes of each MON-RF block of u-blox, after a header of four bytes.
 _BANDS, _FRONT_ENDS = 12, 24  #: Offsets of Septentrio's first band block and first front-end block in the payload.
 _NO_GAIN: Final = -128
-#: Bytes of each event in u-blox SEC-SIGLOG, and time for which an event of a single trigger sets the alarm [s].
-_EVENT: Final = 8
-_TRIGGERED_S: Final = 10
+_EVENT: Final = 8  #: Bytes of each event in u-blox SEC-SIGLOG.
+_TRIGGERED_S: Final = 10  #: Time for which a SEC-SIGLOG event of a single trigger sets the alarm [s].
 _SIMULATED: Final = 0  #: SEC-SIGLOG detection type of simulated signals, the only type that sets an alarm.
 
 
@@ -63,7 +62,7 @@ class Indicators:
 
 
 def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
-    """Return alarm bits and gain at rising offsets `places`, shape (T,) each, and the indicators after all messages."""
+    """Return alarm bits and gain at ascending offsets `places`, shape (T,), and the indicators after all messages."""
     found = sorted(_messages(frames))
     alarm, gain = dict(before.alarm), before.gain
     alarms, gains = np.zeros(len(places), dtype=np.uint8), np.full(len(places), np.nan)
@@ -128,7 +127,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
     """Return the spoofing bit, set if simulated signals have begun and not ended, or were triggered within 10 s.
 
     Events of abnormal signals, inconsistent inertial data and abrupt changes are ignored, because tunnels cause them.
-    Jamming events are ignored, because they begin with a warning. None for a broken message.
+    Jamming events are ignored, because they begin with a warning. Return None for a broken message.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
@@ -139,7 +138,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit (interference not cancelled) and spoofing bit (misleading or unauthentic), or None."""
+    """Return the bits of jamming (not cancelled) and spoofing (misleading, unauthentic); None for a broken message."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -214,7 +213,8 @@ class StreamState:
     rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch, at first a date.
+    #: Time of the last epoch; before the first epoch, a time within half a week of the stream, NaT if unknown.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
     observed: bool = False  #: Whether UBX or SBF measurements with a time have been decoded.
     kind: str = ""  #: Kind of observation messages used, blank before the first epoch.
@@ -224,7 +224,7 @@ class StreamState:
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
-    """Decode a block of bytes; return its contents and the new state. Blocks may end anywhere in the stream."""
+    """Decode a block of bytes, which may end anywhere in the stream; return a decoded piece and the state after it."""
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:
@@ -295,7 +295,7 @@ def _places(frames: Frames, kind: str) -> Integers:
 
 
 def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Integers) -> str:
-    """Return the kind of the first epoch with a date, "" if there is none; other kinds repeat the same ranges."""
+    """Return the kind of message of the first dated epoch, "" if there is none; other kinds repeat the same ranges."""
     begins = {kind: _places(frames, kind)[-len(part.time)] for kind, part in own.items() if len(part.time)}
     if len(msm_places):
         begins[_MSM] = msm_places[0]
@@ -305,7 +305,7 @@ def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Int
 def _of_other_kinds(frames: Frames, kind: str) -> dict[str, int]:
     """Return the number of observation messages of each unused kind."""
     counts = {other: len(_places(frames, other)) for other in (_RAWX, _MEAS_EPOCH, _MSM) if other != kind}
-    return {f"{other} messages next to {kind}, which is used": n for other, n in counts.items() if n}
+    return {f"{other} messages not used, because {kind} is used": n for other, n in counts.items() if n}
 
 
 class _Dated(NamedTuple):
@@ -363,8 +363,8 @@ def scan_pieces(
 ) -> Iterator[LogPiece]:
     """Yield the pieces of a receiver log.
 
-    `progress` is called with the fraction read. `date`, within half a week of the log, resolves the week of RTCM 3 logs
-    without ephemerides. Raise MismatchError if the ephemerides contradict the date.
+    `progress` is called with the fraction of the file read. `date`, within half a week of the log, resolves the week of
+    RTCM 3 logs without ephemerides. Raise MismatchError if the ephemerides contradict the date.
     """
     state = StreamState(time=_week_of_log(path, date))
     with open_stream(path, content="bytes") as stream:

@@ -20,10 +20,8 @@ from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, list_fields
 
-_SLIP, _HALF_CYCLE = (
-    1,
-    2,
-)  #: RINEX loss-of-lock bits: lock lost since the previous epoch; half-cycle ambiguity possible.
+#: RINEX loss-of-lock bits: lock lost since the previous epoch, and half-cycle ambiguity possible.
+_SLIP, _HALF_CYCLE = 1, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +33,7 @@ class Measurements:
     #: Satellite and signal, blank where RINEX has no name; such measurements are counted but not used. Shape (N,).
     satellite: Strings
     signal: Strings
-    #: NaN where absent or declared invalid by the receiver, shape (N,).
+    #: Measured values, shape (N,); NaN where a value is absent or declared invalid by the receiver.
     code_m: Floats
     phase_cycles: Floats
     doppler_hz: Floats
@@ -54,14 +52,16 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """State after a piece: time of the last epoch, and lock time [s] and polarity of the last phase by channel."""
+    """State after a piece of a log: time of the last epoch, and lock time [s] and polarity of each channel's last
+    phase.
+    """
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def join_observations(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
-    """Return measurements as observations with sorted channels, and the new state.
+    """Return measurements as observations with sorted channels, and the tracking state after them.
 
     Epochs that are not later than all preceding epochs are skipped and counted.
     """
@@ -120,7 +120,7 @@ def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDA
 def _tracking_after(
     observations: Observations, tracking: Tracking, channels: Strings, lock_s: Floats, polarity: Floats
 ) -> Tracking:
-    """Return the state after a piece, with the last lock time and polarity of each channel."""
+    """Return the tracking state after a piece, with the last lock time and polarity of each channel."""
     rows = np.where(np.isnan(lock_s), -1, np.arange(len(lock_s))[:, None]).max(axis=0)
     seen = np.flatnonzero(rows >= 0)
     lock = {str(channels[k]): (float(lock_s[rows[k], k]), float(polarity[rows[k], k])) for k in seen.tolist()}
@@ -137,7 +137,9 @@ def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
 
 
 def slips(lock_s: Floats, polarity: Floats) -> Masks:
-    """Return which phases are discontinuous, shape (T, M): lock time 0 or less than before, or changed polarity.
+    """Return whether each phase is discontinuous, shape (T, M).
+
+    A phase is discontinuous if the lock time is 0 or has decreased, or if the polarity has changed.
 
     Inputs are NaN where there is no phase.
     """
@@ -175,7 +177,7 @@ def no_measurements(receiver: str) -> Measurements:
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
-    """Join the measurements of several pieces; epochs with equal time tags in different pieces stay separate."""
+    """Join the measurements of several pieces of a log; equal time tags in different pieces remain separate epochs."""
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     epoch = np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)])
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
@@ -188,7 +190,7 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-#: Record, and its issue, which distinguishes it from the satellite's next record.
+#: Record, and the issue of data that distinguishes the record from the next record of the satellite.
 Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
@@ -250,7 +252,7 @@ def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Recor
     """Return the Galileo record from the fields of I/NAV words 1 to 5, F/NAV pages 1 to 4, RTCM 1046 or RTCM 1045."""
     week, epoch = _week_and_toc(values, int(values["week"]) + _GALILEO_WEEK_MINUS_GPS, time)
     health = 0
-    for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # as RINEX packs them
+    for signal, bit in (("e5b", 6), ("e5a", 3), ("e1b", 0)):  # from high to low bits in the RINEX health word
         if f"{signal}_health" in values:
             health |= int(values[f"{signal}_health"]) << bit + 1 | int(values[f"{signal}_invalid"]) << bit
     numbers = {

@@ -149,8 +149,9 @@ CNAV: Final = _with_head(CNAV_HEAD, {
     | _klobuchar(192),
 })  # fmt: skip
 CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: Value of an unavailable CNAV group delay (IS-GPS-200N, 30.3.3.3.1.1).
-#: Reference semi-major axes [m] and rate of right ascension [rad/s] of CNAV (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+#: Reference semi-major axis of CNAV [m] by constellation letter (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
+#: Reference rate of right ascension of CNAV [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_OMEGA_DOT: Final = -2.6e-9 * _PI
 _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
     **_CNAV_ORBIT,
@@ -264,7 +265,7 @@ GLONASS_CODINGS: Final[dict[str, Coding]] = {
     "tau_s": (22, 2.0**-30, "m"),
     "dtau": (5, 2.0**-30, "m"),
 }
-#: GLONASS strings of 85 bits, the idle bit first, by number.
+#: Layouts of the GLONASS strings by string number. Each string has 85 bits, beginning with the idle bit.
 GLONASS: Final = {
     1: layout(GLONASS_CODINGS, hour=9, minute=14, half_minute=20, x_velocity=21, x_acceleration=45, x=50),
     2: layout(GLONASS_CODINGS, health=5, tb_s=9, y_velocity=21, y_acceleration=45, y=50),
@@ -277,7 +278,7 @@ URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 
 
 
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
-    """Return I/NAV words as bits (N, 128) from page pairs (N, 8), even page first, and whether they are valid.
+    """Return I/NAV words as bits (N, 128) from page pairs (N, 8), even page first, and whether each pair is valid.
 
     A pair is valid if its CRC is correct and neither page is an alert page.
     """
@@ -315,7 +316,7 @@ def glonass_hamming(bits: Bytes) -> Masks:
     return np.asarray(~wrong & (total == 0))
 
 
-#: Galileo data source of I/NAV (clock and group delay of E5b/E1), received on E1-B and on E5b-I.
+#: Galileo data sources of I/NAV (clock and group delay of E5b/E1): received on E1-B, and received on E5b-I.
 E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
 #: Galileo data source of F/NAV (clock and group delay of E5a/E1).
 E5A_SOURCE: Final = 1 << 1 | 1 << 8
@@ -324,14 +325,17 @@ _UBX_E5A: Final = (3, 4)
 _CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
 #: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
-#: Offsets of the numbers of F/NAV pages, CNAV messages and B-CNAV1 pages among the page numbers of a satellite.
+#: Offsets added to the numbers of F/NAV pages, CNAV messages and B-CNAV1 pages, so that the page numbers of a satellite
+#: are unique.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
 Pages = Iterator[tuple[int, int, Values]]  #: Row, page number of the satellite, and fields of each page.
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
-    """Return the decoded pages in the order of the stream (row, satellite, number, fields), and skipped counts."""
+    """Return the decoded pages in the order of the stream (row, satellite, number, fields), and the numbers of skipped
+    pages.
+    """
     counts = Counter(subframes.skipped)
     pages: list[tuple[int, str, int, Values]] = []
     letters = subframes.satellite.astype("<U1")

@@ -87,7 +87,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Return the channels known before, then the channels in 1020 messages; MSM4 and MSM6 do not contain channels."""
+    """Return the channels known before, and then those in messages 1020; MSM4 and MSM6 do not contain channels."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -132,7 +132,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
 
 
 def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
-    """Return the numbers of MSM without satellites, and of broken MSM, whose masks or length do not fit."""
+    """Return the number of MSM without satellites, and the number of MSM with inconsistent masks or length."""
     if len(messages) == used:
         return {}
     empty = int(np.count_nonzero(~take_bits(frames, messages, 137)[:, 73:137].any(axis=1)))
@@ -259,7 +259,7 @@ def _decode(
     near: np.datetime64,
     known: Integers,
 ) -> Measurements:
-    """Decode N messages with equal masks; `known` are GLONASS channels for messages without channels."""
+    """Decode N messages with equal masks; `known` has the GLONASS channels for messages that do not contain them."""
     system = SYSTEMS[number // 10]
     code_bits, code_step, phase_bits, phase_step, lock_bits, cn0_bits, cn0_step, with_rate = _LAYOUT[number % 10]
     n_satellites, n_cells = len(satellites), int(mask.sum())
@@ -369,7 +369,7 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: Week numbers in ephemeris messages: GPS week of week 0, and number of weeks after which the field repeats.
+#: Week field by ephemeris message: GPS week in which the field is 0, and number of weeks after which it repeats.
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 

@@ -35,11 +35,11 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
     6: {0: "1C", 2: "2C"},
     7: {0: "5A"},
 }
-#: Masks of the data bits in the parity equations of D25 to D30 of an LNAV word, and equations that contain the previous
-#: word's D29.
+#: Masks of the data bits in the parity equations of D25 to D30 of an LNAV word.
 _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
+#: Indices of the parity equations that contain D29 of the previous word.
 _LNAV_WITH_D29: Final = (0, 2, 5)
-#: Last plausible GPS week of a log, in 2079. After a later date, all following epochs would be out of order.
+#: Last plausible GPS week of a log, in 2079. If a later date were accepted, all following epochs would be out of order.
 _LAST_WEEK: Final = 5200
 #: Codes [m], phases [cycles] and Dopplers [Hz] from this value on are invalid; they exceed the fields of RINEX.
 _LARGEST: Final = 1e10

@@ -18,8 +18,9 @@ from railfix.io.file_kind import wrong_kind
 from railfix.io.rinex.observations_epochs import FaultLog
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_columns
 
-#: Time systems of TIME OF FIRST OBS, and the default time system by constellation of files without this record.
+#: Time systems that TIME OF FIRST OBS may name.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
+#: Time system of a file without TIME OF FIRST OBS, by constellation letter of the file.
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
 ALL: Final = ""  #: Key of the types of a RINEX 2 file, which apply to all constellations.
 #: Longest accepted header [bytes].

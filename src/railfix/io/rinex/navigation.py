@@ -43,7 +43,7 @@ class NavigationContent:
     seen: set[tuple[object, ...]] = field(default_factory=set)
 
     def add(self, record: RawRecord) -> None:
-        """Add a record, or count it as a duplicate, as in joined files of several receivers."""
+        """Add a record, or count a duplicate, which occurs in joined files of several receivers."""
         key = (record.satellite, record.epoch, record.message, *record.numbers)
         if key in self.seen:
             self.skipped["duplicate"] += 1
@@ -118,7 +118,7 @@ def _header_line(line: str, label: str, content: NavigationContent) -> None:
 
 
 #: Minimum and maximum number of lines of a record, including the epoch line, by constellation (RINEX 2.11, tables A4
-#: and A11; 3.05, tables A6 to A16). GLONASS has a fifth line since 3.05, whose flags are not needed.
+#: and A11; 3.05, tables A6 to A16). Since 3.05, GLONASS records have a fifth line of flags, which are not needed.
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
 #: Numbers of lines of messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
 _LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
@@ -136,7 +136,7 @@ _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navigation:
-    """Read all records of one or several navigation files, plain or packed.
+    """Read all records of one or several navigation files, plain or compressed.
 
     With "count", a broken record is counted in `skipped` and described in `notes`. Raise InputFileError if a file is
     missing, is not a navigation file, or (with "stop") has a broken record, or if no file has a usable record.

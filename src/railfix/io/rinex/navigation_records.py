@@ -24,8 +24,8 @@ _GLONASS: Final = (
     "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
     "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
 ).split()
-#: Names of the first numbers of CNAV and of CNV1 to CNV3; CNAV records have no toe, which equals toc (IS-GPS-200,
-#: 30.3.3.1.1).
+#: Names of the first numbers of CNAV and of CNV1 to CNV3; CNAV records do not contain toe, because toe equals toc
+#: (IS-GPS-200, 30.3.3.1.1).
 _ORBIT_4: Final = (
     "af0_s af1 af2 a_dot crs delta_n m0 cuc eccentricity cus sqrt_a {} cic omega0 cis i0 crc omega omega_dot "
     "i_dot delta_n_dot "
@@ -131,7 +131,7 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
 
 
 def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Convert Keplerian records; blank rates, corrections, health and issues are 0, as defined by RINEX."""
+    """Convert Keplerian records; blank rates, corrections, health and issues are read as 0, as defined by RINEX."""
     column = _columns(raw)
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
     system = satellite.astype("<U1")

@@ -54,7 +54,7 @@ def write_navigation(
     packing : {"plain", "gz"}, optional
         By default from the file name (``.gz``).
     version : {"3.04", "4.02"}
-        Version 4 names the message of each record, and has the ionosphere as records.
+        Version 4 names the message of each record, and stores the ionospheric coefficients as records.
     comments : sequence of str
         Comment lines of at most 60 ASCII characters.
     created : datetime64, optional

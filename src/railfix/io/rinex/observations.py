@@ -223,7 +223,7 @@ def _runs(
 ) -> Iterator[Observations]:
     """Yield runs of epochs of all files in order of time.
 
-    Raise InputFileError if no file has a usable epoch, and MismatchError if no epoch is selected or files are of
+    Raise InputFileError if no file has a usable epoch, and MismatchError if no epoch is selected or the files are from
     different runs.
     """
     firsts = [first_time(path) for path in paths] if len(paths) > 1 else []
@@ -239,7 +239,7 @@ def _runs(
         last = readers[-1]
         if not any(reader.epochs for reader in readers):
             raise InputFileError(
-                last.path, "has no usable epoch; with broken_lines='stop' (no --lenient) the first fault is named"
+                last.path, "has no usable epoch; read it with broken_lines='stop' (no --lenient) to see the first fault"
             )
         begin, end = first_time(paths[0]), np.datetime64(max(reader.last_ns for reader in readers), "ns")
         what = f"is of {str(begin)[:19]} to {str(end)[:19]}"
@@ -308,7 +308,7 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
     """Yield pieces of `epochs` epochs from runs; the first piece is a fifth as long, so that processing begins early.
 
-    Problems are reported in the piece during whose collection they were found.
+    Each problem is reported in the piece that was being collected when the problem was found.
     """
     waiting: list[Observations] = []
     length, size = 0, -(-epochs // _FIRST_PART)

@@ -1,7 +1,7 @@
 """Decode satellite lines to dense arrays of epochs by channels, without Python loops over epochs or channels.
 
-Two 64-bit words hold a field of sixteen characters, and eight digits in one integer become their value in three
-multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
+A field of sixteen characters is held in two 64-bit words. Eight digits in one word are converted to their value by
+three multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
 doi:10.1145/360933.360994). The exact integer of thousandths divided by 1000 is the same as ``float(text)``. Fields of
 other forms are read singly with `float`.
 """
@@ -99,9 +99,8 @@ def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
-#: Number of satellite names on a RINEX 2 epoch line, and column of the first name.
-NAMES_PER_LINE: Final = 12
-_FIRST_NAME: Final = 32
+NAMES_PER_LINE: Final = 12  #: Number of satellite names on a RINEX 2 epoch line.
+_FIRST_NAME: Final = 32  #: Column of the first satellite name on a RINEX 2 epoch line.
 #: Number of observations on a RINEX 2 line.
 FIELDS_PER_LINE: Final = 5
 _LETTERS: Final = range(ord("A"), ord("Z") + 1)

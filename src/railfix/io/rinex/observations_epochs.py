@@ -122,7 +122,7 @@ LABELS: Final = frozenset(
         "PRN / # OF OBS",
     )
 )  # fmt: skip
-#: Number of lines that exceeds the largest epoch, whose count has three digits.
+#: Number of lines that no epoch reaches, because the number of satellites has at most three digits.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
@@ -313,7 +313,7 @@ class _Walk:
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _header_records(self, position: int, *, at_end: bool) -> int:
-        """Add header records among the epochs as one event, and return the line at which to continue.
+        """Store the header records found between epochs as one event, and return the line at which to continue.
 
         Records that may continue after the end of the block are left for the next block.
         """

@@ -27,9 +27,8 @@ class Lines:
     """Lines of a block of text."""
 
     data: Bytes  #: The text, padded with blanks so that fixed columns may extend beyond the end of a line.
-    #: Start of each line, and its length without line end (LF or CR LF); shape (n,).
-    start: Integers
-    length: Integers
+    start: Integers  #: Start of each line, shape (n,).
+    length: Integers  #: Length of each line without the line end (LF or CR LF), shape (n,).
     stop: Integers  #: Start of the next line, shape (n,).
     number: Integers  #: 1-based line numbers in the (decompressed) file, shape (n,).
 

@@ -42,7 +42,7 @@ def detect_packing(path: FilePath) -> Packing:
 
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
-    """Open a stream to a file, packed as requested or by the file name; the file is created only if there is no error.
+    """Open a stream to a file, packed as requested or as the file name implies; an error leaves no file.
 
     Raise ValueError if the packing is unknown, and OutputError if the text cannot be compressed.
     """
@@ -114,9 +114,8 @@ def program_line(created: np.datetime64 | None) -> str:
 
 
 _BLOCK_EPOCHS: Final = 1024  #: Number of epochs formatted at once.
-#: Bytes of an epoch line with its line end, and of an observation (F14.3, LLI, SSI).
-_EPOCH_WIDTH: Final = 36
-_FIELD_WIDTH: Final = 16
+_EPOCH_WIDTH: Final = 36  #: Number of bytes of an epoch line, including the line end.
+_FIELD_WIDTH: Final = 16  #: Number of bytes of an observation (F14.3, LLI, SSI).
 _BLANK: Final = ord(" ")
 #: ``_FOUR[n]`` is n as four digits.
 _FOUR: Final = (np.arange(10_000)[:, None] // (1000, 100, 10, 1) % 10 + ord("0")).astype(np.uint8)
@@ -281,7 +280,7 @@ def _text_blocks(piece: Observations, columns: Mapping[str, Sequence[str]]) -> I
 
 
 def _satellite_lines(part: Observations, row: _WrittenRows) -> tuple[Bytes, Masks]:
-    """Format the lines of one constellation, shape (T, S, width); return them, and which bytes are to be written."""
+    """Format the lines of one constellation, shape (T, S, width); return the lines and a mask of the bytes to write."""
     epochs, satellites, width = len(part), len(row.satellites), 3 + _FIELD_WIDTH * len(row.columns) + 1
     text = np.full((epochs, satellites, width), _BLANK, dtype=np.uint8)
     text[:, :, :3] = np.array(row.satellites, dtype="S3").view(np.uint8).reshape(satellites, 3)
