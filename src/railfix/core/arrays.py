@@ -30,7 +30,7 @@ Strings = NDArray[np.str_]  #: Names, for example of satellites.
 def copy_with(instance: Instance, **values: Any) -> Instance:
     """Copy a frozen dataclass with changed attributes, without calling ``__init__`` and ``__post_init__``.
 
-    Values of cached properties are copied, too.
+    Values of cached properties are also copied.
     """
     copy = object.__new__(type(instance))
     copy.__dict__.update(instance.__dict__, **values)

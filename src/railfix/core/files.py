@@ -34,10 +34,10 @@ from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip,
 from railfix.core.staged_files import FilePath as FilePath
 
 Paths = FilePath | Sequence[FilePath]  #: Path of one file, or paths of several files.
-#: Policy of a reader for a broken line: stop with an error, or skip and count it.
+#: Policy of a reader for a malformed line: stop with an error, or skip and count the line.
 BrokenLines = Literal["stop", "count"]
 Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation files.
-#: Last clause of the message about a broken line, with the option that skips such lines.
+#: Last clause of the message about a malformed line, with the option that skips these lines.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
 #: Endings of the names of compressed files; the ending before them shows the kind of file.
@@ -339,7 +339,7 @@ def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> Byte
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
         spool.flush()
         source = spool
-    # the decoder inherits the file descriptor, whose position a `source.seek` within the buffer does not move
+    # the decoder inherits the file descriptor; `source.seek` within the buffer does not move the descriptor
     os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
     program = held.enter_context(hatanaka_program("crx2rnx"))

@@ -79,7 +79,7 @@ class Observations(NotebookTable):
 
     time: Datetimes  #: Receiver time tags in GPS time, not rounded, strictly rising; shape (T,).
     satellite: Strings  #: Satellite of each channel, such as "G01" or "J02"; shape (M,).
-    #: RINEX 3 observation code of each channel without its type letter, such as "1C" or "2I"; shape (M,). RINEX 2 codes
+    #: RINEX 3 observation code of each channel without the type letter, such as "1C" or "2I"; shape (M,). RINEX 2 codes
     #: are mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
     signal: Strings
     code_m: Floats  #: Pseudorange, shape (T, M).
@@ -99,7 +99,7 @@ class Observations(NotebookTable):
     #: the number of further faults. A slice of epochs has no messages.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of faults.
-    #: Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs, external events,
+    #: Number of items skipped, by kind: malformed epochs and satellite lines, duplicate epochs, external events,
     #: satellites of unknown or unselected constellations.
     skipped: Mapping[str, int] = field(default_factory=dict)
 

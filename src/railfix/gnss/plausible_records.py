@@ -79,7 +79,7 @@ def unrelated_times(records: KeplerRecords) -> Masks:
 
 
 def plausible_kepler(records: KeplerRecords) -> Masks:
-    """Return whether semi-major axis and eccentricity of each record fit its constellation, shape (n,)."""
+    """Return whether semi-major axis and eccentricity of each record fit the constellation, shape (n,)."""
     axis, letter = records.sqrt_a**2, records.satellite.astype("<U1")
     fine = np.zeros(len(records), dtype=np.bool_)
     for name, limits in _AXES_M.items():

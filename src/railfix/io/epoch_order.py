@@ -44,7 +44,7 @@ class EpochOrder:
         self._break = False
 
     def ordered(self, runs: Iterable[FileEpochs]) -> Iterator[Observations]:
-        """Yield the epochs in rising order of time; the last part has no epochs, only notes and counts.
+        """Yield the epochs in order of time; the last part yielded has no epochs, only notes and counts.
 
         Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """

@@ -51,10 +51,10 @@ def read_observations(
     ----------
     path : path or sequence of path
         RINEX observation files, logs in UBX, SBF or RTCM 3 (other protocols in between are skipped), or EGNSS MATE
-        tables S_GNSS_SAT; plain or packed. Several files must be of one kind, and are read in order of time.
+        tables S_GNSS_SAT; plain or compressed. Several files must be of one kind, and are read in order of time.
     broken_lines : {"stop", "count"}
-        With "stop", a broken RINEX line raises InputFileError. With "count", the values or epochs that it affects are
-        skipped and counted. Broken messages in a receiver log are always skipped and counted.
+        With "stop", a malformed RINEX line raises InputFileError. With "count", the values or epochs that the line
+        affects are skipped and counted. Malformed messages in a receiver log are always skipped and counted.
     systems : iterable of str, optional
         Letters of the constellations to read, all by default.
     start, end : datetime64 or str, optional
@@ -64,7 +64,7 @@ def read_observations(
         have no week number.
     reader : {"railfix", "georinex"}
         "georinex" reads RINEX files with georinex, an independent reader, for comparison. georinex is slower, ignores
-        events, scale factors and the indicators of bands other than 1 and 2, and does not count broken lines.
+        events, scale factors and the indicators of bands other than 1 and 2, and does not count malformed lines.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     ----------
     paths : path or sequence of path
     broken_lines : {"stop", "count"}
-        With "stop", a broken record raises InputFileError. With "count", it is counted in `Navigation.skipped` and
+        With "stop", a malformed record raises InputFileError. With "count", it is counted in `Navigation.skipped` and
         described in `Navigation.notes`.
     date : datetime64 or str, optional
         Any time within half a week of the logs; needed for RTCM 3 logs whose records have no full date.

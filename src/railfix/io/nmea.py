@@ -60,8 +60,8 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
         Text file, plain or compressed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the
         ``$`` of a sentence is ignored; a sentence may lack its checksum.
     broken_lines : {"stop", "count"}
-        With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", it is
-        skipped and noted, as a broken last line always is.
+        With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", the
+        sentence is skipped and noted. A malformed last line is always skipped and noted.
     date : datetime64, optional
         UTC date of the first GGA, for logs without RMC and ZDA. If `date` is given, the dates in the log are ignored.
 
@@ -74,7 +74,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Raises
     ------
     InputFileError
-        The file has no GGA sentence or no date, or a sentence is broken and `broken_lines` is "stop".
+        The file has no GGA sentence or no date, or a sentence is malformed and `broken_lines` is "stop".
     """
     problems: list[InputFileError] = []
     fixes: list[_Gga] = []

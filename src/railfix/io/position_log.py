@@ -70,7 +70,7 @@ class PositionLog(NotebookTable):
         return bool((self.quality >= 0).any())
 
 
-#: Number of broken lines beyond which a file is not accepted as a log.
+#: Number of malformed lines beyond which a file is not accepted as a log.
 _MOST_BROKEN: Final = 200
 Parsed = TypeVar("Parsed")
 
@@ -80,8 +80,9 @@ def skip_broken(
 ) -> tuple[Parsed, tuple[str, ...]]:
     """Parse the lines of a log; return the result, and a note on each skipped line.
 
-    With "count", broken lines below the header are skipped; with "stop", only an incomplete last line, as left by a
-    power cut. Raise InputFileError if any other line is broken, or more than `_MOST_BROKEN` lines are broken.
+    With "count", malformed lines below the header are skipped. With "stop", only an incomplete last line is skipped,
+    which a power cut may leave. Raise InputFileError if any other line is malformed, or if there are more than
+    `_MOST_BROKEN` malformed lines.
     """
     text = read_text(path)
     lines = text.splitlines()

@@ -85,7 +85,7 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
                 latitude, longitude, height = (float(v) for v in body[2:5])
                 rows.append((float(week), float(seconds), latitude, longitude, height, -1, *[np.nan] * 3))
         except (ValueError, IndexError):
-            raise InputFileError(path, f"the {name} log is broken", line=number) from None
+            raise InputFileError(path, f"the {name} log cannot be read", line=number) from None
         lines.append(number)
     if not rows:
         raise InputFileError(path, "there is no BESTPOSA, INSPVAA, INSPVASA or INSPVAXA log with a position")
@@ -122,8 +122,8 @@ def read_positions(
         An RTKLIB solution, a table with named columns (CSV), NMEA, GPX, NovAtel ASCII, or a receiver log with positions
         (UBX, SBF); plain or compressed.
     broken_lines : {"stop", "count"}
-        With "stop", a broken line raises InputFileError; with "count", it is skipped and noted. An incomplete last line
-        is always skipped.
+        With "stop", a malformed line raises InputFileError; with "count", it is skipped and noted. An incomplete last
+        line is always skipped.
     date : datetime64, optional
         UTC date of the first position in an NMEA log without dates (see `railfix.io.nmea.read_nmea`). For a UBX log
         whose positions have no date, any time within half a week of the log.
@@ -143,7 +143,7 @@ def read_positions(
     Raises
     ------
     InputFileError
-        The file is not a position log, a line is broken, heights are missing, or there are several antennas.
+        The file is not a position log, a line is malformed, heights are missing, or there are several antennas.
     NoPositionError
         No row has a position.
     SettingsError

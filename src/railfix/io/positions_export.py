@@ -56,8 +56,8 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return the path of the QGIS style to write for a file; None if its format has no style or the style is already
-    there.
+    """Return the path of the QGIS style to write for a file; None if the format has no style or the style file already
+    exists.
     """
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):

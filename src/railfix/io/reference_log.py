@@ -243,7 +243,7 @@ def read_pulses(path: FilePath) -> Pulses:
     The count is in the column ``count`` (reading of a counter, which falls when the train runs backward and never
     wraps), ``pulse`` (number of a pulse, as for `railfix run`) or ``distance_m`` (distance run). Without these columns,
     each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. Raise InputFileError if the file is not
-    such a table, its times do not rise, or a direction is neither 1 nor -1.
+    such a table, the times do not rise, or a direction is neither 1 nor -1.
     """
     table = read_sensor_table(path, "pulses")
     names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
@@ -265,7 +265,7 @@ def read_acceleration(path: FilePath) -> Acceleration:
 
     ``specific_force_mps2``, and ``force_forward_mps2`` in tables of the simulator, are measured by an accelerometer and
     include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the train's acceleration
-    without gravity. Raise InputFileError if the table has none or several of these columns, or its times do not rise.
+    without gravity. Raise InputFileError if the table has none or several of these columns, or the times do not rise.
     """
     table = read_sensor_table(path, "acceleration")
     kinds = {

@@ -42,7 +42,7 @@ _WHOLE: Final = ("pulse", "direction")  #: Integer columns.
 
 
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
-    """Read a sensor table of a kind in `COLUMNS`; names are text, and times are GPS time and do not fall.
+    """Read a sensor table of a kind in `COLUMNS`; names are text, and times are GPS time in order.
 
     Rows with only a time are dropped. Raise InputFileError if the file is not such a table or has no rows, or if a
     value is missing or wrong; the message names the row.
@@ -111,7 +111,7 @@ def _check_times(path: FilePath, column: pl.Series, kind: str) -> None:
     wrong = np.flatnonzero(step <= nothing if kind in _COMPLETE else step < nothing)
     if len(wrong):
         how = "falls" if step[wrong[0]] < nothing else "repeats the row before"
-        raise InputFileError(path, f"row {int(wrong[0]) + 3}: time_gpst {how}; sort the rows, keep each time once")
+        raise InputFileError(path, f"row {int(wrong[0]) + 3}: time_gpst {how}; sort the rows and keep each time once")
     if kind in _COMPLETE and not len(step):
         raise InputFileError(path, "has fewer than two rows")
 

@@ -39,7 +39,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     Raises
     ------
     InputFileError
-        A file is missing, is not an SP3 file, is in an unknown time system, or is broken; all files together have
+        A file is missing, is not an SP3 file, is in an unknown time system, or is malformed; all files together have
         fewer epochs than the interpolation needs; or all positions are at implausible radii.
     """
     files = path_names(paths)

@@ -101,7 +101,7 @@ _AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "a_dot", "delta_n_dot", "
 
 
 def is_beidou_geo(satellite: str) -> bool:
-    """Return whether a satellite is a BeiDou GEO by its number: C01 to C05, C59 to C63 (B1I ICD, table 4-1)."""
+    """Return whether a satellite number belongs to a BeiDou GEO: C01 to C05, C59 to C63 (B1I ICD, table 4-1)."""
     return satellite[:1] == "C" and (int(satellite[1:]) <= 5 or int(satellite[1:]) >= 59)
 
 

@@ -57,7 +57,7 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return the record of each satellite at each time, its validity, and whether it was sent later, shapes (M, T).
+        """Return records by satellite and time, whether they are valid, and whether they are sent later, shapes (M, T).
 
         The record is a row of the record table, -1 without records. The record is valid if its toe differs from the
         epoch by at most `limit`, which has one value per row of the table.

@@ -44,7 +44,7 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Constellation of RTCM ephemeris messages.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which its strings 1 to 4 are sent [s].
+_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which strings 1 to 4 are sent [s].
 _EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch that gives the string its time [s].
 #: Duration of a GLONASS frame [s].
 _FRAME_S: Final = 30.0

@@ -294,7 +294,7 @@ class Subframes(RowArrays):
     """Raw navigation words in the layout of UBX, N rows in the order of the stream."""
 
     satellite: Strings
-    signal: Integers  #: Signal number (UBX sigId; other formats are translated to it); shape (N,).
+    signal: Integers  #: Signal number as UBX sigId, also for other formats; shape (N,).
     glonass_channel: Integers  #: Frequency channel of a GLONASS satellite, shape (N,).
     #: Words of 30 or 32 bits, right-aligned; unused words are 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]

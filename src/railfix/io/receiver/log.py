@@ -55,10 +55,10 @@ _SIMULATED: Final = 0  #: SEC-SIGLOG detection type of simulated signals, the on
 
 @dataclass(frozen=True, kw_only=True)
 class Indicators:
-    """Latest alarm bits of each kind of message, and latest front-end gain, NaN before the first gain."""
+    """Latest interference indicators of a receiver."""
 
-    alarm: Mapping[int, int] = field(default_factory=dict)
-    gain: float = np.nan
+    alarm: Mapping[int, int] = field(default_factory=dict)  #: Alarm bits by kind of message.
+    gain: float = np.nan  #: Front-end gain, NaN before the first gain.
 
 
 def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
@@ -96,7 +96,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _mon_rf(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit, which any band sets, and the gain of the first band; None for a broken message."""
+    """Return the jamming bit, which any band sets, and the gain of the first band; None for a malformed message."""
     if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
         return None
     blocks = data[4:].reshape(-1, _BLOCK)
@@ -105,7 +105,7 @@ def _mon_rf(data: Bytes) -> tuple[int, float] | None:
 
 
 def _mon_hw(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit and gain from receivers up to the M8; None for a broken message."""
+    """Return the jamming bit and gain from receivers up to the M8; None for a malformed message."""
     if len(data) != _MON_HW_BYTES:
         return None
     return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
@@ -127,7 +127,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
     """Return the spoofing bit, set if simulated signals have begun and not ended, or were triggered within 10 s.
 
     Events of abnormal signals, inconsistent inertial data and abrupt changes are ignored, because tunnels cause them.
-    Jamming events are ignored, because they begin with a warning. Return None for a broken message.
+    Jamming events are ignored, because they begin with a warning. Return None for a malformed message.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
@@ -138,7 +138,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the bits of jamming (not cancelled) and spoofing (misleading, unauthentic); None for a broken message."""
+    """Return the bits of jamming (not cancelled) and spoofing (misleading, unauthentic); None if malformed."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -149,7 +149,7 @@ def _rf_status(data: Bytes) -> tuple[int, float] | None:
 
 
 def _receiver_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the gain of the first front end [dB], NaN if unavailable; None for a broken message."""
+    """Return the gain of the first front end [dB], NaN if unavailable; None for a malformed message."""
     if len(data) < _FRONT_ENDS or int(data[20]) < 1 or len(data) < _FRONT_ENDS + int(data[21]):
         return None
     gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])

@@ -30,7 +30,8 @@ class Measurements:
 
     time: Datetimes  #: Time tags in the order of the stream, shape (T,).
     epoch: Indices  #: Epoch of each measurement, shape (N,).
-    #: Satellite and signal, blank where RINEX has no name; such measurements are counted but not used. Shape (N,).
+    #: Satellite and signal of each measurement, shape (N,); blank where RINEX has no name. Measurements without a name
+    #: are counted but not used.
     satellite: Strings
     signal: Strings
     #: Measured values, shape (N,); NaN where a value is absent or declared invalid by the receiver.
@@ -52,11 +53,10 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """State after a piece of a log: time of the last epoch, and lock time [s] and polarity of each channel's last
-    phase.
-    """
+    """State of phase tracking after a piece of a log."""
 
-    last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
+    #: Lock time [s] and polarity of the last phase of each channel, by channel name.
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -313,8 +313,8 @@ def _frame_s(values: Values) -> float:
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
     """Return the GPS week of toe, and toc as GPS time.
 
-    The broadcast week is the week of transmission; near its end, toe may be in the next week. RTCM 3 has no time of
-    transmission, so the time of reception `time` is used instead.
+    The broadcast week is the week of transmission; near the end of a week, toe may be in the next week. RTCM 3 has no
+    time of transmission, so the time of reception `time` is used instead.
     """
     sent_s = values.get("tow_s", values["toe_sow_s"] if np.isnat(time) else float(to_week(time)[1]))
     sent = from_week(week, sent_s)

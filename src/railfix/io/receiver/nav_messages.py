@@ -219,8 +219,8 @@ D1: Final = _with_head(BDS_HEAD, {
               omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
               omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
 })  # fmt: skip
-#: First bit of each page of D2 subframe 1 in the 3000 bits of its ten consecutive pages; fields that extend over two
-#: pages are given in pieces.
+#: First bit of each page of D2 subframe 1 in the 3000 bits of ten consecutive pages. Fields that extend over two pages
+#: are defined in pieces.
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
 D2: Final = layout(
     BEIDOU_CODINGS,
@@ -418,7 +418,7 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
     heads = dict.fromkeys(range(1, 11), BDS_HEAD)
     for row, k, head in _of_kinds(bits, valid & geo & (subframe == 1), read_unsigned(bits, 42, 4), heads, 100):
         packed = int("".join(map(str, bits[row].tolist())), 2)
-        yield row, k, {**head, "page": packed}  # the whole page, because its fields cross the ends of pages
+        yield row, k, {**head, "page": packed}  # the whole page, because fields extend over the ends of pages
 
 
 def _glonass(part: Subframes, counts: Counter[str]) -> Pages:

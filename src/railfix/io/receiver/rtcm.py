@@ -66,11 +66,11 @@ def _lock_table(bits: int) -> Floats:
 
 
 class ChannelNews(NamedTuple):
-    """GLONASS frequency channels in order of reception: offset in the stream, satellite number, channel, (N,) each."""
+    """GLONASS frequency channels in order of reception, N rows."""
 
-    place: Indices
-    number: Integers
-    channel: Integers
+    place: Indices  #: Offset in the stream, shape (N,).
+    number: Integers  #: Number of the satellite, shape (N,).
+    channel: Integers  #: Frequency channel, shape (N,).
 
     def latest(self) -> dict[int, int]:
         """Return the last known channel by satellite number."""

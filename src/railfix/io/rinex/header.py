@@ -102,7 +102,7 @@ def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: 
 
 
 def read_version(path: FilePath, line: str) -> float:
-    """Return the version of a RINEX file from its first line; raise InputFileError if it is not supported."""
+    """Return the version of a RINEX file from its first line; raise InputFileError if the version is not supported."""
     try:
         version = float(line[:9])
     except ValueError as error:

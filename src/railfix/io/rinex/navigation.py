@@ -32,10 +32,11 @@ _ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
 
 @dataclass
 class NavigationContent:
-    """Records and header values of one or several files; `klobuchar` has eight coefficients by constellation letter."""
+    """Records and header values of one or several files."""
 
     broken_lines: BrokenLines
     records: list[RawRecord] = field(default_factory=list)
+    #: Eight Klobuchar coefficients, alpha and beta, by constellation letter.
     klobuchar: dict[str, list[float]] = field(default_factory=dict)
     leap_seconds: int | None = None
     skipped: Counter[str] = field(default_factory=Counter)
@@ -52,7 +53,7 @@ class NavigationContent:
         self.records.append(record)
 
     def reject(self, error: InputFileError) -> None:
-        """Raise the error of a broken record, or count and note it."""
+        """Raise the error of a malformed record, or count and note the error."""
         if self.broken_lines == "stop":
             raise InputFileError(error.path, f"{error.message}; {LENIENT}", line=error.line)
         self.drop("broken", error)
@@ -138,8 +139,8 @@ _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navigation:
     """Read all records of one or several navigation files, plain or compressed.
 
-    With "count", a broken record is counted in `skipped` and described in `notes`. Raise InputFileError if a file is
-    missing, is not a navigation file, or (with "stop") has a broken record, or if no file has a usable record.
+    With "count", a malformed record is counted in `skipped` and described in `notes`. Raise InputFileError if a file is
+    missing, is not a navigation file, or (with "stop") has a malformed record, or if no file has a usable record.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -162,12 +163,12 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
 
 @dataclass(frozen=True)
 class _Block:
-    """Lines of one record: first line number, satellite name, message (empty before RINEX 4), text."""
+    """Lines of one record."""
 
-    line: int
-    name: str
-    message: str
-    text: list[str]
+    line: int  #: Number of the first line in the file, from 1.
+    name: str  #: Name of the satellite as written.
+    message: str  #: Name of the message, empty before RINEX 4.
+    text: list[str]  #: Text of the lines.
     last: bool = False  #: Whether this is the last record of the file, which may be incomplete.
 
 

@@ -85,13 +85,13 @@ _TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this f
 
 @dataclass(frozen=True)
 class RawRecord:
-    """Record of a file, with the epoch in the constellation's time, and numbers in file order."""
+    """Navigation record as read from a file or assembled from messages."""
 
     system: str
     satellite: str
     message: str
-    epoch: np.datetime64
-    numbers: list[float]
+    epoch: np.datetime64  #: Clock reference time in the time system of the constellation (UTC for GLONASS).
+    numbers: list[float]  #: Numbers of the record in RINEX order (`fields`); NaN where blank.
     version: float
 
     @property

@@ -1,9 +1,9 @@
 """Reader of RINEX 2, 3 and 4 observation files of one receiver.
 
-Reading in pieces and reading at once use the same code. With ``broken_lines="stop"``, a broken line raises
-`InputFileError`. With "count", the record, satellite, epoch or rest of the file that the line breaks is skipped,
-counted and described in `Observations.problems`. An error in the header that changes how the file is read is always
-raised.
+Reading in pieces and reading at once use the same code. With ``broken_lines="stop"``, a malformed line raises
+`InputFileError`. With "count", the part that cannot be read because of the line (a record, satellite, epoch or the rest
+of the file) is skipped, counted and described in `Observations.problems`. An error in the header that changes how the
+file is read is always raised.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Part of a log to read, and policy for broken lines."""
+    """Part of a log to read, and policy for malformed lines."""
 
     broken_lines: BrokenLines = "stop"
     systems: frozenset[str] | None = None  #: Constellation letters, None for all.

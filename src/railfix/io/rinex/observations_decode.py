@@ -62,11 +62,11 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
 def read_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
-    """Return values, loss-of-lock digits and bad fields of n satellite lines by k observation types, shape (n, k).
+    """Return values, loss-of-lock digits and a mask of bad fields for n satellite lines by k types, shape (n, k).
 
     Values are NaN where blank or bad, and digits are 0 there. A field is bad if it is neither blank nor a number, or if
-    one of its two indicators is neither blank nor a digit. `index` is the field number of each type, and `divisor` its
-    scale factor (SYS / SCALE FACTOR), shape (k,); the other arguments are as in `gather`.
+    one of its two indicators is neither blank nor a digit. `index` is the field number of each type, shape (k,), and
+    `divisor` the scale factor of each type (SYS / SCALE FACTOR), shape (k,); the other arguments are as in `gather`.
     """
     value, lock, odd = kernels.reading.decode_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
@@ -81,7 +81,7 @@ def read_fields(
 
 
 def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
-    """Read decimal numbers of any form that end in the last column of the value; return values and wrong fields."""
+    """Read decimal numbers of any form that end in the value's last column; return values and a mask of bad fields."""
     value = np.full(len(flat), np.nan)
     wrong = np.ones(len(flat), dtype=np.bool_)
     characters = flat.tobytes().decode("latin-1")
@@ -108,12 +108,12 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
 @dataclass(frozen=True)
 class DecodedRows:
-    """Satellites of a run of epochs, shape (n,): epoch, constellation, number (-1 if unreadable), first line."""
+    """Satellites of consecutive epochs, n rows."""
 
-    epoch: Integers
-    letter: Bytes
-    number: Integers
-    line: Integers
+    epoch: Integers  #: Index of the epoch, shape (n,).
+    letter: Bytes  #: Constellation letter as ASCII code, shape (n,).
+    number: Integers  #: Number of the satellite, -1 if it cannot be read; shape (n,).
+    line: Integers  #: Index of the first observation line of the satellite in `Lines`, shape (n,).
 
     def __getitem__(self, which: Masks | Integers) -> DecodedRows:
         return take_rows(self, which)

@@ -71,12 +71,12 @@ class FaultLog:
         self._problems += rest
 
     def note(self, message: str) -> None:
-        """Record a broken record, with its complete message."""
+        """Count a malformed header record, and store the complete message about it."""
         self.count(RECORDS, 1)
         self.remark(message)
 
     def remark(self, message: str) -> None:
-        """Record a deviation from the format that loses no data, with its complete message."""
+        """Store the complete message about a deviation from the format that loses no data."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
@@ -263,7 +263,7 @@ class _Walk:
         return _with_events(self._head[self._kept], self._events), position
 
     def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
-        """Keep the epochs from the k-th up to a gap or a broken epoch, and return the line at which to continue."""
+        """Keep the epochs from the k-th up to a gap or a malformed epoch, and return the line at which to continue."""
         later = self._breaks[np.searchsorted(self._breaks, k) :]
         last = int(later[0]) if len(later) else len(self._line) - 1
         beyond = int(np.searchsorted(self._line, stop))
@@ -290,7 +290,7 @@ class _Walk:
         return bound
 
     def _other(self, position: int, k: int, *, at_end: bool) -> int:
-        """Handle a line that is not an epoch line: an event without time, or a broken line."""
+        """Handle a line that is not an epoch line: an event without time, or a malformed line."""
         if _is_record(self._lines, position):
             return self._header_records(position, at_end=at_end)
         event = event_line(self._lines, position)

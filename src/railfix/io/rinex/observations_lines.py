@@ -72,17 +72,13 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 
 @dataclass(frozen=True)
 class EpochHeads:
-    """Epoch lines and events of a block, shape (n,).
+    """Epoch lines and events of a block, n rows."""
 
-    `time_ns` is in the file's time system since 1970, 0 for events. Flag and count are -1 where unreadable. `flaw` is
-    an index into `FLAWS`, 0 for a valid line.
-    """
-
-    line: Integers
-    flag: Integers
-    count: Integers
-    time_ns: Integers
-    flaw: Integers
+    line: Integers  #: Index of the epoch line in `Lines`, shape (n,).
+    flag: Integers  #: Epoch flag, -1 if it cannot be read; shape (n,).
+    count: Integers  #: Number of satellites or of header records, -1 if it cannot be read; shape (n,).
+    time_ns: Integers  #: Time since 1970 in the file's time system [ns], 0 for events; shape (n,).
+    flaw: Integers  #: Index into `FLAWS`, 0 for a valid line; shape (n,).
 
     def __len__(self) -> int:
         return len(self.line)
@@ -222,13 +218,13 @@ _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "
 
 @dataclass(frozen=True)
 class SignalColumn:
-    """Column of an observation type: position, type as declared, position in `KINDS`, signal, divisor."""
+    """Column of an observation type in satellite lines."""
 
-    index: int
-    name: str
-    kind: int
-    signal: str
-    divisor: float
+    index: int  #: Index of the type among the declared types.
+    name: str  #: Observation type as declared in the header, such as "C1C".
+    kind: int  #: Index of the array of the type in `KINDS`.
+    signal: str  #: Signal of the type, such as "1C".
+    divisor: float  #: Scale factor by which values are divided (SYS / SCALE FACTOR).
 
 
 def find_signal(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
