@@ -339,11 +339,11 @@ trains = [{ number = 1, station = "A", track = 1, direction = 1, front_m = 300, 
 
 
 def test_a_state_of_an_older_version_is_refused(state: Interlocking) -> None:
-    with pytest.raises(InputFileError, match="older version of railfix; give another database"):
+    with pytest.raises(InputFileError, match="older version of railfix; choose another database"):
         from_documents({"interlocking": '{"trains": [], "points": [], "stopped": false, "granted": 3}'})
     texts = to_documents(state)
     older = {name: str(text).replace('"runs_by"', '"unbraked"') for name, text in texts.items()}
-    with pytest.raises(InputFileError, match="older version of railfix; give another database"):
+    with pytest.raises(InputFileError, match="older version of railfix; choose another database"):
         from_documents(older)
 
 

@@ -309,7 +309,7 @@ def test_nothing_is_granted_after_a_start_until_every_train_is_heard(desk: Desk)
     assert {number: known.end_m for number, known in desk.state.trains.items()} == ends
     assert any("nothing is granted until" in alarm for alarm in desk.centre.alarms)
     desk.report(1, 1500.0, authority=900, authority_end_cm=245_000, speed_cmps=1000, direction=1, standstill=False)
-    assert "the newest in the centre's database at its start was" in (desk.state.trains[1].stop or "")
+    assert "the newest in the centre's database at the last start was" in (desk.state.trains[1].stop or "")
     assert desk.state.trains[1].interval_m[1] == 2450.0  # what it may still run to is occupied
     assert desk.state.granted >= 900
     desk.steps(0.2)
@@ -661,7 +661,7 @@ def test_a_start_on_board_with_a_clock_an_hour_back_goes_on_with_a_word(desk: De
     assert desk.state.trains[1].front_m == 406.0
     assert any("train 1: started again on board" in line for line in desk.centre.lines)
     desk.report(1, 402.0, session=5, sent_ns=time_ns - 2_000_000_000, time_ns=time_ns)
-    assert "set that clock" in (desk.centre.snapshot()["trains"][0]["rejected"] or "")
+    assert "set the train's clock" in (desk.centre.snapshot()["trains"][0]["rejected"] or "")
 
 
 def test_an_order_to_brake_from_before_the_start_stops_the_train(desk: Desk) -> None:

@@ -1,6 +1,6 @@
 """Messages from the centre to a train: movement authority with speed limits, and order to brake.
 
-Each message is a canonical CBOR array of its kind, version and fields.
+Each message is a canonical CBOR array: kind of the message, version, and fields.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from railfix.core.messages import Message
 from railfix.ground.layout import MOST_PARTS
 from railfix.io.train_message import MessageError, cbor, validate_message
 
-#: Version of the messages; a receiver rejects other versions.
+#: Version of the message format; a receiver rejects messages of other versions.
 VERSION: Final = 3
 
 Number = Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -23,24 +23,29 @@ GradientPart = tuple[Chainage, Annotated[int, Field(ge=-1000, le=1000)]]
 
 
 class Authority(Message):
-    """Movement authority, sent after each report of the train, at a stop, and at least every second."""
+    """Movement authority, sent after each report of the train, when the train is stopped, and at least every second."""
 
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
-    number: Number  #: Number that rises with every authority sent to the train, also across restarts of the centre.
-    #: Sequence number of the train's newest report that the centre has stored, 0 before the first. The authority
-    #: acknowledges this report, and the age of the authority on board is the time since the train sent the report.
+    #: Number of the authority, which rises with every authority sent to the train, even after the centre has restarted.
+    number: Number
+    #: Sequence number of the train's newest report that the centre has stored, 0 before the first report. The authority
+    #: acknowledges this report. On board, the age of the authority is the time since this report was sent.
     report: Number
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
     stopped: bool  #: Whether the train is ordered to stop.
-    #: Whether the train is requested to accept this end instead of a farther end, if it can stop before this end.
+    #: Whether the train is requested to accept `end_cm` instead of the farther end of an earlier authority, if the
+    #: train can stop before `end_cm`.
     shortens: bool = False
-    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Identifier of the on-board start that `report` belongs to.
+    #: Session in which `report` was sent; the on-board unit draws a new identifier at each start.
+    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     overlap_cm: Number = 0  #: Distance kept free beyond the end for a train that passes the end at release speed.
-    #: Chainages, lower first, and highest speed [cm/s] of each speed restriction in the interval.
+    #: Lower chainage [cm], upper chainage [cm] and highest speed [cm/s] of each speed restriction in the train's
+    #: interval.
     restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()
-    #: Gradient in thousandths, positive uphill with rising chainage, from each chainage to the next part's chainage.
+    #: Chainage [cm] from which each gradient applies, until the next part's chainage, and gradient [per mille],
+    #: positive where the track rises with the chainage.
     gradients: Annotated[tuple[GradientPart, ...], Field(max_length=MOST_PARTS)] = ()
 
     def encode(self) -> bytes:
@@ -65,7 +70,7 @@ class Authority(Message):
         found: dict[Any, type[Authority]] = {Authority.kind: Authority, BrakeOrder.kind: BrakeOrder}
         model = found.get(kind) if type(kind) is int else None
         if model is None or version != VERSION:
-            raise MessageError(f"is of kind {kind!r} and version {version!r}; an authority of {VERSION} was expected")
+            raise MessageError(f"is of kind {kind!r} and version {version!r}; version {VERSION} was expected")
         if len(values) != len(model.model_fields):
             raise MessageError(f"has {len(values)} fields, {len(model.model_fields)} were expected")
         message = validate_message(model, dict(zip(model.model_fields, values, strict=True)))
@@ -75,7 +80,7 @@ class Authority(Message):
 
 
 class BrakeOrder(Authority):
-    """Order to brake to a stop, which is sent without a commit and repeated until a report names its number.
+    """Order to brake to a stop, sent without waiting for a commit and repeated until a report names this order.
 
     `number` is the latest authority's number. A later authority without `stopped` ends the order.
     """

@@ -16,23 +16,24 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 GRAVITY_MPS2: Final = 9.80665
-#: Upper limit of the speed search [m/s], and the number of its bisections.
+#: `_largest`: upper limit of the search for a speed [m/s], and number of bisections.
 _TOP_MPS, _HALVINGS = 150.0, 40
 
 
 class BrakeLimits(Settings):
-    """Brakes of a train, and the delays before they act."""
+    """Brakes of a train, and the delays before the brakes act."""
 
-    #: Deceleration on level track, and the fraction of this deceleration that braking curves assume.
-    braking_mps2: float = Field(default=0.5, gt=0)
+    braking_mps2: float = Field(default=0.5, gt=0)  #: Deceleration of the braked train on level track.
+    #: Fraction of `braking_mps2` that braking curves assume.
     safety: float = Field(default=0.9, gt=0, le=1)
-    least_mps2: float = Field(default=0.05, gt=0)  #: Least deceleration assumed on any downhill gradient.
+    least_mps2: float = Field(default=0.05, gt=0)  #: Lower limit of the deceleration assumed on downhill gradients.
     build_up_s: float = Field(default=2.0, ge=0)  #: Time from the intervention until the brakes act.
     cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most `build_up_s`.
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
-    reaction_s: float = Field(default=3.0, ge=0)  #: Driver's time between the permitted-speed and intervention curves.
-    over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restriction at which the intervention begins.
+    #: Driver's reaction time; the permitted-speed curve is this time ahead of the intervention curve.
+    reaction_s: float = Field(default=3.0, ge=0)
+    over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restricted speed at which the intervention begins.
 
 
 class Target(NamedTuple):
@@ -43,16 +44,17 @@ class Target(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Stepwise gradients, uphill positive, each from its position to the next; level before the first position."""
+    """Stepwise gradients, positive uphill; each applies up to the next position, and 0 before the first."""
 
     from_m: Sequence[float] = ()
     gradient: Sequence[float] = ()
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed from which a train that brakes at `at_m` reaches the target speed there [m2/s2].
+    """Return the square of the speed at `at_m` from which a braking train reaches the target at its speed [m2/s2].
 
-    ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target it is below ``v_target^2``.
+    ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)`` from `at_m` to the target, with a: `braking_mps2`,
+    g: gravity, i: gradient, least: `least_mps2`. Beyond the target, the result is below ``v_target^2``.
     """
     if at_m >= target.at_m:
         return target.speed_mps**2 - (at_m - target.at_m)
@@ -75,7 +77,10 @@ def deceleration_mps2(at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
 
 
 def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the stopping position of a train that brakes now, with build-up time and traction until cut-off [m]."""
+    """Return the position at which a train that begins to brake at `at_m` stops [m].
+
+    The train first runs on for the build-up time of the brakes, with traction until cut-off.
+    """
     place, speed = _after_build_up(at_m, speed_mps, brakes)
     square, ahead = speed**2, [step for step in steps.from_m if step > place]
     for step in ahead:
@@ -88,7 +93,7 @@ def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits)
 
 
 def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple[float, float]:
-    """Return the position [m] and speed [m/s] at which the brakes act."""
+    """Return the position [m] and speed [m/s] at which the brakes act after an intervention at `at_m`."""
     cut = min(brakes.cut_s, brakes.build_up_s)
     faster = speed_mps + brakes.traction_mps2 * cut
     way = speed_mps * cut + 0.5 * brakes.traction_mps2 * cut**2 + faster * (brakes.build_up_s - cut)
@@ -96,11 +101,11 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 
 
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
-    """Return the speed above which the train is braked, at once or after `before_s` [m/s].
+    """Return the highest speed at which an intervention, now or `before_s` later, is in time for the target [m/s].
 
-    The result is the largest speed at which the train is on the curve of `braking_speed` when its brakes act. Between
-    two changes of gradient, the position at which the brakes act and the square of the curve are linear in the speed,
-    which gives a quadratic equation. The equations are solved from the target backward.
+    At this speed, the train is on the curve of `braking_speed` when the brakes act. Between two changes of gradient,
+    the position at which the brakes act is linear in the train's speed, and the square of the curve is linear in this
+    position. This gives one quadratic equation per gradient; the equations are solved from the target backward.
     """
     if at_m >= target.at_m:
         return 0.0
@@ -120,7 +125,7 @@ def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLim
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Return the largest speed [m/s] for which `fits` is true, as for all lower speeds; 0 if there is none."""
+    """Return the largest speed for which `fits` is true, or 0 [m/s]; `fits` must be true for all lower speeds."""
     low, high = 0.0, _TOP_MPS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -136,7 +141,7 @@ def release_mps(overlap_m: float, at_m: float, steps: Steps, brakes: BrakeLimits
 
 
 class Supervised(NamedTuple):
-    """Speeds of a train at a position [m/s], and the target that determines them."""
+    """Supervised speeds of a train [m/s], and the target with the lowest permitted speed."""
 
     permitted_mps: float
     warning_mps: float
@@ -155,9 +160,9 @@ def supervise(
     steps: Steps | None = None,
     brakes: BrakeLimits,
 ) -> Supervised:
-    """Return the supervised speeds of a train at its safe front and rear ends, the lowest over all targets.
+    """Return the lowest supervised speeds over all targets, for a train with given safe front and rear ends.
 
-    Each restriction has its start [m], end [m] and speed [m/s], and applies to the whole train.
+    Each restriction consists of start [m], end [m] and speed [m/s], and applies while any part of the train is inside.
     """
     steps = steps or Steps()
     release = release_mps(overlap_m, end_m, steps, brakes)
@@ -178,7 +183,10 @@ def supervise(
 def _supervised(
     front_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, release: float = 0.0
 ) -> Supervised:
-    """Return the supervised speeds for a target, at least the target speed and, up to the target, `release` [m/s]."""
+    """Return the supervised speeds for one target.
+
+    No speed is below the target speed, nor, up to the target, below `release` [m/s].
+    """
     aimed = target if target.speed_mps == 0.0 else target._replace(speed_mps=target.speed_mps + brakes.over_mps)
     brake, warn = (intervention_mps(front_m, aimed, steps, brakes, before_s=s) for s in (0.0, brakes.warning_s))
     permitted = intervention_mps(front_m, target, steps, brakes, before_s=brakes.reaction_s)

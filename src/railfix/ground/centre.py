@@ -1,10 +1,11 @@
 """State and displayed position of each train in the control centre; the display is not a safety function.
 
-A pure state machine (P5 3.1): `report_received` and `time_passed` take a train's record and return its new record.
+A pure state machine (P5 3.1): `report_received` and `time_passed` take the record of a train and return the new record.
 The displayed position is indicative only; a train occupies the interval from its last safe rear end to the end of the
 authority (`railfix.ground.interlocking`).
 
-A reference run curve is the position over running time in one direction, for simulated running.
+A reference run curve is a train's position over running time in one direction. With this curve, the centre simulates
+the running of a train that has stopped reporting.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from railfix.core.arrays import Floats, copy_with, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Acceleration of the reference run curve [m/s^2]; distance within which a train is at a station [m].
+#: Acceleration of the reference run curve [m/s^2], and distance from a stopping position within which a train is at the
+#: station [m].
 _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
 
 
@@ -30,7 +32,7 @@ class ReferenceCurve:
 
     direction: int  #: Running direction: 1 toward rising chainage, -1 toward falling.
     running_s: Floats  #: Running time without the dwell times at stations, strictly rising; shape (N,).
-    chainage_m: Floats  #: Front of the train, strictly rising or, with direction -1, falling; shape (N,).
+    chainage_m: Floats  #: Position of the train's front, strictly rising or, with direction -1, falling; shape (N,).
     stations_m: Floats  #: Stopping positions of the front, in the order of the run; shape (K,).
 
     def __post_init__(self) -> None:
@@ -45,7 +47,7 @@ class ReferenceCurve:
     def between_stations(cls, stations_m: Floats, *, speed_mps: float) -> Self:
         """Return the curve of a run that starts and stops at each station with constant acceleration.
 
-        `stations_m`, shape (K,), are in the order of the run. Between stations that are near each other the train does
+        `stations_m`, shape (K,), are in the order of the run. Between stations that are close together, the train does
         not reach `speed_mps`.
         """
         direction = 1 if stations_m[-1] > stations_m[0] else -1
@@ -68,7 +70,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position after a running time from `from_m`, limited to the next station [m]."""
+        """Return the position that a train reaches `elapsed_s` after `from_m`, at most the next station [m]."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -83,7 +85,9 @@ class ReferenceCurve:
         return nearest if distance[nearest] <= _AT_STATION_M else None
 
     def progress(self, chainage_m: float) -> tuple[int, float]:
-        """Return the section, by its first station, and the progress in it in running direction [%].
+        """Return the number of the station at which a section begins, and the progress in this section [%].
+
+        Stations are numbered in running direction.
 
         In P5 3.1 a train at a station reports the station, otherwise the section and the progress in percent of the
         section's length.
@@ -101,7 +105,7 @@ class TrainState(Enum):
     UNKNOWN = "unknown"
     #: Reports are accepted.
     TRACKED = "tracked"
-    #: No report for `lost_s`: the train is shown by simulated running on the reference run curve.
+    #: No report for `lost_s`: the displayed position is simulated on the reference run curve.
     SIMULATED = "simulated"
     #: No report for too long, or the simulated position has reached the end of the authority.
     ERROR = "error"
@@ -110,15 +114,16 @@ class TrainState(Enum):
 class CentreLimits(Settings):
     """Limits for the reports of trains."""
 
-    #: Time without an accepted report after which a train is shown by simulated running.
+    #: Time without an accepted report after which the displayed position is simulated.
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)  #: Time without an accepted report after which a train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
-    #: Largest delay of a train's clock behind the instants of its positions, and largest undetected variation of its
-    #: delays.
+    #: Largest delay of a train's clock behind the times of the train's positions. The time between two positions is
+    #: assumed to be longer by this value, because the delay of the clock may vary.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest lead of a sequence number over the newest number, and increase of this lead per second since its arrival.
+    #: Largest accepted lead of a sequence number over the newest sequence number, at the arrival of the newest.
     jump: int = Field(default=1000, ge=1)
+    #: Increase of the largest accepted lead per second since the newest sequence number arrived.
     rate: float = Field(default=20.0, gt=0)
 
     @model_validator(mode="after")
@@ -135,15 +140,16 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 before the first.
-    session: int = 0  #: Identifier of the on-board start that `sequence` belongs to.
-    retired: tuple[int, ...] = ()  #: Identifiers of earlier on-board starts, whose late messages are rejected.
+    session: int = 0  #: Session that `sequence` belongs to; the on-board unit draws a new identifier at each start.
+    retired: tuple[int, ...] = ()  #: Identifiers of earlier sessions, whose late messages are rejected.
     counted_s: float | None = None  #: Centre's clock at the arrival of the newest sequence number [s].
-    rejected: str | None = None  #: Reason why the newest report was rejected.
+    rejected: str | None = None  #: Reason why the newest report was rejected, None if it was accepted.
     message: TrainMessage | None = None  #: Newest report with a position.
     heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of `message` [s].
     measured_s: float = 0.0  #: Centre's clock at the instant for which the position of `message` is valid [s].
     shown_m: float | None = None  #: Displayed position of the front end [m].
-    #: Reported minus simulated position at the last resynchronisation, positive in running direction [m].
+    #: Reported minus displayed position when the train last reported again after simulated running, positive in running
+    #: direction [m].
     jump_m: float | None = None
 
 
@@ -153,25 +159,26 @@ class Rejection(Enum):
     UNKNOWN_TRAIN = "of a train that is not supervised"
     OTHER_TRAIN = "of another train"
     REPEATED = "repeated or older than the newest"
-    EARLIER_START = "of an earlier start on board"
-    FAR_AHEAD = "sequence number higher than the train can have reached; start its unit again"
+    EARLIER_START = "sent before the on-board unit was restarted"
+    FAR_AHEAD = "sequence number higher than the train can have reached; restart the on-board unit"
     NO_PLACE = "without a position"
     NO_FACING = "the direction of the front end is unknown"
     NO_FRONT_END = "the position of the front end is unknown"
-    TOO_OLD = "position too old when it was sent, or later than the train's clock; set that clock"
+    TOO_OLD = "position too old when it was sent, or later than the train's clock; set the train's clock"
 
 
-#: Number of earlier on-board starts that are stored.
+#: Number of earlier sessions of the on-board unit whose identifiers are stored.
 _RETIRED = 16
 
 
 def report_received(
     record: TrainRecord, message: TrainMessage, now_s: float, *, limits: CentreLimits
 ) -> tuple[TrainRecord, Rejection | None]:
-    """Return the record after a report, and the reason if the report is rejected.
+    """Return the record after a report, and the reason for rejecting the report, None if it is accepted.
 
-    The instant of the measurement is computed from the age of the position by the train's own clock, so that the clocks
-    of train and centre need not agree. The delay of the link, which is unknown, is neglected.
+    The time of the measurement is the time of arrival minus the age of the position. The age is computed with the
+    train's own clock, so that the clocks of train and centre need not agree. The unknown delay of the link is
+    neglected.
     """
     if message.train != record.train:
         return record, Rejection.OTHER_TRAIN
@@ -220,7 +227,7 @@ def time_passed(
     authority_m: float | None = None,
     limits: CentreLimits,
 ) -> TrainRecord:
-    """Return the record at a later instant, with the state and displayed position after a time without reports.
+    """Return the record at a later instant if the train has not reported: state and displayed position.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
 """Changes of trains by order: correct an interval; enter, remove, join and divide trains.
 
-Reports cannot show these changes; a person who has observed them enters them. Each change leaves its trains stopped, to
-be released one by one (`railfix.ground.stops.release_train`), and frees nothing that a train may still occupy.
+Reports cannot show these changes; a person who has observed them enters them. Each change leaves the changed trains
+stopped, to be released one by one (`railfix.ground.stops.release_train`), and frees no track that a train may still
+occupy.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Changed = tuple[Interlocking, str | None]
 def _placed(
     train: TrainInterval, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
 ) -> TrainInterval | str:
-    """Return a train between two chainages, without an authority, or the reason why it cannot be there."""
+    """Return a train moved to two chainages, without an authority, or the reason why the train cannot be there."""
     low, high = sorted((rear_m, front_m))
     if direction not in (-1, 1) or track not in (1, 2):
         return "direction must be -1 or 1, and track 1 or 2"
@@ -33,7 +34,7 @@ def _placed(
         return "the interval reaches beyond the line"
     stations = layout.stations_between(low, high)
     tracks = dict.fromkeys(stations, track)
-    # between stations the route ends where it began, in the station behind the train
+    # the route of a train between two stations ends in the station behind the train
     behind = [k for k, s in enumerate(layout.stations) if direction * (s.begin_m - front_m) < 0.0]
     station = max(behind) if direction > 0 else min(k for k, s in enumerate(layout.stations) if s.end_m > front_m)
     if station not in tracks:
@@ -58,9 +59,9 @@ def correct_interval(
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason for a refusal.
 
-    The train's route and authority end, and the train's locks on points are removed. The train must therefore report
-    that it obeys an order to brake which no authority in transit can end, unless all authorities have lapsed on board
-    (`lapsed`).
+    The train's route and authority end, and the train's locks on points are removed. The train must therefore have
+    reported that it obeys an order to brake, and no authority in transit may be able to end that order. This is not
+    required if all authorities have lapsed on board (`lapsed`).
     """
     known = state.trains.get(train)
     if known is None:
@@ -77,7 +78,7 @@ def correct_interval(
 
 
 def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
-    """Return the reason for refusal if a train may still run by an authority in transit, otherwise None."""
+    """Return the reason for a refusal if an authority in transit may still permit a train to run, otherwise None."""
     if known.runs_by is None or lapsed:
         return None
     return (
@@ -97,7 +98,10 @@ def enter_train(
     front_m: float,
     track: int,
 ) -> Changed:
-    """Return the state with a train added anywhere on the line, even without reports, and the reason for a refusal."""
+    """Return the state with a train added at any position, and the reason for a refusal.
+
+    The train need not have reported.
+    """
     if train in state.trains:
         return state, f"train {train} exists already"
     if not 0 < train < 1 << 32 or not length_m > 0.0:
@@ -132,9 +136,9 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 
 
 def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
-    """Return the state without a train, whose sections are then occupied by vehicles that do not report.
+    """Return the state without a train; the sections of the train's interval become occupied by unreported vehicles.
 
-    The sections are freed by their detection, or by the order of a person who has seen that they are free. As in
+    A section is freed by its detection, or by the order of a person who has seen that the section is free. As in
     `correct_interval`, no authority in transit may permit the train to run.
     """
     known = state.trains.get(train)
@@ -148,7 +152,8 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # the section of a whole station counts only for its points, because its tracks are separate sections
+        # a section that is a whole station is barred only if the train is on the points, as the tracks are separate
+        # sections
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None
@@ -157,7 +162,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
 def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
     """Return the state in which train `other` is joined to train `lead` ahead of it, and the reason for a refusal.
 
-    The joined train has the number `lead`, the sum of both lengths, and the interval of both trains.
+    The joined train has the number `lead`, the sum of both lengths, and an interval that includes both intervals.
     """
     first, second = state.trains.get(lead), state.trains.get(other)
     if first is None or second is None or lead == other:
@@ -187,7 +192,7 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
 
 
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
-    """Return the state in which the rear part of a train, behind its first `length_m`, is the new train `other`.
+    """Return the state in which the part of a train behind the train's first `length_m` is the new train `other`.
 
     Until the parts are apart, their intervals overlap by the uncertainty of the position. The second value is the
     reason for a refusal.

@@ -1,7 +1,7 @@
-"""Running control centre: supervision with its store, the monitor of satellite positioning, log, and page values.
+"""Control centre in operation: supervision, store, monitor of satellite positioning, log, and values of the page.
 
-Authorities, which also acknowledge reports, are committed before they are sent: a centre that is killed at any moment
-restarts with every authority that its trains may have received.
+Authorities, which also acknowledge reports, are committed to the store before they are sent. A centre that is killed at
+any moment therefore restarts with every authority that its trains may have received.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _CAUSE = "cause of the stop"
 
 
 def _severity(verdict: TriangleVerdict) -> int:
-    """Return the rank of a verdict; of the verdicts between two steps, one of the highest rank is used."""
+    """Return the severity of a verdict; each step uses the most severe verdict since the previous step."""
     if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
-        return 2  # absent fixes stop trains only once they are late
+        return 2  # missing fixes stop trains only after `MonitorLimits.late_s`
     return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
 
 
 @dataclass(kw_only=True)
 class StopOrder:
-    """Order to stop sent to a train, with the times until its acknowledgement and until standstill [s]."""
+    """Order to stop, with the times from sending it to its acknowledgement and to the train's standstill [s]."""
 
     number: int
     sent_s: float
@@ -59,7 +59,7 @@ class StopOrder:
         return rests
 
     def __str__(self) -> str:
-        """Return the times in words."""
+        """Return the times to acknowledgement and standstill in words."""
         taken = "not acknowledged" if self.acknowledged_s is None else f"acknowledged after {self.acknowledged_s:.1f} s"
         return taken if self.rest_s is None else f"{taken}, at rest after {self.rest_s:.1f} s"
 
@@ -72,8 +72,8 @@ class ControlCentre:
     store: Store
     curves: dict[int, ReferenceCurve]  #: Reference run curves by running direction.
     send: Callable[[int, bytes], None]  #: Function that sends bytes to a train.
-    clock: Callable[[], float]  #: Centre's clock, which never runs backwards [s].
-    wall_ns: Callable[[], int]  #: Time for the log [ns].
+    clock: Callable[[], float]  #: Function that returns the time of the centre's clock, which never runs backwards [s].
+    wall_ns: Callable[[], int]  #: Function that returns the time for the log [ns].
     monitor: MonitorState | None = None  #: State of the monitor of satellite positioning; None without a triangle.
     times: MonitorLimits = field(default_factory=MonitorLimits)
     lines: list[str] = field(default_factory=list)
@@ -81,7 +81,7 @@ class ControlCentre:
     rejected: Counter[str] = field(default_factory=Counter)  #: Number of rejected reports, by reason.
     stop_s: float | None = None
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Orders to stop, by train.
-    #: Commits to the store, which a centre that runs as a process carries out in a thread.
+    #: Commits to the store; in the process of a centre, a thread carries them out.
     commits: Commits = field(default_factory=Commits)
     #: Function that requests the detection of points; `Supervision.set_detected` processes the answer.
     ask: Callable[[PointName], None] = lambda _: None
@@ -102,8 +102,9 @@ class ControlCentre:
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
         """Return the centre with the state stored by an earlier process; at the first start the state is unchanged.
 
-        Trains are unknown until they report; the detection of all points is requested from the field. Where a triangle
-        monitors satellite positioning, the first start is a stop, to be released by hand; an earlier stop remains.
+        Trains are unknown until they report; the detection of all points is requested from the field. If a triangle
+        monitors satellite positioning (`judged`), all trains are stopped at the first start until the stop is released
+        by hand. A stop from before a restart remains.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         asked: tuple[PointName, ...] = ()
@@ -128,7 +129,7 @@ class ControlCentre:
 
     @property
     def database(self) -> str | None:
-        """Reason why the database rejects the state, None without a fault."""
+        """Reason why the database rejects the state, None if it accepts the state."""
         return self.commits.alarm
 
     def log(self, text: str, *, train: int | None = None) -> None:
@@ -171,7 +172,7 @@ class ControlCentre:
             self.log(f"train {number}: first report", train=number)
 
     def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
-        """Count and log contradictions of a report, and log the train's answer to a request for the route."""
+        """Count and log contradictions of a report to the record, and log the answer to a request for the route."""
         number = known.train
         if known.contradiction is not None:
             self.rejected["contradicts the record of the train"] += 1
@@ -187,7 +188,7 @@ class ControlCentre:
             self.log(f"train {number}: {what}", train=number)
 
     def _hear_interference(self, message: TrainMessage) -> None:
-        """Store a train's suspected interference, also from a report without a position, and log its changes."""
+        """Store the interference that a report states, even if the report has no position, and log changes."""
         before = self.interference.get(message.train, SuspectedInterference.NONE)
         now = message.interference or SuspectedInterference.NONE
         if now is not before:
@@ -197,7 +198,7 @@ class ControlCentre:
 
     @property
     def alarms(self) -> list[str]:
-        """Alarms on reports awaited after a start, and on interference that trains suspect."""
+        """Alarms about reports awaited after a start of the centre, and about interference that trains suspect."""
         awaited = self.supervision.awaited_text
         waits = (
             [f"nothing is granted until these trains report, or confirm-start is ordered twice for them: {awaited}"]
@@ -209,7 +210,9 @@ class ControlCentre:
         ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Process a verdict on satellite positioning from fixes of a given age; each step uses the worst new verdict.
+        """Process a verdict on satellite positioning from fixes of a given age.
+
+        Each step uses the most severe verdict since the previous step.
 
         Fixes older than `MonitorLimits.late_s`, or farther in the future than this time, give no verdict.
         """
@@ -386,7 +389,7 @@ class ControlCentre:
         return f"{names[section]} to {names[section + 1]}, {progress:.0f} %"
 
     def point_name(self, point: PointName) -> str:
-        """Return the displayed name of points: the station, and its lower or upper end by chainage."""
+        """Return the displayed name of points: station, and end of the station at lower or higher chainage."""
         return f"{self.supervision.layout.stations[point[0]].name} {'lower' if point[1] < 0 else 'upper'}"
 
     def _monitor_values(self) -> dict[str, Any]:
@@ -400,7 +403,7 @@ class ControlCentre:
 
 
 def list_orders(centre: ControlCentre) -> dict[str, Order]:
-    """Return the orders of the page by name."""
+    """Return the functions of the page's orders, by name of the order."""
     desk = OrderDesk(
         supervision=centre.supervision, clock=centre.clock, log=centre.log, release=centre.release, stop=centre.stop
     )

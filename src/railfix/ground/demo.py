@@ -1,7 +1,7 @@
 """Demonstration of the ground side: two trains on a line with a passing loop, disturbed links, a satellite fault.
 
-The demonstration uses the centre of ``railfix ground centre`` (`railfix.ground.control`), with the clock of the
-simulated traffic.
+The demonstration runs the same control centre as ``railfix ground centre`` (`railfix.ground.control`), driven by the
+clock of the simulated traffic.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class RelaySettings(Settings):
     """Settings of a relay's disturbances."""
 
     loss: float = Field(default=0.0, ge=0, le=1)  #: Probability that a datagram is lost.
-    #: Delay of each datagram, and the largest additional random delay, by which datagrams overtake each other.
-    delay_s: float = Field(default=0.0, ge=0)
+    delay_s: float = Field(default=0.0, ge=0)  #: Delay of each datagram.
+    #: Largest additional random delay of a datagram; because of this delay, datagrams may overtake each other.
     jitter_s: float = Field(default=0.0, ge=0)
     seed: int = 0
 
@@ -50,7 +50,7 @@ class RelaySettings(Settings):
 class LinkDisturbance:
     """Seeded disturbance of packets of any kind.
 
-    `settings` may be replaced while packets pass; while `up` is False, an outage, every packet is lost.
+    `settings` may be replaced at any time. While `up` is False (an outage), every packet is lost.
     """
 
     def __init__(self, settings: RelaySettings) -> None:
@@ -98,7 +98,7 @@ class Relay(asyncio.DatagramProtocol):
         self._pass(data, self._there, self._target)
 
     def back(self, data: bytes) -> None:
-        """Return a datagram from the target to the client."""
+        """Forward a datagram from the target to the client."""
         if self._client is not None:
             self._pass(data, self._here, self._client)
 
@@ -118,16 +118,17 @@ class _Back(asyncio.DatagramProtocol):
         self._relay.back(data)
 
 
-#: East and north of the receivers [m].
+#: East and north coordinates of the three receivers [m].
 PLAN_M: Floats = np.array([[0.0, 0.0], [800.0, 100.0], [300.0, 700.0]])
-#: Directions to the satellites [deg].
+#: Elevations of the nine simulated satellites [deg].
 ELEVATION_DEG = np.array([75.0, 50.0, 48.0, 35.0, 33.0, 25.0, 22.0, 18.0, 60.0])
+#: Azimuths of the satellites, clockwise from north [deg].
 AZIMUTH_DEG = np.array([20.0, 80.0, 150.0, 215.0, 290.0, 340.0, 110.0, 250.0, 310.0])
 TIME = np.datetime64("2024-03-05T00:00:00", "ns")
 
 
 def points_ecef_m() -> Floats:
-    """Return the known points of the receivers, shape (3, 3) [m]."""
+    """Return the known Earth-fixed positions of the receivers, shape (3, 3) [m]."""
     return ecef_from_geodetic(35.7, 139.7, 100.0) + PLAN_M @ enu_axes(35.7, 139.7)[:2]
 
 
@@ -137,7 +138,7 @@ def draw_fixes(
     """Return fixes, one per second, from simulated ranges of fixed satellites.
 
     `common_m`, shape (T, 9), are satellite errors common to the receivers. `moved_m`, shape (T, 3, 2), are the east and
-    north displacements of each receiver's fix; NaN gives a receiver without a fix, whose C/N0 has fallen.
+    north displacements of each receiver's fix; with NaN, the receiver has no fix, and its C/N0 is marked as fallen.
     """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
@@ -166,11 +167,12 @@ def draw_fixes(
 
 
 HOSTS: Final[dict[LinkName, str]] = {"A": "127.0.1.1", "B": "127.0.2.1"}
-#: Simulated times at which bearer A fails, both bearers fail, the satellite fault begins, and the run ends [s].
+#: Start and end of the outage of bearer A, in simulated time [s].
 OUTAGE_A_S: Final = (40.0, 80.0)
+#: Start and end of the outage of both bearers of train 1 [s].
 OUTAGE_BOTH_S: Final = (106.0, 118.0)
-FAULT_S: Final = 130.0
-END_S: Final = 170.0
+FAULT_S: Final = 130.0  #: Time at which the satellite fault begins [s].
+END_S: Final = 170.0  #: Time at which the run ends [s].
 _TIME_NS: Final = 1_400_000_000_000_000_000
 
 
@@ -204,7 +206,7 @@ class LinkedTraffic(Traffic):
 
 
 def _verdicts(seed: int) -> list[tuple[TriangleVerdict, int]]:
-    """Return the verdicts of the triangle, one per second; the range of a satellite drifts from `FAULT_S` on."""
+    """Return the verdicts of the triangle, one per second, with a drift of one satellite's range from `FAULT_S` on."""
     epochs = int(END_S) + 1
     common = np.zeros((epochs, 9))
     common[:, 3] = 8.0 * np.clip(np.arange(epochs) - FAULT_S, 0.0, None)
@@ -251,12 +253,12 @@ async def run_demo(
     keep: Callable[[str], Any] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
-    """Run the demonstration and return its figures.
+    """Run the demonstration and return its results by name.
 
-    `speed` is in simulated seconds per second. The page is served on the loopback address at `port` (0 takes a free
+    `speed` is in simulated seconds per second. The page is served on the loopback address at `port` (0 selects a free
     port), and `password` permits the release of a stop. `announce` is called with the page's address, and `keep` is
-    awaited with this address before the page closes. `picture` is the path of the picture of response rates along the
-    line.
+    awaited with this address before the page closes. `picture` is the path at which the picture of response rates along
+    the line is written.
     """
     async with contextlib.AsyncExitStack() as held:
         folder, done = Path(held.enter_context(tempfile.TemporaryDirectory())), False
@@ -341,7 +343,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        # Time lost on a busy machine is not recovered: the links would otherwise run faster than the simulated time.
+        # Time lost on a busy machine is not made up, because simulated time would otherwise run too fast for the links.
         start = max(start, loop.time() - traffic.now_s / speed)
         await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 

@@ -1,7 +1,7 @@
-"""Orders given on the page, with their authors and effects, and with confirmation by a second order.
+"""Orders given on the page: their authors and effects, and the confirmation of orders by a second order.
 
-Each order is a line of the log with its author and its outcome. Orders based on an observation that no report confirms
-are given twice: by two people, or by one person after a minimum time.
+For each order, the log gets a line with the author and the outcome. Orders based on an observation that no report
+confirms are given twice: by two people, or by one person after a minimum time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from railfix.ground.stops import CLOSED, OCCUPIED, close_section, open_section, 
 from railfix.ground.supervision import Supervision
 from railfix.ground.web import Order
 
-#: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
+#: Shortest and longest time after which the same person may confirm an order [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
 #: Longest accepted reason [characters].
 LONGEST_REASON: Final = 200
@@ -51,11 +51,11 @@ class OrderDesk:
     log: Callable[..., None]  #: Function that writes a line to the log.
     release: Callable[[], str | None]  #: Function that releases a stop of all trains.
     stop: Callable[[int | None], str | None]  #: Function that stops a train, or every train with None.
-    #: Orders that have been given once, by name and values: time and author.
+    #: Time [s] and author of each order that awaits confirmation, by name and values of the order.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
-        """Carry out an order, with a line in the log; return the reason for a refusal, None if it is done."""
+        """Carry out an order and log it; return the reason for a refusal, None if the order was carried out."""
         reason = order(values, by)
         shown = json.dumps({key: value for key, value in values.items() if key != "password"})
         outcome = "done" if reason is None else f"refused: {reason}"
@@ -65,7 +65,7 @@ class OrderDesk:
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
-        """Return None if an order confirms the first order in time, otherwise a sentence on the next step."""
+        """Return None if this order confirms an earlier one in time, otherwise a request to confirm it."""
         key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
@@ -80,7 +80,7 @@ class OrderDesk:
         )
 
     def asked_s(self, name: str, values: Values) -> float:
-        """Return the time at which an order was first given, or the present time [s]."""
+        """Return the time at which an order that awaits confirmation was given, otherwise the present time [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
         return self._asked.get(key, (self.clock(), ""))[0]
 
@@ -103,7 +103,7 @@ class OrderDesk:
     def twice(
         self, name: str, change: Callable[[Values], tuple[Interlocking, str | None]], what: str, values: Values, by: str
     ) -> str | None:
-        """Change trains at the second order; both orders must contain the same reason in words."""
+        """Change trains when the order is given a second time; both orders must contain the same reason in words."""
         reason = values.get("reason")
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
             return (
@@ -120,7 +120,7 @@ class OrderDesk:
         return refused
 
     def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
-        """Return a sentence on a train whose position, reported since the first order, is outside its new interval."""
+        """Return a sentence if a train has, since the first order, reported a position outside its new interval."""
         for number, train in after.trains.items():
             known, record = before.trains.get(number), self.supervision.records.get(number)
             if known is None or known is train or known.reported_m is None or record is None:
@@ -133,7 +133,7 @@ class OrderDesk:
         return None
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
-        """Return the state after a change of trains, and the reason for a refusal."""
+        """Return the state after the change of trains named by `of`, and the reason for a refusal."""
         state, layout = self.supervision.state, self.supervision.layout
         train = number_of(values, "train")
         if isinstance(train, str):
@@ -165,7 +165,7 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Continue at the second order without the trains that have not reported since the start of the centre."""
+        """Cease to wait for trains that have not reported since the start of the centre, when ordered a second time."""
         if not self.supervision.awaited:
             return "every train has reported since the start"
         what = f"the database is not an older copy, and these trains do not report: {self.supervision.awaited_text}"
@@ -174,7 +174,7 @@ class OrderDesk:
         return reason
 
     def section(self, values: Values, by: str, *, of: str) -> str | None:
-        """Bar a section, or remove its bar; an occupied section is freed only at the second order."""
+        """Bar a section, or remove a bar; an occupied section is freed only when the order is given a second time."""
         supervision, name = self.supervision, str(values.get("section", ""))
         layout, state = supervision.layout, supervision.state
         if name not in layout.sections:
@@ -204,7 +204,7 @@ class OrderDesk:
         return None
 
     def restrict(self, values: Values, by: str) -> str | None:
-        """Set a temporary speed restriction by its name, or lift it at the second order."""
+        """Set a named temporary speed restriction, or lift it when ordered a second time."""
         supervision, name = self.supervision, str(values.get("name", "")).strip()
         state = supervision.state
         if not 0 < len(name) <= 40:
@@ -231,7 +231,7 @@ class OrderDesk:
         return None
 
     def orders(self) -> dict[str, Order]:
-        """Return the functions of the orders by name; they are called with the values and the author of an order."""
+        """Return the function of each order by name; a function is called with the order's values and author."""
         supervision = self.supervision
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:

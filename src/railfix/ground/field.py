@@ -14,7 +14,7 @@ class SimulatedPoints:
 
     move_s: float
     clock: Callable[[], float]
-    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that each set of points leads to; 1 by default.
+    lie: dict[PointName, int] = field(default_factory=dict)  #: Track to which each set of points leads; 1 by default.
     _moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
     _answers: dict[PointName, int | None] = field(default_factory=dict)
 
@@ -24,13 +24,13 @@ class SimulatedPoints:
         self._answers[point] = None
 
     def ask(self, point: PointName) -> None:
-        """Request the detection of points, which `take_detected` returns."""
+        """Request the detection of points; the next call of `take_detected` returns it."""
         self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
 
     def take_detected(self) -> Mapping[PointName, int | None]:
-        """Return the detected track of points that have changed or were requested since the last call.
+        """Return the detected track of each set of points that has changed or was requested since the last call.
 
-        The track is None while points move.
+        The detected track is None while points move.
         """
         answers, self._answers = self._answers, {}
         for point, (until, track) in list(self._moving.items()):

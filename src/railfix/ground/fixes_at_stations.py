@@ -36,7 +36,7 @@ from railfix.run.processor_setup import parse_position
 
 #: Minimum drop of a receiver's mean C/N0 below the median over the preceding epochs that counts as a fall [dB-Hz].
 FALLEN_DBHZ = 6.0
-#: Number of epochs in the median of the mean C/N0.
+#: Number of preceding epochs over which the median of the mean C/N0 is computed.
 USUAL_EPOCHS: Final = 600
 #: Time tags of different receivers that round to the same multiple of this interval are one epoch.
 SAME_EPOCH = np.timedelta64(100, "ms")
@@ -44,11 +44,15 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class StationFixes(FrozenArrays):
-    """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
+    """Single point positions of N receivers at T epochs.
+
+    At each epoch, all receivers use the same satellites and weights.
+    """
 
     time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
-    points_m: Floats  #: Known points, east and north of the first point [m]; shape (N, 2).
-    #: Fixes, east and north of the first point [m]; NaN if too few satellites are common; shape (T, N, 2).
+    points_m: Floats  #: East and north coordinates of the known points relative to the first point [m]; shape (N, 2).
+    #: East and north coordinates of the fixes relative to the first known point [m], NaN if too few satellites are
+    #: common to the receivers; shape (T, N, 2).
     fixes_m: Floats
     n_satellites: Integers  #: Number of common satellites, 0 if unknown; shape (T,).
     cn0_fallen: Masks  #: Whether the mean C/N0 of a receiver has fallen; shape (T, N).
@@ -100,7 +104,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         usable[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k])
         states_of.append(states)
     shared = usable.all(axis=0)
-    # all fixes have the same weights, because otherwise a common error would move each fix differently
+    # all receivers use the same weights: with different weights, an error common to all would move each fix differently
     square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])
@@ -112,9 +116,10 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
-    """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
+    """Compute fixes from corrected ranges of the same satellites, as single point positions are computed in a run.
 
-    The fixes are at T times, from the ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
+    `ranges` has the ranges of each of N receivers at the T times of `time`; `points_ecef_m` has the shape (N, 3) and
+    `cn0_fallen` the shape (T, N).
     """
     plane = axes_at(points_ecef_m[0])[:2]
     fixes = [
@@ -133,9 +138,10 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
     """Read the positions of three receivers (`computed`), or compute them from their observations.
 
-    `points` are the known points as texts, one per log; without them the positions in the headers are used. Raise
-    SettingsError if navigation or points are missing, or not applicable. Raise MismatchError if a header has no
-    position, or the logs have no satellite or no epoch in common.
+    `points` are the known points as texts, one per log; without `points`, the positions in the headers of the logs are
+    used. Raise SettingsError if navigation files or points are required but missing, or if navigation files are given
+    with `computed`. Raise MismatchError if a header has no position, or the logs have no satellite or no epoch in
+    common.
     """
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:
@@ -160,8 +166,8 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
     """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
 
-    `n_satellites` is 0: it is unknown whether the fixes are from the same satellites. Raise MismatchError if the
-    logs have no epoch in common.
+    `n_satellites` is 0, because it is unknown whether the receivers used the same satellites. Raise MismatchError if
+    the logs have no epoch in common.
     """
     known = [np.flatnonzero(np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time)) for log in logs]
     time, rows_of = _common_epochs([log.time[rows] for log, rows in zip(logs, known, strict=True)])
@@ -184,7 +190,7 @@ def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]
 
 
 def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:
-    """Return epochs in which no receiver has a fix."""
+    """Return `StationFixes` for epochs at which no receiver has a fix."""
     shape = (len(time), len(points_ecef_m))
     return StationFixes(
         time=time,
@@ -209,26 +215,27 @@ def mean_cn0(log: Observations) -> Floats:
 
 
 def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
-    """Return whether the mean C/N0 of each receiver has fallen by `FALLEN_DBHZ`, shape (T, N).
+    """Return whether the mean C/N0 of each receiver has fallen by more than `FALLEN_DBHZ`, shape (T, N).
 
-    The reference is the median over the `USUAL_EPOCHS` before each epoch, including `earlier_dbhz`, shape (M, N).
+    The mean C/N0 `level_dbhz`, shape (T, N), is compared with the median over the `USUAL_EPOCHS` preceding epochs;
+    these include the epochs of `earlier_dbhz`, shape (M, N).
     """
     table = pl.DataFrame(np.vstack([earlier_dbhz, level_dbhz])).fill_nan(None)
     usual = table.select(pl.all().rolling_median(USUAL_EPOCHS, min_samples=1).shift(1)).to_numpy()
     return np.asarray(level_dbhz < usual[len(earlier_dbhz) :] - FALLEN_DBHZ)
 
 
-#: Largest number of epochs that wait for the epochs of other receivers.
+#: Largest number of epochs for which receivers are waited for that have not sent them yet.
 _LONGEST_QUEUE: Final = 1000
 
 
 class StationStreams:
     """Fixes of receivers at known points, computed from epochs as they arrive.
 
-    An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver is silent,
-    there are no fixes, and the monitor detects that fixes are late. Records from the streams are added to `navigation`.
-    Only epochs at whole seconds are used. `counts` has the numbers of epochs "used", "incomplete", and "without common
-    satellites".
+    An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver is silent, no
+    fixes are computed, and the monitor detects that fixes are late. Records from the streams are added to `navigation`.
+    Only epochs at whole seconds are used. `counts` has the number of epochs by outcome: "used", "incomplete" or
+    "without common satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:
@@ -244,7 +251,7 @@ class StationStreams:
         self._known = receive(self._known, self._config, np.datetime64("NaT", "ns"), navigation=navigation)
 
     def push(self, receiver: int, epoch: Observations) -> StationFixes | None:
-        """Process one epoch of a receiver; return the fixes once all receivers have sent the epoch, None before."""
+        """Process one epoch of a receiver; return the fixes if all receivers have sent this epoch, otherwise None."""
         tag = round_tags(epoch.time)[0]
         tag_ns = int(tag.astype(np.int64))
         if tag_ns % 1_000_000_000 or tag <= self._done:
@@ -281,10 +288,10 @@ class StationStreams:
 async def stream_fixes(
     sources: Sequence[str], points_ecef_m: Floats, *, navigation: Navigation | None = None
 ) -> AsyncIterator[StationFixes]:
-    """Yield the fixes of single epochs until every source has ended.
+    """Yield the fixes of each epoch until every source has ended.
 
     Sources are written as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files and
-    RINEX files). Raise InputFileError if a source cannot be opened, or breaks and is not opened again.
+    RINEX files). Raise InputFileError if a source cannot be opened, or fails and cannot be opened again.
     """
     stations = StationStreams(points_ecef_m, navigation=navigation)
     queue: asyncio.Queue[tuple[int, ReceivedData | None]] = asyncio.Queue(2 * len(sources))
@@ -323,7 +330,7 @@ async def stream_fixes(
 def usable_ranges(
     states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
 ) -> Ranges:
-    """Return the ranges for the fit; ranges with a rejection reason, or NaN, have weight 0 and finite filler values."""
+    """Return the ranges for the fit; rejected ranges and ranges that are NaN have weight 0 and finite filler values."""
     used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
     return Ranges(
         sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, FILLER_SATELLITE_M)),

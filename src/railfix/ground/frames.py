@@ -1,8 +1,8 @@
-"""Redundancy layer above two links: frames with sequence number and time stamp, with the defences of EN 50159.
+"""Redundancy layer above two links: frames with sequence numbers and time stamps, as defences according to EN 50159.
 
 The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults of the layers between, and
-is not cryptographic. A receiver uses each frame once, from the link that delivers it first, and no frame that is older
-than a used frame.
+is not cryptographic. A receiver uses each frame once, from the link that delivers it first. It does not use frames that
+are older than a frame already used.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ _ECHO: Final = struct.Struct("!Qqqq")
 _CHECK: Final = struct.Struct("!I")
 #: Longest payload, which fits a QUIC datagram together with the header [bytes].
 LONGEST_PAYLOAD: Final = 1100
-#: Number of recent sequence numbers, and number of earlier starts of the sender, that are stored.
+#: Number of recent sequence numbers that are stored to detect repeated frames.
 REMEMBERED: Final = 4096
+#: Number of earlier sessions of the sender whose identifiers are stored.
 RETIRED: Final = 64
 
 
 def draw_session() -> int:
-    """Return a random number that identifies a start of a program, independent of any clock."""
+    """Return a random number that identifies one run of a program (a session), independent of any clock."""
     return secrets.randbits(62)
 
 
@@ -63,7 +64,7 @@ class Frame:
 
     kind: FrameKind
     sender: int
-    session: int  #: Random number that identifies the sender's start.
+    session: int  #: Random number that the sender draws at each start.
     sequence: int
     time_ns: int  #: Sender's monotonic clock at the time of sending [ns].
     payload: bytes = b""
@@ -77,7 +78,7 @@ class Frame:
 
 
 class Echo(NamedTuple):
-    """Answer to a frame: its number, time of sending (sender's clock), and times of reception and answer."""
+    """Answer to a frame: number of the frame, and times of sending, reception and answer."""
 
     sequence: int
     sent_ns: int
@@ -94,18 +95,19 @@ class Echo(NamedTuple):
         return cls(*_ECHO.unpack(payload)) if len(payload) == _ECHO.size else None
 
     def round_trip_s(self, now_ns: int) -> float:
-        """Return the round-trip time at the sender: t4 - t1 - (t3 - t2) [s]."""
+        """Return the round-trip time t4 - t1 - (t3 - t2) [s]; t4 is the time of arrival `now_ns` of the echo."""
         return (now_ns - self.sent_ns - (self.answered_ns - self.received_ns)) / 1e9
 
 
 class ReceiverLimits(Settings):
     """Limits of a receiver."""
 
-    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed delay.
-    #: Largest relative drift of the clocks; the stored shortest delay grows at this rate.
+    delay_s: float = Field(default=5.0, gt=0)  #: Largest accepted delay in excess of the shortest observed delay.
+    #: Largest relative drift between the clocks of both ends; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Largest lead of a sequence number over the newest number, and increase of this lead per second since its arrival.
+    #: Largest accepted lead of a sequence number over the newest sequence number, at the arrival of the newest.
     jump: int = Field(default=1000, ge=1)
+    #: Increase of the largest accepted lead per second since the newest sequence number arrived.
     rate: float = Field(default=100.0, gt=0)
 
 
@@ -118,7 +120,7 @@ class _Seen:
     bits: int = 0
 
     def is_alone(self, sequence: int, now_ns: int, limits: ReceiverLimits) -> bool:
-        """Return whether a number is further ahead of the newest than the sender can have counted."""
+        """Return whether a number is further ahead of the newest number than the sender can have counted meanwhile."""
         most = limits.jump + limits.rate * (now_ns - self.at_ns) / 1e9
         return self.newest >= 0 and sequence > self.newest + most
 
@@ -140,9 +142,10 @@ class _Seen:
 class FrameReceiver:
     """Receiver of the frames of one sender over any number of links."""
 
-    sender: int  #: Only sender whose frames are accepted, as named by the connection's certificate.
+    #: Number of the sender, as named by the connection's certificate; frames of other senders are rejected.
+    sender: int
     limits: ReceiverLimits = field(default_factory=ReceiverLimits)
-    #: Number of rejected frames by threat; deletions are skipped sequence numbers.
+    #: Number of rejected frames by threat; under `Threat.DELETION`, the number of skipped sequence numbers.
     threats: Counter[Threat] = field(default_factory=Counter)
     _session: int | None = None
     _retired: deque[int] = field(default_factory=lambda: deque(maxlen=RETIRED))
@@ -152,7 +155,7 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return the frame to answer and the frame to use; either is None if there is no such frame.
+        """Return the frame to answer, or None, and the frame to use, or None.
 
         A second copy of a frame is answered but not used, so that both links are measured.
         """
@@ -182,7 +185,7 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Reset after a new start of the sender, whose numbers and clock have new origins."""
+        """Reset after a restart of the sender, because its sequence numbers and its clock begin anew."""
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None
@@ -208,7 +211,7 @@ class FrameReceiver:
         )
 
     def _late(self, frame: Frame, now_ns: int) -> bool:
-        """Return whether a frame is too late relative to the shortest delay; the clocks of both ends need not agree."""
+        """Return whether a frame's delay is too long compared with the shortest; the clocks need not agree."""
         took = now_ns - frame.time_ns
         if self._shortest_ns is None:
             self._shortest_ns = float(took)

@@ -1,8 +1,8 @@
 """Authorities, routes and points of a single-track line with passing loops.
 
-A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority.
-Authorities are extended, less a margin, to the nearest of these limits: another train's interval, a section that is
-closed or occupied, points that are not locked and detected for the train, the end of the train's route. Authorities are
+A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority. An
+authority is extended to a margin before the nearest of these limits: another train's interval, a section that is closed
+or occupied, points that are not locked and detected for the train, or the end of the train's route. Authorities are
 shortened only by agreement with the train (`railfix.ground.stops`); reports move the intervals
 (`railfix.ground.reports`). Shunting, overlaps behind signals, level crossings and degraded working by hand are not
 modelled.
@@ -21,20 +21,21 @@ from railfix.ground.state import Interlocking, InterlockingLimits, PointState, T
 
 
 class NearbyTrains:
-    """Index of trains by the blocks of the line that their interval, route and next route include.
+    """Index of trains by the blocks of the line that a train's interval, route and next route include.
 
-    With this index the cost of a step grows with the number of trains, not with the number of pairs of trains. `update`
-    locates only trains whose interval or route has changed.
+    With this index, the time of a step grows with the number of trains, not with the number of pairs of trains.
+    `update` locates only trains whose interval or route has changed.
     """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
         self._blocks: dict[int, set[int]] = defaultdict(set)
-        self._located: dict[int, tuple[TrainInterval, range]] = {}  #: Records at the last update, and their blocks.
+        #: Record of each train at the last update, and the train's blocks.
+        self._located: dict[int, tuple[TrainInterval, range]] = {}
         self.update(state)
 
     def update(self, state: Interlocking) -> None:
-        """Locate the trains of a newer state."""
+        """Update the index to a newer state."""
         for number in self._located.keys() - state.trains.keys():
             self._move(range(0), number, self._located.pop(number)[1])
         for number, train in state.trains.items():
@@ -50,7 +51,7 @@ class NearbyTrains:
             self._located[number] = train, blocks
 
     def _blocks_of(self, train: TrainInterval) -> range:
-        """Return the blocks of a train, to the end of its next route."""
+        """Return the blocks from the rear of a train to the end of its next route."""
         last = len(self._layout.stations) - 1
         ahead = self._layout.stations[min(max(train.station + train.direction, 0), last)]
         furthest = ahead.end_m if train.direction > 0 else ahead.begin_m
@@ -58,7 +59,7 @@ class NearbyTrains:
         return self._layout.blocks_between(min(low, furthest), max(high, furthest))
 
     def _move(self, blocks: range, number: int, before: range) -> None:
-        """Enter a train in its blocks, and remove it from its previous blocks."""
+        """Enter a train in `blocks`, and remove it from the blocks `before`."""
         if blocks == before:
             return
         for block in before:
@@ -67,7 +68,7 @@ class NearbyTrains:
             self._blocks[block].add(number)
 
     def between(self, state: Interlocking, low_m: float, high_m: float) -> Iterator[TrainInterval]:
-        """Return the trains that may share some chainage with an interval, in the order of their numbers."""
+        """Return the trains that may overlap a range of chainages, in order of train number."""
         numbers = {n for block in self._layout.blocks_between(low_m, high_m) for n in self._blocks.get(block, ())}
         return (state.trains[number] for number in sorted(numbers))
 
@@ -86,8 +87,8 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
     by_high = sorted((high, low) for low, high, _ in by_low)
     free = [span for span in by_low if span[2] not in found]
     for number in list(found):
-        # Trains on other tracks of its station, the nearest on either side, and trains on other tracks of the nearest
-        # train's station.
+        # Range that includes the nearest train on either side. Trains on other tracks of the stopped train's station,
+        # and of the station of a nearest train, overlap this range as well.
         low, high = state.trains[number].span_m
         if (k := bisect_left(by_low, (high,))) < len(by_low):
             high = by_low[bisect_right(by_low, (by_low[k][0], math.inf)) - 1][1]
@@ -100,10 +101,11 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
 
 
 def points_reported(state: Interlocking, point: PointName, detected: int | None, layout: Layout) -> Interlocking:
-    """Return the state after a detection of points.
+    """Return the state after the field has reported the detected position of points, None if undetected.
 
-    Trains that lock points are stopped if the detection of the points is lost. After a start, trains over the points
-    are stopped if another position than theirs is detected; points that no train locks keep their detected position.
+    Trains that lock the points are stopped if the detection of the points is lost. After a start, trains over the
+    points are stopped if the detected position is not the commanded one. Points that no train locks keep their detected
+    position.
     """
     before = state.points[point]
     after = replace(before, detected=detected)
@@ -159,7 +161,7 @@ def route_requested(
 
 
 def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: Mapping[int, str]) -> str | None:
-    """Return the reason for refusing a route, apart from other trains' intervals; None if there is no reason."""
+    """Return the reason for refusing a route, other trains' intervals not considered; None if there is no reason."""
     target = here.station + here.direction
     if here.asked_m is not None:
         return "a shorter authority is being agreed with the train"
@@ -169,7 +171,7 @@ def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: 
         return f"the train is stopped: {stopped[here.train]}"
     if not 0 <= target < len(layout.stations):
         return "there is no station ahead"
-    if reached(here, target, layout):  # the train has a track there, on which it may stop
+    if reached(here, target, layout):  # the train already has a track in this station, on which it may stop
         return f"the train is in {layout.stations[target].name}"
     for name in ((here.station, here.direction), (target, -here.direction)):
         if not state.points[name].commanded and state.points[name].detected is None:
@@ -178,12 +180,12 @@ def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: 
 
 
 def reached(train: TrainInterval, station: int, layout: Layout) -> bool:
-    """Return whether the front of a train is in a station, or beyond."""
+    """Return whether the front of a train is in a station, or beyond the station."""
     return layout.is_reached(station, train.front_m, train.direction)
 
 
 def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: NearbyTrains) -> str | None:
-    """Return the obstacle between a train and the next station, or on its track there; None if there is none."""
+    """Return the obstacle between a train and the next station, or on its track there; None without obstacle."""
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
@@ -203,7 +205,7 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
 
 
 def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str, str] | None:
-    """Return a barred section that shares track with a path, and the bar of the section; None if there is none."""
+    """Return the name of a barred section that shares track with a path, and the kind of bar; None if there is none."""
     for name, kind in sorted(state.bars):
         if any(shares(piece, mine) for piece in layout.sections[name] for mine in path):
             return name, kind
@@ -211,9 +213,9 @@ def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str,
 
 
 def comes_the_other_way(other: TrainInterval, direction: int, section: int, layout: Layout) -> bool:
-    """Return whether a train in the opposite direction has its route or interval between `section` and `section` + 1.
+    """Return whether an opposing train has its route or interval between stations `section` and `section` + 1.
 
-    The points of both stations are not considered.
+    The zones of the points of both stations are not considered.
     """
     if other.direction == direction:
         return False
@@ -223,7 +225,7 @@ def comes_the_other_way(other: TrainInterval, direction: int, section: int, layo
 
 
 def is_free(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether points may be moved: they are not locked, and not under an interval or a barred section."""
+    """Return whether points may be moved: not locked, and not in any interval or barred section."""
     return not (state.points[point].locked or under_interval(state, point, layout, nearby))
 
 
@@ -241,9 +243,10 @@ def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby
 def due_commands(
     state: Interlocking, layout: Layout, stored: Interlocking, nearby: NearbyTrains | None = None
 ) -> tuple[Interlocking, dict[PointName, int]]:
-    """Return the state after all due commands to points, and the commanded tracks by points.
+    """Return the state after all due commands to points, and the commanded track of each set of points.
 
-    Only stored commands are due. Points whose detection is awaited, or that are under an interval, get no command.
+    A command is due only if it is stored. Points whose detection is awaited, or that an interval includes, get no
+    command.
     """
     due = {
         name: point
@@ -263,7 +266,7 @@ def due_commands(
 
 
 def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
-    """Return the state with points released `InterlockingLimits.release_s` after the safe rear end has passed them."""
+    """Return the state in which points are released that safe rear ends passed `InterlockingLimits.release_s` ago."""
     points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
         if not point.locked:
@@ -312,14 +315,14 @@ def extend_authorities(
 def _limit_m(
     state: Interlocking, train: TrainInterval, layout: Layout, nearby: NearbyTrains, *, limits: InterlockingLimits
 ) -> float:
-    """Return the furthest end of a train's authority [m]."""
+    """Return the chainage to which a train's authority may be extended at most [m]."""
     direction = train.direction
     end = direction * layout.track_end_m(train.station, direction)
     for name in layout.points_between(*sorted((train.rear_m, direction * end))):
         near, far = along(layout.zone_m(name), direction)
         if far <= direction * train.rear_m or near >= end:
             continue
-        # points under the train are locked by its passage, and do not limit its authority
+        # points under the train are locked for the train, and therefore do not limit its authority
         if not leads(state.points[name], train, name[0]):
             end = min(end, near)
     first_m, last_m = sorted((train.rear_m, direction * end))
@@ -335,10 +338,10 @@ def _limit_m(
 
 
 def bars_ahead(state: Interlocking, layout: Layout) -> list[Piece]:
-    """Return the pieces of barred sections."""
+    """Return the pieces of track of all barred sections."""
     return [piece for name, _ in state.bars for piece in layout.sections[name]]
 
 
 def leads(point: PointState, train: TrainInterval, station: int) -> bool:
-    """Return whether points are locked for a train, and detected in the position for the train's track there."""
+    """Return whether points are locked for a train, and detected in the position for its track in the station."""
     return train.train in point.locked and point.lies and point.wanted == train.tracks.get(station)

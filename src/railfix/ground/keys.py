@@ -1,7 +1,7 @@
-"""Keys and certificates of the links: creation, renewal with overlap, revocation, and warning before expiry.
+"""Keys and certificates of the links: creation, renewal, revocation, and warning before expiry.
 
 One certificate authority signs the certificates of the centre and of the trains. The authority's key stays in the
-folder where keys are created, and is not distributed.
+folder in which it was created, and is not distributed.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ with needs_extra():
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
-#: Validity of certificates and of the authority's certificate, and remaining validity that causes an alarm [days].
-VALID_DAYS: Final = 365
-AUTHORITY_DAYS: Final = 3650
-WARNING_DAYS: Final = 30
+VALID_DAYS: Final = 365  #: Validity of the certificates of the centre and of trains [days].
+AUTHORITY_DAYS: Final = 3650  #: Validity of the authority's certificate [days].
+WARNING_DAYS: Final = 30  #: Remaining validity below which an alarm is raised [days].
 _ISSUER: Final = "railfix authority"
 _PEM: Final = serialization.Encoding.PEM
 
 
 def check_keys(folder: Path, name: str) -> None:
-    """Raise InputFileError if a file that an end of the links requires is missing."""
+    """Raise InputFileError if a key or certificate file that `name` (an end of the links) requires is missing."""
     for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
         if not (folder / file).is_file():
             raise InputFileError(folder / file, "does not exist; create it by railfix ground keys")
@@ -44,7 +43,10 @@ class Peer(NamedTuple):
 
     @classmethod
     def of(cls, certificate: x509.Certificate) -> Peer:
-        """Return the values of a certificate, which are slow to read; raise ValueError if it has no common name."""
+        """Return the values of a certificate; raise ValueError if the certificate has no common name.
+
+        The values are stored because reading them from a certificate is slow.
+        """
         names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
         if not names:
             raise ValueError("no name")
@@ -57,7 +59,7 @@ class Peer(NamedTuple):
 
 
 class Revoked(NamedTuple):
-    """Revoked certificates: by name, such as ``train-7``, and by serial number."""
+    """Names (such as ``train-7``) and serial numbers of revoked certificates."""
 
     names: frozenset[str] = frozenset()
     serials: frozenset[int] = frozenset()
@@ -68,11 +70,11 @@ class Revoked(NamedTuple):
 
 
 def read_revoked(folder: Path) -> Revoked:
-    """Return the revoked certificates, listed as words in ``revoked.txt``; there are none if this file is missing.
+    """Return the revoked certificates listed as words in ``revoked.txt``; without this file, there are none.
 
     A name (``train-7``) revokes all certificates of that name, including later certificates. A serial number
     (``0x5a1f...``, as printed by `railfix ground keys`) revokes one certificate, so that a train whose key was lost can
-    get a new certificate. Raise InputFileError if the file exists and cannot be read.
+    receive a new certificate. Raise InputFileError if the file exists and cannot be read.
     """
     path = folder / "revoked.txt"
     try:
@@ -86,12 +88,12 @@ def read_revoked(folder: Path) -> Revoked:
 
 
 def ending_sentence(name: str, ends: datetime) -> str:
-    """Return the sentence that a certificate expires soon, with the remedy."""
+    """Return a sentence that states when a certificate expires, and how to renew it."""
     return f"the certificate {name} ends on {ends.date().isoformat()}; renew it (railfix ground keys --renew)"
 
 
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
-    """Return one sentence per certificate, of an end or the authority, that expires within `WARNING_DAYS`."""
+    """Return one sentence per certificate of `name` or the authority that expires within `WARNING_DAYS`."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):
@@ -103,12 +105,12 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
 
 
 def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write keys and certificates of a certificate authority, of ``centre`` and of each ``train-N``; return the files.
+    """Write keys and certificates of an authority, of ``centre`` and of each ``train-N``; return the paths.
 
-    If the folder has an authority, only missing files are written, to add trains. ``authority.key`` stays in this
-    folder and is never given to a train or a centre. Key files can be read only by their owner. Raise OutputError if
-    there is nothing to write, or a file cannot be written. Raise InputFileError if a file of the authority cannot be
-    read.
+    If the folder already has an authority, only missing files are written, so that trains can be added.
+    ``authority.key`` must stay in this folder; it is never given to a train or a centre. Key files can be read only by
+    their owner. Raise OutputError if there is nothing to write, or a file cannot be written. Raise InputFileError if a
+    file of the authority cannot be read.
     """
     names = ["centre", *(f"train-{number}" for number in trains)]
     if (folder / "authority.key").exists():
@@ -130,10 +132,10 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
 def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
     """Replace the keys and certificates of the centre and of trains; return the new files.
 
-    The previous certificates stay valid until they expire, so that each end can change to its new files at its next
-    start or connection. An authority that would expire before the new certificates is renewed as well. In this case
-    ``authority.pem`` has the old and the new certificate, and must be given to every end before the new files.
-    Raise InputFileError or OutputError as `write_keys` does.
+    The previous certificates stay valid until they expire, so that each end can change to the new files when it next
+    starts or connects. The authority is renewed as well if its certificate would expire before the new certificates. In
+    this case, ``authority.pem`` has the old and the new certificate, and must be given to every end before the new
+    files. Raise InputFileError or OutputError as `write_keys` does.
     """
     signing, issuer = _read_authority(folder)
     parts: dict[str, bytes] = {}
@@ -148,14 +150,14 @@ def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
 
 
 def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
-    """Return the authority's key and its newest certificate."""
+    """Return the key and the newest certificate of the authority."""
     path = folder / "authority.key"
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), password=None)
         certificates = x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes())
     except (OSError, ValueError, TypeError) as error:
         raise InputFileError(
-            path, f"cannot be read with authority.pem ({error}); give the folder of the keys"
+            path, f"cannot be read with authority.pem ({error}); a folder written by railfix ground keys was expected"
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificates[0].public_key():
         raise InputFileError(path, "is not the key of authority.pem")
@@ -163,7 +165,7 @@ def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
 
 
 def _within(issuer: x509.Certificate, days: int) -> int:
-    """Return a validity limited to the authority's remaining validity [days]."""
+    """Return a period of validity, limited to the remaining validity of the authority's certificate [days]."""
     return min(days, (issuer.not_valid_after_utc - datetime.now(UTC)).days)
 
 
@@ -172,7 +174,7 @@ def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _pair(name: str, signing: ec.EllipticCurvePrivateKey, *, days: int) -> dict[str, bytes]:
-    """Return a new certificate and key as files by name."""
+    """Return the contents of a new certificate file and key file, by name of the file."""
     key = ec.generate_private_key(ec.SECP256R1())
     certificate = _signed(name, key.public_key(), signing, days=days)
     return {f"{name}.pem": certificate.public_bytes(_PEM), f"{name}.key": _private(key)}
@@ -202,10 +204,10 @@ def _signed(
 
 
 def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path]:
-    """Write each file, keys readable only by their owner; return the paths.
+    """Write each file and return the paths; key files can be read only by their owner.
 
-    With `replace` existing files are replaced once all new files are complete. Raise OutputError if a file exists
-    already, or cannot be written.
+    With `replace`, existing files are replaced once all new files are complete. Raise OutputError if a file cannot be
+    written, or exists already without `replace`.
     """
     written = []
     try:

@@ -19,12 +19,12 @@ from railfix.core.errors import MismatchError
 from railfix.core.settings import Settings
 from railfix.track.network import Network
 
-#: Name of points: number of the station, and side, -1 at the end of lower chainage, 1 at the end of higher chainage.
+#: Name of a set of points: number of the station, and end of the station (-1: lower chainage, 1: higher chainage).
 PointName = tuple[int, int]
-#: Largest number of gradients, and of speed restrictions, in one authority.
+#: Largest number of gradients in one authority, and largest number of speed restrictions.
 MOST_PARTS: Final = 16
-#: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single track with the sets of points;
-#: lane 2 k + t is track t of station k.
+#: Piece of track: lane, lower chainage [m] and upper chainage [m]. Lane 0 is the single track including the sets of
+#: points; lane 2 k + t is track t of station k.
 Piece = tuple[int, float, float]
 
 
@@ -32,10 +32,9 @@ class LoopStation(Settings):
     """Station with two tracks."""
 
     name: str
-    #: Chainages of the outer ends of the points.
-    begin_m: float
-    end_m: float
-    #: Length from the outer end of the points to the position at which the tracks are clear of each other.
+    begin_m: float  #: Chainage of the outer end of the points at lower chainage.
+    end_m: float  #: Chainage of the outer end of the points at higher chainage.
+    #: Length of each set of points, from its outer end to the position at which the two tracks are clear of each other.
     points_m: float = Field(default=60.0, gt=0)
 
     @model_validator(mode="after")
@@ -51,17 +50,18 @@ class LoopStation(Settings):
 
 
 class Gradient(Settings):
-    """Gradient from a chainage to the next gradient's chainage; before the first gradient the line is level."""
+    """Gradient that applies from a chainage to that of the next gradient; before the first, the line is level."""
 
     from_m: float
-    permille: float = Field(ge=-1000, le=1000)  #: Gradient in thousandths, positive uphill with rising chainage.
+    #: Gradient in thousandths, positive where the track rises with the chainage.
+    permille: float = Field(ge=-1000, le=1000)
 
 
 class Layout(Settings):
     """Line of stations in order of chainage."""
 
     stations: Annotated[tuple[LoopStation, ...], Field(min_length=2)]
-    gradients: tuple[Gradient, ...] = ()  #: In order of chainage.
+    gradients: tuple[Gradient, ...] = ()  #: Gradients of the line, in order of chainage.
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -82,11 +82,11 @@ class Layout(Settings):
         return [border for station in self.stations for border in (station.begin_m, station.end_m)]
 
     def stations_between(self, low_m: float, high_m: float) -> range:
-        """Return the numbers of the stations that share some chainage with an interval."""
+        """Return the numbers of the stations whose range of chainage overlaps an interval."""
         return range(bisect_right(self._borders_m, low_m) // 2, (bisect_left(self._borders_m, high_m) + 1) // 2)
 
     def points_between(self, low_m: float, high_m: float) -> Iterator[PointName]:
-        """Return the points of the stations that share some chainage with an interval."""
+        """Return the points of the stations whose range of chainage overlaps an interval."""
         last = len(self.stations) - 1
         between = self.stations_between(low_m, high_m)
         return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
@@ -97,7 +97,7 @@ class Layout(Settings):
 
     @cached_property
     def sections(self) -> dict[str, tuple[Piece, ...]]:
-        """Pieces of track by name: each station with its points, each of its tracks, and the line between stations."""
+        """Pieces of track by name of section: whole station, single track of a station, or line between stations."""
         found: dict[str, tuple[Piece, ...]] = {}
         for k, station in enumerate(self.stations):
             first, last = station.inner_m
@@ -115,9 +115,12 @@ class Layout(Settings):
         return pieces[0][1], pieces[-1][2]
 
     def gradients_between(self, low_m: float, high_m: float, direction: int) -> tuple[tuple[int, int], ...]:
-        """Return chainages [cm] and gradients [1/1000] between two positions, rounded downhill for a running direction.
+        """Return chainages [cm] and gradients [1/1000] between two positions.
 
-        Of more than `MOST_PARTS` parts only the nearest are returned, all with the steepest descent of the whole range.
+        Gradients are rounded to the downhill side in running direction.
+
+        If there are more than `MOST_PARTS` gradients, only the nearest are returned, all with the steepest descent of
+        the range.
         """
         ends = [gradient.from_m for gradient in self.gradients[1:]] + [math.inf] * bool(self.gradients)
         parts = [
@@ -133,23 +136,23 @@ class Layout(Settings):
         return tuple(parts)
 
     def zone_m(self, point: PointName) -> tuple[float, float]:
-        """Return the chainages of the two ends of points, lower first [m]."""
+        """Return the chainages of the two ends of a set of points, lower first [m]."""
         station = self.stations[point[0]]
         if point[1] < 0:
             return station.begin_m, station.inner_m[0]
         return station.inner_m[1], station.end_m
 
     def track_end_m(self, station: int, direction: int) -> float:
-        """Return the chainage at which the tracks of a station end for a train that runs in a direction [m]."""
+        """Return the chainage at which the tracks of a station end for a train in a given running direction [m]."""
         first, last = self.stations[station].inner_m
         return last if direction > 0 else first
 
     def points(self) -> Iterator[PointName]:
-        """Return the points of all stations; the line has no points at its two outer ends."""
+        """Return the points of all stations; there are none at the two outer ends of the line."""
         return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
-        """Return the pieces of an interval; `tracks` has the train's track by station, by default 1."""
+        """Return the pieces of track of an interval; `tracks` has the train's track by station (default 1)."""
         low, high = min(from_m, to_m), max(from_m, to_m)
         pieces, at = [], low
         for k in self.stations_between(low, high):
@@ -166,12 +169,12 @@ class Layout(Settings):
         return pieces
 
     def is_reached(self, station: int, front_m: float, direction: int) -> bool:
-        """Return whether a front that runs in a direction is beyond the entry of a station."""
+        """Return whether the front of a train with a given running direction is beyond the entry of a station."""
         here = self.stations[station]
         return front_m > here.begin_m if direction > 0 else front_m < here.end_m
 
     def station_at(self, low_m: float, high_m: float) -> int | None:
-        """Return the station whose tracks contain a whole interval, None if there is none."""
+        """Return the number of the station whose tracks contain a whole interval, None if there is none."""
         for k in self.stations_between(low_m, high_m):
             station = self.stations[k]
             if station.inner_m[0] <= low_m and high_m <= station.inner_m[1]:
@@ -180,37 +183,37 @@ class Layout(Settings):
 
 
 def along(between_m: tuple[float, float], direction: int) -> tuple[float, float]:
-    """Return the near and the far end of a range of chainages, as distances in a running direction [m]."""
+    """Return the near end and the far end of a range of chainages, as distances in running direction [m]."""
     low, high = between_m
     return (low, high) if direction > 0 else (-high, -low)
 
 
 def shares(one: Piece, other: Piece) -> bool:
-    """Return whether two pieces share some track."""
+    """Return whether two pieces of track overlap."""
     return one[0] == other[0] and one[1] < other[2] and other[1] < one[2]
 
 
 def overlap(first: Iterable[Piece], second: Sequence[Piece]) -> bool:
-    """Return whether two lists of pieces share some track."""
+    """Return whether any piece of one list overlaps a piece of another list."""
     return any(shares(a, b) for a in first for b in second)
 
 
 #: Distance between centrelines from which two tracks are clear of each other [m].
 CLEAR_M: Final = 3.5
-#: Largest difference of the lengths of a station's two tracks, which have the same chainage [m].
+#: Largest accepted difference between the lengths of the two tracks of a station, which share one chainage [m].
 LENGTHS_M: Final = 20.0
-#: Spacing of the points at which tracks are compared [m].
+#: Spacing of the positions at which two tracks are compared [m].
 _STEP_M: Final = 2.0
 
 
 def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
-    """Return the layout of a network that is one single line with passing loops.
+    """Return the layout of a network of tracks that is a single line with passing loops.
 
     The chainage begins at one end and follows the single track and track 1 of each station. A station is a pair of
     tracks between the same two switches; the line has one track between stations and beyond the outer stations. Points
-    extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Track 1 of a station is on the
-    side on which trains drive, for trains that run toward rising chainage. Raise MismatchError if the network is of
-    another kind, with several lines, branches, stations of three tracks, or loops of unequal length.
+    extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Seen by a train that runs toward
+    rising chainage, track 1 of a station is on the side `drive`. Raise MismatchError if the network is not of this
+    kind: if it has several lines, branches, stations with three tracks, or loops of unequal length.
     """
     ends = network.joints.tolist()
     at: dict[int, list[int]] = defaultdict(list)
@@ -228,7 +231,8 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
         names = tuple(network.names[track] for track in ahead)
         if len(ahead) > 2 or len(fars) != 1:
             raise MismatchError(
-                f"tracks {', '.join(names)} begin at one point but do not meet at the next: this is not a passing loop"
+                f"tracks {', '.join(names)} start at the same switch but do not end at the same switch: this is not a "
+                "passing loop"
             )
         far = fars.pop()
         lines = [_points_m(network, track, backward=ends[track][0] != node) for track in ahead]
@@ -247,7 +251,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
 
 
 def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats], begin_m: float) -> LoopStation:
-    """Return the station of two tracks, track 1 first, that begins at a chainage."""
+    """Return the station with two tracks that begins at a chainage; track 1 is the first of the two."""
     if abs(lengths_m[0] - lengths_m[1]) > LENGTHS_M:
         raise MismatchError(
             f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; a "
@@ -258,7 +262,7 @@ def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats]
 
 
 def _points_m(network: Network, track: int, *, backward: bool) -> Floats:
-    """Return points along a track from one end, `_STEP_M` apart, shape (P, 3) ECEF [m]."""
+    """Return positions along a track from one end, `_STEP_M` apart; shape (P, 3), ECEF [m]."""
     rows = slice(int(network.first_point[track]), int(network.first_point[track + 1]))
     chainage, points = network.chainage_m[rows], network.points_m[rows]
     along = np.append(np.arange(0.0, chainage[-1], _STEP_M), chainage[-1])
@@ -267,7 +271,7 @@ def _points_m(network: Network, track: int, *, backward: bool) -> Floats:
 
 
 def _side(first: Floats, second: Floats) -> float:
-    """Return the lateral offset of the second line's middle from the first line, positive to the right [m]."""
+    """Return the lateral offset from the first line to the middle of the second line, positive to the right [m]."""
     middle = len(first) // 2
     ahead = first[middle + 1] - first[middle - 1]
     right = np.cross(ahead / np.linalg.norm(ahead), first[middle] / np.linalg.norm(first[middle]))
@@ -276,7 +280,7 @@ def _side(first: Floats, second: Floats) -> float:
 
 
 def _clear_after_m(first: Floats, second: Floats) -> float:
-    """Return the length from the common end to the position at which lines are `CLEAR_M` apart [m].
+    """Return the length from the common end of two lines to the position at which they are `CLEAR_M` apart [m].
 
     Raise MismatchError if the lines are nowhere `CLEAR_M` apart.
     """

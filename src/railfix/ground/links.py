@@ -29,7 +29,7 @@ KEPT: Final = 36_000
 
 
 class LinkResult(NamedTuple):
-    """Result of a frame: time and position of sending, and round-trip time [s], NaN if not answered in time."""
+    """Result of a frame: time [s] and position [m] of sending, and round-trip time [s], NaN if not answered in time."""
 
     sent_s: float
     chainage_m: float
@@ -39,15 +39,15 @@ class LinkResult(NamedTuple):
 class LinkLimits(Settings):
     """Limits of the links."""
 
-    #: Longest time to the echo of a frame (T); a later echo is a miss. A centre delays echoes by up to 0.2 s.
+    #: Longest time from a frame to its echo; a later echo counts as a miss. A centre delays echoes by up to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)
     misses: int = Field(default=3, ge=1)  #: Consecutive misses after which the spare link is used.
     good: int = Field(default=10, ge=1)  #: Consecutive answers before the normal link is used again.
     good_s: float = Field(default=30.0, ge=0)  #: Minimum time on the spare link before the normal link is used again.
-    window: int = Field(default=60, ge=1)  #: Number of frames in the response rate.
+    window: int = Field(default=60, ge=1)  #: Number of newest frames from which the response rate is computed.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
-    #: A connection without any packet for this time since a frame was sent, at most 10 s, is opened again, so that
-    #: trains reconnect after a centre was killed.
+    #: If no packet has arrived for this time after a frame was sent, the connection is opened again, so that trains
+    #: reconnect after a centre was killed. At most 10 s.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 
 
@@ -56,18 +56,17 @@ class LinkMeter:
     """Response rate and round-trip time of one link."""
 
     limits: LinkLimits = field(default_factory=LinkLimits)
-    #: Consecutive misses, and consecutive answers.
-    misses: int = 0
-    good: int = 0
-    #: Numbers of answered and sent frames, by cell of the line and running direction.
+    misses: int = 0  #: Number of misses since the last answer in time.
+    good: int = 0  #: Number of answers in time since the last miss.
+    #: Numbers of answered frames and of sent frames, by cell of the coverage map and running direction.
     coverage: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
-    #: The last `KEPT` frames, by the time of their result.
+    #: Results of the last `KEPT` frames, in the order in which the results became known.
     results: deque[LinkResult] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     _open: dict[int, tuple[float, float | None, int]] = field(default_factory=dict)
 
     def note_sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
-        """Count a sent frame; a frame without a known position is not in the coverage."""
+        """Count a sent frame; a frame without a known position is not counted in the coverage."""
         self._open[sequence] = (now_s, chainage_m, direction)
 
     def note_answer(self, sequence: int, now_s: float, round_trip_s: float) -> None:
@@ -102,13 +101,13 @@ class LinkMeter:
 
     @property
     def response_rate(self) -> float:
-        """Fraction of the frames of the window that were answered in time; NaN if there are no frames."""
+        """Fraction of the newest `LinkLimits.window` frames that were answered in time; NaN if there are no frames."""
         window = self._window_s
         return float(np.isfinite(window).mean()) if window else float("nan")
 
     @property
     def round_trip_s(self) -> float:
-        """Median round-trip time of the window [s]; NaN if no frame was answered."""
+        """Median round-trip time of the newest `LinkLimits.window` frames [s]; NaN if no frame was answered."""
         answered = [value for value in self._window_s if value == value]
         return float(np.median(answered)) if answered else float("nan")
 
@@ -119,10 +118,10 @@ LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or
 
 @dataclass(frozen=True, kw_only=True)
 class LinkChoice:
-    """Link in use with a normal link A and a spare link B."""
+    """Link in use, out of a normal link A and a spare link B."""
 
     active: LinkName = "A"
-    since_s: float = 0.0  #: Time of the last change of the link.
+    since_s: float = 0.0  #: Time of the last change between the links [s].
     switches: int = 0
 
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:
@@ -147,7 +146,7 @@ MISSED: Final = "#e5989b"
 
 
 def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]]]:
-    """Return the numbers of answered and sent frames by direction and cell, summed over meters of one bearer."""
+    """Return the numbers of answered and sent frames, by direction and cell, summed over the meters of one bearer."""
     total: dict[int, dict[int, tuple[int, int]]] = defaultdict(dict)
     for meter in meters:
         for (place, direction), (answered, sent) in meter.coverage.items():
@@ -157,7 +156,7 @@ def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]
 
 
 def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
-    """Return the time from the first frame [s], chainage [m] and round trip [s] of all frames, NaN if not answered."""
+    """Return three values of each frame: time since the first frame [s], chainage [m], and round trip [s] or NaN."""
     results = sorted(result for meter in meters for result in meter.results)
     table = np.array(results, dtype=np.float64).reshape(-1, 3)
     return table[:, 0] - table[:1, 0].sum(), table[:, 1], table[:, 2]
@@ -166,8 +165,8 @@ def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
 def draw_coverage(path: Path, bearers: Mapping[LinkName, list[LinkMeter]]) -> None:
     """Draw the response rates and round-trip times of the links, by bearer.
 
-    One row per bearer and direction has the response rate along the line (P5, figure 7); one row per bearer has the
-    round trips over time and position (P5, figures 9 and 10), unanswered frames at the bottom.
+    One chart per bearer and running direction shows the response rate along the line (P5, figure 7). Two charts per
+    bearer show the round-trip times over time and position (P5, figures 9 and 10); unanswered frames are at the bottom.
     """
     from matplotlib.figure import Figure
 
@@ -203,7 +202,7 @@ def draw_coverage(path: Path, bearers: Mapping[LinkName, list[LinkMeter]]) -> No
     figure.savefig(path, dpi=110)
 
 
-#: Identity of the centre as a sender of frames.
+#: Number that identifies the centre as a sender of frames.
 CENTRE = 0
 BEARERS: tuple[LinkName, LinkName] = ("A", "B")
 #: Time between attempts to connect [s].
@@ -211,7 +210,7 @@ RETRY_S = 1.0
 
 
 class Bearer(NamedTuple):
-    """Bearer of a link: address of the centre, and local address of the train."""
+    """Bearer of a link: address of the centre on this bearer, and local address of the train."""
 
     centre: tuple[str, int]
     local: str
@@ -223,7 +222,7 @@ def create_bearers(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkN
 
 
 class TrainLinks:
-    """The train's end: two connections, one on each bearer, with the keys of `railfix.ground.keys.write_keys`.
+    """The train's end of the links: one connection on each bearer, with keys from `railfix.ground.keys.write_keys`.
 
     `received` is called with the payload of each new frame of the centre.
     """
@@ -321,12 +320,13 @@ class TrainLinks:
 
 
 class CentreLinks:
-    """The centre's end: it listens at one address per bearer, answers every frame, and delivers each payload once.
+    """The centre's end of the links, which listens at one address per bearer.
 
-    `received` is called with the train's number and the payload. By default free ports are used; `addresses` has the
-    addresses by bearer. Answers are delayed by up to `wait_s` to be sent with a payload. `masquerades` is the number of
-    connections that were rejected for their certificate, `heard_s` has the monotonic time of the last frame received,
-    by train and bearer. `alarm` is a sentence on a faulty list of revoked certificates, None without a fault.
+    `received` is called with the train's number and the payload. By default, free ports are used; `addresses` has the
+    addresses in use, by bearer. Answers are delayed by up to `wait_s`, to be sent together with a payload.
+    `masquerades` is the number of connections that were rejected because of their certificate. `heard_s` has the
+    monotonic time of the last frame received, by train and bearer. `alarm` is a sentence if the list of revoked
+    certificates cannot be read, otherwise None.
     """
 
     def __init__(
@@ -351,7 +351,7 @@ class CentreLinks:
         self._stack = AsyncExitStack()
         self.alarm: str | None = None
         self._revoked = Revoked()
-        self._ending: list[str] = []  #: Certificates that expire soon, one sentence each.
+        self._ending: list[str] = []  #: Sentences on certificates that expire soon, one for each certificate.
 
     async def start(self) -> None:
         """Open the server of each bearer.
@@ -378,11 +378,11 @@ class CentreLinks:
         await self._stack.aclose()
 
     def alarms(self) -> list[str]:
-        """Return sentences on a faulty list of revoked certificates, and on certificates that expire soon."""
+        """Return sentences on an unreadable list of revoked certificates, and on certificates that expire soon."""
         return [*([] if self.alarm is None else [self.alarm]), *self._ending]
 
     def threats(self) -> Counter[Threat]:
-        """Return the number of rejected frames of all trains, and of rejected connections, by threat."""
+        """Return the number of rejected frames by threat; rejected connections are counted as masquerades."""
         total: Counter[Threat] = Counter({Threat.MASQUERADE: self.masquerades})
         for receiver in self.receivers.values():
             total += receiver.threats
@@ -409,7 +409,7 @@ class CentreLinks:
             await asyncio.sleep(RETRY_S)
 
     def _note_ending(self) -> None:
-        """List the certificates that expire within `WARNING_DAYS`: of the centre, and of connected trains."""
+        """List the certificates of the authority, the centre and connected trains that expire within `WARNING_DAYS`."""
         limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
         peers = {protocol.peer: None for protocol in self._peers.values() if protocol.peer is not None}
         soon = [ending_sentence(f"of {peer.name}", peer.ends) for peer in peers if peer.ends <= limit]

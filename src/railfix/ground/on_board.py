@@ -1,4 +1,4 @@
-"""On-board supervision of a train: age and end of its movement authority, braking curve, and orders to brake."""
+"""On-board supervision of a train: age and end of the movement authority, braking curve, and orders to brake."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, s
 from railfix.ground.links import LinkMode
 from railfix.ground.positions import Clock
 
-#: Backward movement of the safe front end, larger than the errors of two positions, that counts as rolling back [m].
+#: Backward movement of the safe front end that counts as rolling back [m]; it exceeds the errors of two positions.
 ROLLED_M: Final = 50.0
-#: Number of reports whose time of sending is stored.
+#: Number of newest reports whose times of sending are stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
 #: Longest time limit of authorities: an authority older than this on arrival is rejected.
@@ -25,9 +25,9 @@ LONGEST_FRESH_S: Final = 45.0
 
 
 class OnBoardLimits(BrakeLimits):
-    """Limits on board."""
+    """Limits of the on-board supervision."""
 
-    #: Time limit of authorities: the train brakes if the newest authority answers a report sent longer ago.
+    #: Time limit of authorities: the train brakes if the report that the newest authority answers was sent longer ago.
     fresh_s: float = option(
         "Largest age of the newest authority; the train brakes if the authority is older.",
         15.0,
@@ -36,8 +36,8 @@ class OnBoardLimits(BrakeLimits):
         gt=0,
         le=LONGEST_FRESH_S,
     )
-    #: Time for which a train without a position is extrapolated from its last position at its highest speed; it then
-    #: brakes.
+    #: Longest time for which a train without a new position is extrapolated from the last position, at the highest
+    #: speed of that position. After this time, the train brakes.
     placeless_s: float = Field(default=5.0, ge=0)
     clock: Clock = option(
         "Report positions from a recording with the present time, at the recorded pace.", "live", name="--replay"
@@ -47,7 +47,7 @@ class OnBoardLimits(BrakeLimits):
 
 @dataclass(kw_only=True)
 class Motion:
-    """Newest position of a train: safe ends, highest speed, and its time, None if unknown."""
+    """Newest position of a train: safe front and rear ends, highest speed, and time (None if unknown)."""
 
     front_m: float
     rear_m: float
@@ -60,28 +60,29 @@ class OnBoard:
     """On-board supervision of a train by its movement authority.
 
     The age of an authority is the time since the train sent the report that the authority answers, on the train's
-    monotonic clock. Delays on the links cannot make this age too small, and the clocks of train and centre need not
-    agree.
+    monotonic clock. Delays on the links cannot make this age too small, and the clocks of train and centre need not be
+    synchronised.
     """
 
     direction: int
-    #: End of the authority, initially the front end. Authorities extend it, and shorten it at a request of the centre
-    #: if the train can stop before the shorter end.
+    #: End of the authority, initially the front end. Authorities move this end forward. At a request of the centre, an
+    #: authority moves it back if the train can stop before the new end.
     end_m: float
 
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
-    session: int = 0  #: Identifier of this start in the reports; authorities that answer another start are rejected.
+    #: Identifier in the reports, drawn at each start; authorities that answer a report of another start are rejected.
+    session: int = 0
     number: int = -1  #: Number of the newest authority, -1 before the first.
     stopped: bool = False  #: Whether the newest authority is an order to stop.
     order: BrakeOrder | None = None  #: Order to brake that the train obeys.
     authority: Authority | None = None  #: Newest authority.
-    #: Stopping position of the train's safe front end if it braked now, the farther of the last two stopping positions;
-    #: with None the train accepts no shorter end.
+    #: Position at which the train's safe front end would stop if the train braked now: the farther of the last two such
+    #: positions. If None, the train accepts no shorter end.
     stops_at_m: float | None = None
-    #: Time of sending of the newest report that an authority has answered; None before the first.
+    #: Time at which the newest answered report was sent; None before the first answer.
     answered_s: float | None = None
-    #: Number of the newest report from before the last change of ends, or before rolling back; answers to this or an
-    #: older report are rejected.
+    #: Number of the newest report sent before the last change of ends, or before the train rolled back. Authorities
+    #: that answer this or an older report are rejected.
     before_turn: int = -1
 
     _newest: int = -1
@@ -109,10 +110,10 @@ class OnBoard:
         """Store the train's safe ends and speed.
 
         Whether the train can stop before a shorter end is decided by the farther of its last two stopping positions, so
-        that a single wrong position cannot cause the acceptance of that end.
+        that a single wrong position cannot cause the train to accept that end.
 
-        A train that has rolled back brakes until it gets a new authority, as earlier authorities do not include its
-        position. Without a position or a speed the train is extrapolated (`OnBoardLimits.placeless_s`).
+        A train that has rolled back brakes until it gets a new authority, because earlier authorities do not cover its
+        new position. Without a position or a speed, the last position is extrapolated (`OnBoardLimits.placeless_s`).
         """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
         if safe_front_m is None:
@@ -138,7 +139,7 @@ class OnBoard:
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:
-        """End the authority at the front end; a train that was stopped by order gets a new authority at its release."""
+        """End the authority at the front end; a train stopped by order gets a new authority when it is released."""
         self.end_m = self.direction * min(self.direction * self.end_m, self.direction * front_m)
         self._granted = False
 
@@ -146,12 +147,12 @@ class OnBoard:
         """Process an authority; return whether it is accepted.
 
         An authority must be newer than the last accepted authority, and have the train's direction. An authority that
-        answers a report from before the last change of ends is rejected, because it may have been granted for the
-        present direction two changes ago. An authority that has lapsed in transit is rejected. An order to brake is
+        answers a report sent before the last change of ends is rejected: it may be for the present direction, but from
+        before the last two changes of ends. An authority that has lapsed in transit is rejected. An order to brake is
         always accepted; a late order lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
-            # accepted also with a number below the train's, from a centre whose database is an older copy
+            # an order may have a number below that of the authority, if the centre's database is an older copy
             if self.order is None or authority.number >= self.order.number:
                 self.order = authority
             return True
@@ -165,7 +166,7 @@ class OnBoard:
             return False
         if authority.shortens and (self._granted or authority.stopped):
             self.end_m = self.direction * min(end, held) if agrees else self.end_m
-        elif not authority.stopped:  # an order to stop grants nothing
+        elif not authority.stopped:  # an authority with an order to stop does not extend the end
             self.end_m, self._granted = self.direction * (end if self._begins() else max(end, held)), True
         self.number, self.stopped, self.authority = authority.number, authority.stopped, authority
         self.order = None
@@ -174,7 +175,10 @@ class OnBoard:
         return True
 
     def _ends_order(self, authority: Authority) -> bool:
-        """Return whether an authority ends the order to brake; otherwise only the authority's age is used."""
+        """Return whether an authority ends the order to brake.
+
+        If not, only the time at which the answered report was sent is stored.
+        """
         assert self.order is not None
         if authority.number > self.order.number and not authority.stopped:
             return True
@@ -183,7 +187,7 @@ class OnBoard:
         return False
 
     def _answers(self, authority: Authority) -> bool:
-        """Return whether an authority answers a report since the last start and change of ends that is not too old."""
+        """Return whether an authority answers a recent report, sent since the start and the last change of ends."""
         if authority.session != self.session or authority.report <= self.before_turn:
             return False
         if len(self._sent) == REMEMBERED and authority.report < next(iter(self._sent)):
@@ -203,7 +207,7 @@ class OnBoard:
         return not authority.shortens or agrees or self._granted
 
     def acknowledgement(self) -> dict[str, int]:
-        """Return the fields of a report on the newest authority and order to brake; no fields before the first."""
+        """Return the fields of a report that name the newest authority and the order to brake, where received."""
         order = {} if self.order is None else {"brake_order": self.order.number}
         if self.number < 0:
             return order
@@ -219,15 +223,15 @@ class OnBoard:
         parts = () if self.authority is None else self.authority.gradients
         if self.direction > 0:
             return Steps([c / 100.0 for c, _ in parts], [p / 1000.0 for _, p in parts])
-        # toward falling chainage a gradient applies from the start of the next part to its own start, and the line is
-        # level before the first part
+        # toward falling chainage, a gradient begins at the chainage of the next gradient and ends at its own chainage,
+        # beyond which the previous gradient applies; the line is level below the first chainage
         ends = [-c / 100.0 for c, _ in parts[::-1]]
         return Steps([-math.inf, *ends], [*(-p / 1000.0 for _, p in parts[::-1]), 0.0])
 
     def supervised(self, now_s: float | None = None) -> Supervised | None:
         """Return the supervised speeds of the train, None before its first position.
 
-        The front end is extrapolated from the newest position to `now_s`, where both instants are known.
+        The front end is extrapolated from the time of the newest position to `now_s`, if both are known.
         """
         if (motion := self._motion) is None:
             return None
@@ -254,7 +258,7 @@ class OnBoard:
         return motion.speed_mps * max(now_s - motion.at_s, 0.0)
 
     def brake_reason(self, now_s: float) -> str | None:
-        """Return the reason why the train brakes, None if it may continue."""
+        """Return the reason why the train brakes, None if the train need not brake."""
         if self.order is not None:
             return f"ordered to stop: {self.order.reason}" if self.order.reason else "ordered to stop"
         if self.stopped:
@@ -281,7 +285,7 @@ class OnBoard:
         return f"{motion.speed_mps:.1f} m/s, above the {found.intervention_mps:.1f} m/s that lead to {target}{overruns}"
 
     def turn(self, direction: int, front_m: float) -> None:
-        """Change ends to a running direction; the train then has no authority."""
+        """Change ends to a new running direction; the train then has no authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
         self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
         self._motion, self.authority = None, None

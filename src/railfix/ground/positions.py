@@ -1,4 +1,4 @@
-"""Position messages of a train from JSON lines, received as they are measured or replayed from a recording."""
+"""Position messages of a train in JSON lines, which are live or replayed from a recording."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final, Literal
 from railfix.core.utc import gps_now_ns
 from railfix.io.train_message import MessageError, TrainMessage, from_json
 
-#: Longest line of a position message [bytes].
+#: Longest accepted line [bytes].
 LONGEST_LINE: Final = 100_000
 #: Largest number of bytes in one read.
 _READ: Final = 1 << 16
@@ -24,9 +24,9 @@ Clock = Literal["live", "replay"]
 async def read_positions(
     lines: AsyncIterator[str], *, rejected: Callable[[str], None], clock: Clock = "live"
 ) -> AsyncIterator[TrainMessage]:
-    """Yield the position messages in lines; other lines are rejected with a message and skipped.
+    """Yield the position messages that lines contain; for each other line, `rejected` is called with a message.
 
-    With the clock "replay" messages are delayed to the pace of the recording, and their times are replaced by the
+    With the clock "replay", messages are delayed to the pace of the recording, and their times are replaced by the
     present time, so that the centre accepts the positions as new.
     """
     first: tuple[int, int] | None = None
@@ -51,12 +51,12 @@ async def read_positions(
 
 
 async def standard_input() -> AsyncIterator[str]:
-    """Yield lines of the standard input as they arrive; a waiting reader does not delay the end of the program.
+    """Yield lines of the standard input as they arrive; the wait for a line does not delay the end of the program.
 
-    A line longer than `LONGEST_LINE` is cut to its beginning, which is not a valid message.
+    Of a line longer than `LONGEST_LINE`, only the beginning is yielded, which is not a valid message.
     """
     kind = os.fstat(sys.stdin.fileno()).st_mode
-    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file does not wait
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # reading a file does not block
         while data := sys.stdin.buffer.readline(LONGEST_LINE):
             yield data.decode(errors="replace")
         return

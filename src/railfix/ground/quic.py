@@ -1,8 +1,8 @@
-"""QUIC connections with datagrams, and the keys and certificates of both ends.
+"""QUIC connections with datagrams, in which both ends are authenticated by certificates.
 
-aioquic requests a client's certificate, and delays acknowledgements, only by private attributes
-(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`), which are
-used only in this module.
+In aioquic, a client certificate can be requested, and acknowledgements can be delayed, only by private attributes
+(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`), which no
+other module uses.
 """
 
 from __future__ import annotations
@@ -34,32 +34,34 @@ with needs_extra():
 PROTOCOL: Final = "railfix-link/1"
 #: A connection without any packet ends after this time [s], or earlier at the train's request (`LinkLimits.idle_s`).
 IDLE_S: Final = 10.0
-#: Longest delay of a centre's answers to frames, to be sent with an authority [s].
+#: Longest time for which a centre delays its answer to a frame, in order to send the answer with an authority [s].
 WAIT_S: Final = 0.2
-#: Longest delay of QUIC acknowledgements, to be sent with a frame [s].
+#: Longest time for which a QUIC acknowledgement is delayed, in order to be sent with a frame [s].
 ACKNOWLEDGE_S: Final = 1.5
-#: Largest numbers of handshakes in progress, of one peer and of all peers; further handshakes wait.
+#: Largest number of handshakes of one peer in progress; further handshakes wait.
 MOST_OF_PEER: Final = 16
+#: Largest number of handshakes of all peers in progress; further handshakes wait.
 MOST_HANDSHAKES: Final = 64
-#: Time after which a handshake in progress is ended if another handshake waits, because its peer has given up [s].
+#: Time after which a handshake in progress is ended if another handshake waits [s]; by then, the peer has given up.
 HANDSHAKE_S: Final = 5.0
-#: Time in which peers begin a handshake after a Retry, and interval at which waiting first packets are checked [s].
+#: Time in which a peer begins the handshake after a Retry [s].
 INVITED_S: Final = 0.25
+#: Interval at which waiting first packets are checked [s].
 ASKING_S: Final = 0.01
-#: Receive buffer for packets that arrive while the centre is busy; the default buffer overflows with a thousand trains
-#: after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
+#: Size of the receive buffer for packets that arrive while the centre is busy. With a thousand trains, the default
+#: buffer overflows after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
 #: Number of packets of connected peers that are processed for one packet of a handshake.
 TURN: Final = 16
 #: Time after which a waiting packet of a connected peer is dropped, because the peer has sent a newer message [s].
 LATE_S: Final = 1.0
-#: Largest number of handshake packets that wait, and of packets that are read in a turn.
+#: Largest number of waiting handshake packets, and largest number of packets that are read at a time.
 MOST_WAITING: Final = 1024
 _REJECTED: Final = 0x101
 
 
 def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = IDLE_S) -> QuicConfiguration:
-    """Return the QUIC configuration of an end from the files of `railfix.ground.keys.write_keys`."""
+    """Return the QUIC configuration of one end, from the files that `railfix.ground.keys.write_keys` writes."""
     settings = QuicConfiguration(
         is_client=is_client,
         alpn_protocols=[PROTOCOL],
@@ -81,7 +83,7 @@ class Handshakes:
         self._invited, self._since_s = 0, float("-inf")
 
     def invites(self, now_s: float) -> bool:
-        """Return whether a peer may be invited to prove its address, as there is room for its handshake."""
+        """Return whether a peer may be invited to prove its address: there must be room for its handshake."""
         if now_s - self._since_s > INVITED_S:
             self._invited, self._since_s = 0, now_s
         room = MOST_HANDSHAKES - self._invited
@@ -96,7 +98,10 @@ class Handshakes:
         return self._has_room(mine, MOST_OF_PEER, now_s) and self._has_room(list(self._open), MOST_HANDSHAKES, now_s)
 
     def _has_room(self, handshakes: list[LinkProtocol], most: int, now_s: float) -> bool:
-        """Return whether another handshake fits, if necessary after ending the oldest if it takes `HANDSHAKE_S`."""
+        """Return whether there is room for another handshake.
+
+        If necessary, the oldest handshake is ended, once it has lasted `HANDSHAKE_S`.
+        """
         if len(handshakes) < most:
             return True
         oldest = handshakes[0]
@@ -152,7 +157,7 @@ class LinkProtocol(QuicConnectionProtocol):
             quic._initialize = with_request  # type: ignore[method-assign]
 
     def quic_event_received(self, event: QuicEvent) -> None:
-        """Verify the peer at the end of the handshake; pass datagrams of a verified peer on."""
+        """Verify the peer at the end of the handshake, and pass on datagrams of a verified peer."""
         if isinstance(event, HandshakeCompleted):
             self._verify()
         elif isinstance(event, DatagramFrameReceived) and self.peer is not None:
@@ -183,7 +188,7 @@ class LinkProtocol(QuicConnectionProtocol):
         self.close(error_code=_REJECTED, reason_phrase="certificate")
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
-        """Process a packet; acknowledgements to a verified peer are delayed, which halves packets and work."""
+        """Process a packet; acknowledgements to a verified peer are delayed, which halves the number of packets."""
         self.unanswered_s = None
         if self.patience is not None:
             self.patience()
@@ -200,7 +205,7 @@ class LinkProtocol(QuicConnectionProtocol):
             self._waiting = self._loop.call_later(self._wait_s, self.transmit)
 
     def answer(self, made: Callable[[], bytes]) -> None:
-        """Send the bytes that `made` returns with the next packet; `made` is called when that packet is sent."""
+        """Send the bytes that `made` returns in the next packet; `made` is called when that packet is sent."""
         self._answers.append(made)
 
     def transmit(self) -> None:
@@ -229,7 +234,8 @@ class LinkProtocol(QuicConnectionProtocol):
     async def wait_silent(self, idle_s: float) -> None:
         """Wait until the connection is closed, or no packet has arrived for `idle_s` since a message was sent.
 
-        The time-out of QUIC is at least three times the probe time-out, which grows with the variation of round trips.
+        The idle time-out of QUIC would be too long: it is at least three times the probe time-out, which grows with the
+        variation of round trips.
         """
         while not self.ended:
             now_s = self._loop.time()
@@ -243,7 +249,7 @@ class LinkProtocol(QuicConnectionProtocol):
 
 @contextmanager
 def address_errors(host: str, port: int) -> Iterator[None]:
-    """Add the address and the remedy to an OSError from listening at an address."""
+    """Context manager that adds the address and the remedy to an OSError raised on listening at an address."""
     try:
         yield
     except OSError as error:
@@ -269,10 +275,11 @@ class _Socket:
 
 
 class LinkServer(QuicServer):
-    """Server that reads all packets that have arrived, and processes handshakes and connected peers in turns.
+    """Server that reads all arrived packets, and processes handshakes and connected peers in turns.
 
-    A turn has one packet of a handshake and up to `TURN` packets of connected peers. Handshakes in progress precede new
-    handshakes, which wait. `late` is the number of packets that were dropped because they had waited for `LATE_S`.
+    In a turn, one packet of a handshake and up to `TURN` packets of connected peers are processed. Handshakes in
+    progress precede new handshakes. `late` is the number of packets that were dropped because they had waited longer
+    than `LATE_S`.
     """
 
     def __init__(self, bound: socket.socket, handshakes: Handshakes, **settings: Any) -> None:
@@ -296,7 +303,7 @@ class LinkServer(QuicServer):
     def _read(self) -> None:
         """Read the packets that have arrived."""
         now_s, length = self._loop.time(), self._configuration.connection_id_length
-        with suppress(OSError):  # no more packets have arrived, or a peer has refused a packet
+        with suppress(OSError):  # raised if no packet is left, or if a peer has refused a packet
             for _ in range(MOST_WAITING):
                 data, addr = self._bound.recvfrom(65_536)
                 protocol = None if data[:1] >= b"\x80" else self._protocols.get(data[1 : 1 + length])
@@ -309,7 +316,7 @@ class LinkServer(QuicServer):
         self._turn()
 
     def _sort(self, data: bytes, addr: Any, now_s: float) -> None:
-        """Queue a packet of a peer that is not connected; other data than QUIC packets are dropped."""
+        """Queue a packet of a peer that is not connected; data that are not QUIC packets are dropped."""
         with suppress(ValueError):  # the bytes are not a QUIC packet
             header = pull_quic_header(Buffer(data=data), host_cid_length=self._configuration.connection_id_length)
             first = header.packet_type == QuicPacketType.INITIAL and header.destination_cid not in self._protocols
@@ -350,10 +357,10 @@ async def listen(
     rejected: Callable[[], None],
     wait_s: float = WAIT_S,
 ) -> tuple[LinkServer, tuple[str, int]]:
-    """Open a server at an address, where port 0 takes a free port; return the server and its address.
+    """Open a server at an address, where port 0 selects a free port; return the server and the address.
 
-    Answers and acknowledgements to a verified peer are delayed up to `wait_s`, to be sent with a message. A peer must
-    prove its address before more than its first packet is stored (Retry, RFC 9000, 8.1.2).
+    Answers and acknowledgements to a verified peer are delayed by up to `wait_s`, to be sent with a message. Until a
+    peer has proved its address (Retry, RFC 9000, 8.1.2), only its first packet is stored.
     """
     handshakes = Handshakes()
     with address_errors(*address):
@@ -387,7 +394,7 @@ async def connection(
     received: Callable[[LinkProtocol, bytes], None],
     timeout_s: float = 5.0,
 ) -> AsyncIterator[LinkProtocol]:
-    """Connect from a bearer's local address; a first packet must arrive within `timeout_s`.
+    """Connect to a server from the local address of a bearer; a first packet must arrive within `timeout_s`.
 
     The connection must then be established within three times `timeout_s`. Raise ConnectionError or TimeoutError if the
     other end rejects the certificate, has another name, or does not answer.
@@ -398,14 +405,14 @@ async def connection(
     )
     try:
         protocol.connect(address)
-        # `wait_for` would not retrieve the error of a connection that ends as it gives up.
+        # `wait_for` would not retrieve the error of a connection that ends at the same moment as the time-out.
         async with asyncio.timeout(timeout_s) as limit:
             protocol.patience = lambda: None if limit.expired() else limit.reschedule(loop.time() + 3.0 * timeout_s)
             await protocol.wait_connected()
         yield protocol
     finally:
         protocol.patience = None
-        protocol._connected_waiter = None  # after a time-out nothing retrieves the error set by closing
+        protocol._connected_waiter = None  # after a time-out, nothing would retrieve the error that closing sets
         protocol.close()
         await asyncio.sleep(0)
         transport.close()

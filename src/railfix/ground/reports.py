@@ -1,11 +1,11 @@
 """Effect of a position report on the interval of its train, as pure functions.
 
-No check proves a report correct: `CHECKS` detect reports that contradict earlier reports. Undetected errors (within the
-train's own bounds) are excluded by condition C12 of ``docs/safety.md``.
+`CHECKS` detect reports that contradict earlier reports; they cannot prove a report correct. Condition C12 of
+``docs/safety.md`` excludes errors that these checks do not detect.
 
-The safe rear end moves to the position confirmed by two consecutive reports of a complete train of its configured
-length. A report that contradicts the record of its train stops that train and its neighbours. Whatever the
-contradiction, the interval is extended to the reported position, as far as the train can have run.
+The safe rear end moves to a position that two consecutive reports confirm, in which the train is complete and has the
+configured length. A report that contradicts the record of its train stops this train and the trains next to it. After
+any contradiction, the interval is extended to the reported position, but no farther than the train can have run.
 """
 
 from __future__ import annotations
@@ -19,26 +19,28 @@ from railfix.ground.layout import Layout
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Largest rounding difference between a reported and the configured length [m].
+#: Largest difference between the reported and the configured train length that is attributed to rounding [m].
 LENGTH_ROUNDING_M: Final = 0.02
-#: Largest speed of a train at standstill, and largest backward speed that is not rolling back [m/s].
+#: Largest reported speed of a train at standstill, and largest backward speed that does not count as running backward
+#: [m/s].
 STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
-#: Largest sum of over- and under-reading amount of an accepted report [m].
+#: Largest sum of the over-reading and under-reading amounts of an accepted report [m].
 WIDEST_M: Final = 1000.0
-#: Shortest time between two positions that extensions of intervals assume, and largest age of a sent position [s].
+#: Shortest time between two positions that is assumed when an interval is extended, and largest age of a sent position
+#: [s].
 INSTANT_S: Final = 5.0
 
 
 def is_placed(message: TrainMessage) -> bool:
-    """Return whether a report has a position with both bounds, of a train whose front end is known."""
+    """Return whether a report has a position with both bounds, and it is known which end of the train is the front."""
     known = None not in (message.chainage_cm, message.over_cm, message.under_cm)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
     return known and placed and message.facing != 0 and Unknown.FRONT_END not in message.unknown
 
 
 def is_newer(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report is from another on-board start than the newest report, or has a higher number."""
+    """Return whether a report is from another session than the newest report, or has a higher sequence number."""
     return (message.session or 0) != known.session or message.sequence > known.sequence
 
 
@@ -48,13 +50,13 @@ def stands(message: TrainMessage) -> bool:
 
 
 def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether the safe rear end may follow a report: the train is complete and has its configured length."""
+    """Return whether a report may move the safe rear end: the train is complete and has its configured length."""
     return message.complete and abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedReport:
-    """A report with a position, and the record of its train."""
+    """Report with a position, and what the centre knows about the train."""
 
     known: TrainInterval
     message: TrainMessage
@@ -62,8 +64,8 @@ class PlacedReport:
     limits: InterlockingLimits
     granted: int  #: Number of the newest authorities.
     skipped: tuple[int, int]  #: `Interlocking.skipped`.
-    #: Longest time since the previous position [s]: negative if the report's clock is behind the previous report's,
-    #: None if unknown, as at the first report.
+    #: Longest time since the previous position [s]: negative if the time of the new position is before that of the
+    #: previous one, None if unknown, as at the first report.
     elapsed_s: float | None
 
     @property
@@ -73,12 +75,12 @@ class PlacedReport:
 
     @property
     def over_m(self) -> float:
-        """Largest distance of the front end behind the reported front end [m]."""
+        """Over-reading amount: largest distance of the true front end behind the reported front end [m]."""
         return (self.message.over_cm or 0) / 100.0
 
     @property
     def under_m(self) -> float:
-        """Largest distance of the front end ahead of the reported front end [m]."""
+        """Under-reading amount: largest distance of the true front end ahead of the reported front end [m]."""
         return (self.message.under_cm or 0) / 100.0
 
     @property
@@ -139,16 +141,16 @@ def moving_standstill(report: PlacedReport) -> str | None:
 
 
 def unknown_authority(report: PlacedReport) -> str | None:
-    """Return a contradiction if an authority is not in the centre's database, otherwise None."""
+    """Return a contradiction if the report names an authority that is not in the centre's database, otherwise None."""
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None
-    newest = f"at its start was {last}" if held < first else f"is {report.granted}"
+    newest = f"at the last start was {last}" if held < first else f"is {report.granted}"
     return f"the train has authority {held}, the newest in the centre's database {newest}"
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
-    """Return a contradiction if ends are changed while the train runs or is outside its interval, otherwise None."""
+    """Return a contradiction if a train has changed ends while running or outside its interval, otherwise None."""
     if not report.turns:
         return None
     if not report.message.standstill:
@@ -162,9 +164,9 @@ def wrong_turn(report: PlacedReport) -> str | None:
 
 
 def holds_more(report: PlacedReport) -> str | None:
-    """Return a contradiction if an authority ends beyond the interval, otherwise None.
+    """Return a contradiction if the train's authority ends beyond the train's interval, otherwise None.
 
-    After a change of ends, the limit is the reported position.
+    After a change of ends, the authority must not end beyond the reported position.
     """
     held, facing = report.held_m, report.message.facing
     if held is None:
@@ -177,22 +179,23 @@ def holds_more(report: PlacedReport) -> str | None:
 
 
 def too_fast(report: PlacedReport) -> str | None:
-    """Return a contradiction if a speed exceeds the highest speed of trains, otherwise None."""
+    """Return a contradiction if the reported speed exceeds the highest speed of trains, otherwise None."""
     fast = report.speed_mps is not None and report.speed_mps > report.limits.speed_mps
     return f"the speed {report.speed_mps:.0f} m/s is above {report.limits.speed_mps:g} m/s" if fast else None
 
 
 def older_place(report: PlacedReport) -> str | None:
-    """Return a contradiction if a position is older than the previously reported position, otherwise None."""
+    """Return a contradiction if the reported position is older than the previous one, otherwise None."""
     older = report.elapsed_s is not None and report.elapsed_s < 0.0
     return "the position is older than in the previous report" if older else None
 
 
 def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
-    """Return the longest distance [m] that a train can have run in a time, by its speeds at both ends if known."""
+    """Return the longest distance [m] that a train can have run in a time, given its speeds before and after."""
     top = limits.speed_mps
     if before is not None and now is not None:
-        # highest speed between the two reports: errors of the reported speeds, and acceleration until the middle
+        # highest speed between the two reports: the higher reported speed, plus the largest error of a reported speed,
+        # plus the acceleration over half of the time
         top = min(top, max(before, now) + SPEED_ERROR_MPS + 0.5 * limits.acceleration_mps2 * elapsed_s)
     return top * elapsed_s
 
@@ -202,7 +205,7 @@ def impossible_way(report: PlacedReport) -> str | None:
     known, elapsed = report.known, report.elapsed_s
     if report.turns:
         return None
-    # Before its first report the train is at rest; after a start on board it may be anywhere in its interval.
+    # Before the first report, the train is at rest; after a restart on board, it may be anywhere in its interval.
     if elapsed is None:
         end = known.front_m if known.reported_m is None else known.interval_m[1]
         way = known.direction * (report.front_m - end) - report.over_m
@@ -246,7 +249,7 @@ def compute_contradiction(report: PlacedReport) -> str | None:
 
 
 def covered_m(report: PlacedReport) -> tuple[float, float]:
-    """Return the rear and front ends of the interval extended to the reported position [m].
+    """Return the rear end and the front end of a train's interval, extended to the reported position [m].
 
     The extension is limited by the distance that the train can have run, and by the line.
     """
@@ -262,7 +265,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
-    """Return the train's record with the data of a report, contradicted or not, and with the changes in `interval`."""
+    """Return the train's record with the data of a report, which may be contradicted, and the changes in `interval`."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     noted: dict[str, Any] = {
@@ -288,7 +291,7 @@ def _runs_by(report: PlacedReport) -> int | None:
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
-    """Return the record of a stopped train, with its interval extended to the reported position and authority."""
+    """Return the record with the train stopped, and the interval extended to the reported position and authority."""
     (rear, front), d, noted = covered_m(report), report.known.direction, _noted(report)
     held = noted.end_m if report.held_m is None else report.held_m
     end, rear = d * max(d * noted.end_m, d * held), d * min(d * rear, d * held) if report.turns else rear
@@ -305,10 +308,10 @@ def report_received(
 ) -> Interlocking:
     """Return the state after a position report.
 
-    A change of ends is accepted only at standstill inside the train's station, and the interval still includes the
-    earlier position. A report that contradicts the record stops the train, and only extends its interval. Reports
-    without a position, and older reports, have no effect. `elapsed_s` is the longest time since the previous position
-    by the centre's clock, where known.
+    A change of ends is accepted only at standstill inside the train's station; afterwards the interval still includes
+    the earlier position. A report that contradicts the train's record stops the train, and can only extend the
+    interval. Reports without a position, and reports older than the newest, have no effect. `elapsed_s` is the longest
+    time since the previous position by the centre's clock, where known.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):
@@ -346,31 +349,31 @@ def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:
 
 
 def furthest(facing: int, agreed_m: float, known_m: float) -> float:
-    """Return the further of two rear ends in running direction, so that a wider bound moves no rear end back [m]."""
+    """Return the foremost of two rear ends as a distance in running direction [m]; the rear end never moves back."""
     return max(agreed_m, facing * known_m)
 
 
 def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float | None) -> float | None:
-    """Return the longest time since the previous position, by the clocks of the train and of the centre [s]."""
+    """Return the longest time since the previous position, computed with the clocks of the train and the centre [s]."""
     if known.measured_ns is None or (message.session or 0) != known.session:
         return by_centre_s
     by_train_s = (message.time_ns - known.measured_ns) / 1e9
-    # a clock that was set forward does not lengthen the possible distance
+    # the centre's clock limits the time, so that a train's clock that was set forward does not permit a longer distance
     return by_train_s if by_centre_s is None or by_train_s < 0.0 else max(min(by_train_s, by_centre_s), 0.0)
 
 
-#: Highest authority number that a train may report beyond an older copy of the database.
+#: Numbers from this value on are not adopted from a report that names an authority unknown to the database.
 _MOST_NUMBERS: Final = 1 << 62
 
 
 def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state whose next authorities have higher numbers than the authority that a report names."""
+    """Return a state in which the next authorities have higher numbers than the authority named by a report."""
     held = message.authority or 0
     return replace(state, granted=held) if state.granted < held < _MOST_NUMBERS else state
 
 
 def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
-    """Return the record of a train that has changed ends; its earlier position and authority remain occupied."""
+    """Return a train's record after a change of ends; the interval covers the earlier position and authority."""
     held = ahead if known.held_end_m is None else known.held_end_m
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m, facing * held)

@@ -1,4 +1,4 @@
-"""Process of the centre: its configuration file, links, page, and simulated points."""
+"""Process of the centre: configuration file, links, page, and simulated points."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ from railfix.ground.writer import ThreadWriter
 from railfix.io import read_navigation
 from railfix.track.network_read import read_network
 
-#: Period of the centre's work [s].
+#: Period of the centre's steps [s].
 STEP_S = 0.1
-#: Longest wait for a commit in progress at the end [s].
+#: Longest wait at the end of the process for a commit in progress [s].
 ENDING_S = 3.0
-#: Thresholds of the garbage collector for rare full collections, which take 0.3 s with a thousand connections.
+#: Thresholds of the garbage collector, chosen for rare full collections; one takes 0.3 s with a thousand connections.
 COLLECTION = 10_000, 20, 50
-#: Document with the stations and trains that the database belongs to.
+#: Name of the document with the stations and trains to which the database belongs.
 _BELONGS_TO = "stations and trains"
 
 
 def parse_address(text: object) -> tuple[str, int]:
     """Return the host and the port of ``HOST:PORT``; raise ValueError if the text has another form."""
-    if isinstance(text, tuple):  # parsed before: changed settings are checked again
+    if isinstance(text, tuple):  # already parsed: settings are validated again when they are changed
         text = ":".join(map(str, text))
     host, _, port = str(text).rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
@@ -65,60 +65,59 @@ Address = Annotated[tuple[str, int], BeforeValidator(parse_address)]
 
 
 class TrainPlace(Settings):
-    """Train at rest at the first start of the centre."""
+    """Train that is at rest at the first start of the centre."""
 
     number: int = Field(gt=0, lt=1 << 32)
     station: str
     track: Literal[1, 2]
-    direction: Literal[-1, 1]  #: Direction of the front along the chainage.
-    #: Chainage of the front end, and length of the train.
-    front_m: float
-    length_m: float = Field(gt=0)
-    bound_m: float = Field(default=10.0, ge=0)  #: Largest distance of the front end from `front_m`.
+    direction: Literal[-1, 1]  #: Running direction: 1 toward rising chainage, -1 toward falling.
+    front_m: float  #: Chainage of the front end [m].
+    length_m: float = Field(gt=0)  #: Length of the train [m].
+    bound_m: float = Field(default=10.0, ge=0)  #: Largest distance of the true front end from `front_m` [m].
 
 
 class TriangleInputs(Settings):
-    """Reference triangle on live streams."""
+    """Streams, points and limits of a reference triangle."""
 
     sources: tuple[str, str, str]  #: Streams of the three receivers, as in ``railfix live``.
-    points: tuple[Place, Place, Place]  #: Latitude, longitude and height of the known points; length 3 [deg, deg, m].
+    points: tuple[Place, Place, Place]  #: Latitude [deg], longitude [deg] and height [m] of the three known points.
     nav: tuple[Path, ...] = ()  #: Navigation files; records from the streams are added.
     limits: TriangleLimits = TriangleLimits()
 
     def points_ecef_m(self) -> Floats:
-        """Return the known points, shape (3, 3) [m]."""
+        """Return the known points in Earth-fixed coordinates, shape (3, 3) [m]."""
         return ecef_from_geodetic(*np.array(self.points).T)
 
 
 class CentreFile(Settings):
     """Configuration file of a centre; its paths are relative to the folder of the file."""
 
-    keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key`` of ``railfix ground keys``.
+    keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key``, written by ``railfix ground keys``.
     listen: dict[LinkName, Address]  #: Address of each bearer.
     stations: tuple[LoopStation, ...] = ()  #: Stations of the line, unless `network` is given.
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Gradients of the line, in order of chainage.
-    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection system, which sends the order
-    #: ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise the section is unknown.
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection system. This system must send the order
+    #: ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise, the state of the section is
+    #: unknown.
     detected_sections: tuple[str, ...] = ()
-    drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
-    #: Initial stations of the trains; later starts read them from the database.
+    drive: Literal["left", "right"] = "left"  #: Side on which trains run through a station of the network.
+    #: Trains, with their positions at the first start; at later starts, positions are read from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: SQLite file, or the address of an SQL database (``postgresql+psycopg://...``).
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
-    #: Whether a train that nears the end of its track is given the route to the next station.
+    #: Whether a train that approaches the end of its track is given the route to the next station automatically.
     routes: Literal["automatic", "by hand"] = "automatic"
     speed_mps: float = Field(default=20.0, gt=0)  #: Highest speed of the reference run curve, for simulated running.
-    #: Time in which simulated points move; railfix has no interface to real points.
+    #: Time that simulated points take to move; railfix has no interface to real points.
     points_s: float = Field(default=5.0, ge=0)
-    #: Reference triangle that monitors satellite positioning; the first start is then a stop, to be released by hand.
-    #: Without a triangle, satellite positioning is not monitored.
+    #: Reference triangle that monitors satellite positioning. With a triangle, all trains are stopped at the first
+    #: start until the stop is released by hand. Without a triangle, satellite positioning is not monitored.
     triangle: TriangleInputs | None = None
-    #: Limits of reports, of the interlocking and of the monitor.
-    centre: CentreLimits = CentreLimits()
-    interlocking: InterlockingLimits = InterlockingLimits()
-    monitor: MonitorLimits = MonitorLimits()
+    centre: CentreLimits = CentreLimits()  #: Limits of reports.
+    interlocking: InterlockingLimits = InterlockingLimits()  #: Limits of the interlocking.
+    monitor: MonitorLimits = MonitorLimits()  #: Limits of the monitor of satellite positioning.
 
     @model_validator(mode="after")
     def _both_bearers_and_known_places(self) -> Self:
@@ -150,7 +149,7 @@ class CentreFile(Settings):
         return self
 
     def with_stations(self, folder: Path) -> Self:
-        """Return the settings with the stations of the network, whose files are relative to a folder.
+        """Return the settings with the stations derived from the map files of `network` in a folder.
 
         Raise InputFileError or MismatchError if a map file cannot be read, or the network is not a single line with
         passing loops. Raise SettingsError if a train is outside all stations.
@@ -177,7 +176,7 @@ class CentreFile(Settings):
         ]
 
     def curves(self) -> dict[int, ReferenceCurve]:
-        """Return the reference run curves by direction, which stop in the middle of each station."""
+        """Return the reference run curve of each direction; a curve stops in the middle of each station."""
         stops = np.array([0.5 * (station.begin_m + station.end_m) for station in self.stations])
         return {
             1: ReferenceCurve.between_stations(stops, speed_mps=self.speed_mps),
@@ -195,15 +194,15 @@ async def run_centre(
     for_s: float | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> tuple[bool, dict[str, Any]]:
-    """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time.
+    """Run the centre that a file configures (`CentreFile`), until SIGINT or SIGTERM or for a given time.
 
-    Return whether SIGTERM ended the centre, and figures of the session.
+    Return whether SIGTERM ended the centre, and counts of reports, routes and rejected frames.
 
-    `page` is the host and port of the page, where port 0 takes a free port; at other than loopback addresses the page
-    is served by TLS with the centre's certificate. `password` permits orders, and `people` has personal passwords by
-    name. `orders` is a separate address for orders, by default the page's address. `announce` is called with each
-    address once trains can connect. Raise InputFileError if the file, a key or the database cannot be read. Raise
-    SettingsError if a setting is wrong, or an address is not available.
+    `page` is the host and port of the page, where port 0 selects a free port. At addresses other than loopback, the
+    page is served over TLS with the centre's certificate. Orders require `password`, or one of the personal passwords
+    in `people`, by name. `orders` is a separate address for orders, by default the page's address. `announce` is called
+    with each address once trains can connect. Raise InputFileError if the file, a key or the database cannot be read.
+    Raise SettingsError if a setting is wrong, or an address is not available.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
@@ -283,7 +282,7 @@ async def _run_until(
 def _centre(
     settings: CentreFile, keys: Path, store: Store, points: SimulatedPoints
 ) -> tuple[ControlCentre, CentreLinks]:
-    """Return the centre with its stored state, and the links that are connected to it."""
+    """Return the centre with its stored state, and the links that pass reports to it."""
     supervision = Supervision(
         layout=settings.layout,
         state=at_start(settings.layout, settings.intervals()),
@@ -316,14 +315,14 @@ def _centre(
 
 
 def _stored_points(store: Store) -> dict[PointName, int]:
-    """Return the tracks of the simulated points, as detected, or else commanded, when the previous process ended."""
+    """Return the track of each set of simulated points, as last detected, or else commanded, in the database."""
     texts = store.documents(HEAD)
     points = from_documents(texts).points if texts else {}
     return {name: point.detected or point.wanted for name, point in points.items()}
 
 
 def _call_in(loop: asyncio.AbstractEventLoop, work: Callable[[], None]) -> None:
-    """Call a function in the loop from another thread, unless the loop has ended."""
+    """Call a function in the event loop from another thread, unless the loop has ended."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(work)
 
@@ -340,7 +339,10 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
-    """Run a step every `STEP_S`, for at most half of the time, because links receive frames in the same event loop."""
+    """Run a step of the centre every `STEP_S`.
+
+    Steps take at most half of the time, because the links receive frames in the same event loop.
+    """
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:
@@ -354,7 +356,7 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
 
 
 async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> None:
-    """Monitor satellite positioning with the streams of the triangle; if they end, late fixes stop the trains."""
+    """Monitor satellite positioning with the triangle's streams; if the streams end, late fixes stop the trains."""
     if (triangle := settings.triangle) is None:
         return
     try:
@@ -380,13 +382,13 @@ def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}
     text = store.document(_BELONGS_TO)
     if text is None and store.document(HEAD) is not None:
-        raise InputFileError(path, "the database is of an older version of railfix; give another database")
+        raise InputFileError(path, "the database was written by an older version of railfix; choose another database")
     before: dict[str, str] = under if text is None else json.loads(text)
     for name in sorted(before.keys() | under.keys()):
         if before.get(name) != under.get(name):
             was, is_now = before.get(name, "absent"), under.get(name, "absent")
             raise InputFileError(
-                path, f"{name} is {is_now}, in the database {was}; restore the file, or give another database"
+                path, f"{name} is {is_now}, in the database {was}; restore the file, or choose another database"
             )
     if text is None:
         store.save(documents={_BELONGS_TO: json.dumps(under)})

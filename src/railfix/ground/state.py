@@ -1,4 +1,4 @@
-"""State of the interlocking: intervals of trains, points, bars and speed restrictions; and its texts for the store.
+"""State of the interlocking (intervals of trains, points, bars, speed restrictions), and its stored texts.
 
 The state is stored as texts: one head text, one text per train, and one text per set of points. Values are immutable:
 each step returns new values.
@@ -25,17 +25,18 @@ class InterlockingLimits(Settings):
 
     #: Distance by which a movement authority ends short of the obstacle or signal that limits it.
     margin_m: float = Field(default=20.0, ge=0)
-    #: Overlap beyond the end of an authority for a train that passes the end at release speed; with 0 there is no
-    #: release speed.
+    #: Distance kept free beyond the end of an authority for a train that passes the end at release speed. With 0, there
+    #: is no release speed.
     overlap_m: float = Field(default=0.0, ge=0)
-    #: Time from the passage of the safe rear end to the release of points.
+    #: Time from the passage of a train's safe rear end to the release of the points.
     release_s: float = Field(default=3.0, ge=0)
-    #: Longest time until the field answers a request for the detection of points; then trains on them are stopped.
+    #: Longest time until the field answers a request for the detection of points; after it, trains on these points are
+    #: stopped.
     answer_s: float = Field(default=10.0, gt=0)
-    #: Longest time between two answers of a section's detection; then the section is unknown.
+    #: Longest time between two answers of a section's detection; after it, the section's state is unknown.
     detection_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
-    #: Highest acceleration and deceleration, between two reports with speeds.
+    #: Highest acceleration and deceleration of a train; used between two reports that have speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)
 
 
@@ -45,11 +46,10 @@ class TrainInterval:
 
     train: int
     direction: int
-    #: Last safe rear and front ends.
-    rear_m: float
-    front_m: float
+    rear_m: float  #: Last safe rear end [m].
+    front_m: float  #: Last safe front end [m].
     end_m: float  #: End of the authority.
-    sequence: int  #: Number of the newest report, and on-board start of this number (`TrainMessage.session`).
+    sequence: int  #: Sequence number of the newest report; `session` is the `TrainMessage.session` of this report.
     session: int = 0
     tracks: Mapping[int, int]  #: Track in each station of the route.
     station: int  #: Station where the route ends.
@@ -58,23 +58,25 @@ class TrainInterval:
     #: Safe rear end of the newest report; the interval begins there once the next report confirms it. None if the
     #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
-    line: int | None = None  #: Line of the train's reports; None before the first.
-    #: Instant of the newest position, on the train's clock; None before the first report since a start on board.
+    line: int | None = None  #: Number of the line that the train's reports state; None before the first report.
+    #: Time of the newest position by the train's clock; None before the first report since the train's unit was
+    #: started.
     measured_ns: int | None = None
-    speed_mps: float | None = None  #: Newest speed.
-    #: Ends of the train by the newest report with a position, contradicted or not, lower chainage first; and the
-    #: contradiction of this report.
+    speed_mps: float | None = None  #: Speed of the newest report; None if unknown.
+    #: Ends of the train by the newest report with a position, contradicted or not; lower chainage first [m].
     reported_m: tuple[float, float] | None = None
-    contradiction: str | None = None
-    held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
-    #: Number of the newest authority by which the train may run, sent or named by a report. None before the first, and
-    #: after a report that names an order to brake with this or a later number, which no authority in transit can end.
+    contradiction: str | None = None  #: Contradiction between this report and the record; None without one.
+    held_end_m: float | None = None  #: End of the train's authority according to its newest report.
+    #: Number of the newest authority, sent or named by a report, by which the train may run. None before the first
+    #: authority. Also None after a report that names an order to brake with this or a later number, because no
+    #: authority in transit can end that order.
     runs_by: int | None = None
-    stop: str | None = None  #: Reason of the stop, until the train is released by hand.
+    stop: str | None = None  #: Reason why the train is stopped, until it is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
-    asked_number: int = 0  #: Number of the first authority that requests this end.
-    held: bool = False  #: Whether a route was withdrawn, after which the next route is set by hand.
-    parted: int | None = None  #: Train that was divided from the rear of this train, until the two are apart.
+    asked_number: int = 0  #: Number of the first authority that requests the shorter end.
+    held: bool = False  #: Whether the train has returned a route; the next route is then set by hand.
+    #: Number of the train that was divided from the rear of this train, until the two trains are apart.
+    parted: int | None = None
 
     def changed(self, **values: Any) -> Self:
         """Return a copy with changes, faster than `dataclasses.replace`; raise TypeError for an unknown name."""
@@ -90,7 +92,7 @@ class TrainInterval:
 
     @cached_property
     def interval_m(self) -> tuple[float, float]:
-        """Rear end and furthest end of the occupied interval [m]."""
+        """Rear end and front end of the occupied interval, in running direction [m]."""
         return self.rear_m, max(self.end_m * self.direction, self.front_m * self.direction) * self.direction
 
     @cached_property
@@ -100,11 +102,11 @@ class TrainInterval:
         return low, high
 
     def overlaps(self, low_m: float, high_m: float) -> bool:
-        """Return whether some chainage between two chainages is occupied."""
+        """Return whether the occupied interval overlaps a range of chainages."""
         return self.span_m[0] < high_m and low_m < self.span_m[1]
 
     def has_passed(self, low_m: float, high_m: float) -> bool:
-        """Return whether the rear end is beyond a range of chainages, in running direction."""
+        """Return whether the rear end has left a range of chainages behind, in running direction."""
         return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
 
     def outside_m(self) -> float:
@@ -117,19 +119,20 @@ class TrainInterval:
         return max(beyond, behind, 0.0) if max(beyond, behind) > ROUNDING_M else 0.0
 
 
-#: Largest rounding difference between two ends [m].
+#: Largest difference between two ends that is attributed to rounding [m].
 ROUNDING_M: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
-    """State of points in the interlocking."""
+    """State of a set of points in the interlocking."""
 
     wanted: int = 1  #: Commanded track.
     detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
     #: Whether the field has received the command since `wanted` was stored.
     commanded: bool = True
-    #: Trains that lock the points, with the time of release once the train's rear end has passed [s], None before.
+    #: Trains that lock the points, each with the time at which it releases them [s]; None until its rear end has
+    #: passed.
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
@@ -145,7 +148,7 @@ _NAMES: Final = {
 
 
 class Restriction(NamedTuple):
-    """Temporary speed restriction: highest speed of a train while any part of it is between two chainages."""
+    """Temporary speed restriction: highest speed while any part of a train is between two chainages."""
 
     low_m: float
     high_m: float
@@ -159,17 +162,18 @@ class Interlocking:
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
     stopped: bool = False  #: Whether satellite positioning is suspended: no authority is extended, and no route is set.
-    granted: int = 0  #: Number of the last authorities that were sent.
-    #: Last number before this start, according to the stored database, and first number of this start; numbers between
-    #: them were issued from a newer database.
+    granted: int = 0  #: Number of the authorities that were sent last.
+    #: Last authority number stored in the database at this start, and first number issued after it. Authorities with
+    #: numbers between them were issued from a state that is newer than the stored one.
     skipped: tuple[int, int] = (0, 0)
-    #: Sections (`Layout.sections`) that no authority reaches into, each with its reason: `railfix.ground.stops.BARS`.
+    #: Sections (`Layout.sections`) into which no authority reaches, each with the reason
+    #: (`railfix.ground.stops.CLOSED`, `OCCUPIED` or `UNKNOWN`).
     bars: frozenset[tuple[str, str]] = frozenset()
     restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: Speed restrictions by name.
 
 
 def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
-    """Return the state with the newer interval of a train."""
+    """Return the state with the record of a train replaced."""
     return copy_with(state, trains={**state.trains, train.train: train})
 
 
@@ -182,13 +186,16 @@ def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Inte
     return state
 
 
-#: Name of the head text, and prefixes of the names of train and point texts.
+#: Name of the head text, and beginning of the names of the texts of trains and points.
 HEAD: Final = "interlocking"
 _TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
 
 
 def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str | None]:
-    """Return the texts by name; with a previous state only texts that may have changed, None for a removed text."""
+    """Return the texts of a state by name.
+
+    With a previous state `before`, only texts that may have changed are returned, and None for each text to be removed.
+    """
     head = {
         "stopped": state.stopped,
         "granted": state.granted,
@@ -208,7 +215,9 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
-    """Return the state from its texts; times of release restart, because the earlier process's clock is unknown.
+    """Return the state from its texts.
+
+    The times until points are released begin again, because the clock of the earlier process is unknown.
 
     Raise InputFileError if the texts were written by an older version.
     """
@@ -216,7 +225,9 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
     names = {field.name for field in fields(TrainInterval)}
     of_trains = [json.loads(text or "").keys() for name, text in texts.items() if name.startswith(_TRAIN)]
     if "bars" not in head or any(found != names for found in of_trains):
-        raise InputFileError("the centre's database", "is of an older version of railfix; give another database")
+        raise InputFileError(
+            "the centre's database", "was written by an older version of railfix; choose another database"
+        )
     trains, points = {}, {}
     for name, text in texts.items():
         if name.startswith(_TRAIN):
@@ -230,7 +241,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
             values = json.loads(text or "")
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    # sorted, so that the order does not depend on the order of the texts
+    # sorted, so that the result does not depend on the order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
         granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),

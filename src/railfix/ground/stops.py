@@ -1,8 +1,8 @@
 """Stops of one train, all trains, a section, or trains whose intervals overlap, and their release by hand.
 
-Until the release everything that was granted stays occupied. A train accepts a shorter end of its authority if it can
-stop before this end. Every authority after the request has the shorter end, and the train rejects authorities with
-older numbers, so that a late authority cannot extend the authority again.
+Until the release, every granted interval stays occupied. A train accepts a shorter end of its authority if it can stop
+before this end. Every authority sent after the request has the shorter end, and the train rejects authorities with
+lower numbers. A late authority can therefore not move the end forward again.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from railfix.ground.layout import Layout, Piece, PointName, overlap
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
 
-#: Reasons why a section is barred: it was closed by hand; it is occupied by vehicles without reports, as entered by
-#: hand or as detected; or its detection has not answered. `BARS` are the reasons for which trains inside are stopped.
+#: Reasons why a section is barred: `CLOSED` by hand; `OCCUPIED` by vehicles that do not report, as entered by hand or
+#: as detected; or `UNKNOWN`, because its detection has not answered. For the reasons in `BARS`, trains inside the
+#: section are stopped.
 CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
 BARS: Final = (CLOSED, OCCUPIED)
-#: Bars that end when the detection of a section reports it free.
+#: Reasons that end when the detection reports the section free.
 SWEPT: Final = {OCCUPIED, UNKNOWN}
 
 
@@ -38,10 +39,12 @@ def overlaps_stopped(
     nearby: NearbyTrains | None = None,
     checked: Mapping[int, TrainInterval] | None = None,
 ) -> Interlocking:
-    """Return the state with trains stopped if their intervals overlap: the bounds of trains at rest may have grown.
+    """Return the state with trains stopped if their intervals overlap.
 
-    `checked` holds the trains as they were at an earlier call; pairs of trains that have not changed since that call
-    are not compared with each other again, in order to save time on a line with many trains.
+    Intervals can come to overlap because the bounds of trains at rest may grow.
+
+    `checked` holds the trains as they were at an earlier call; two trains that have not changed since that call are not
+    compared with each other again.
     """
     nearby, checked = nearby or NearbyTrains(state, layout), checked or {}
     pairs = set()
@@ -62,12 +65,12 @@ def overlaps_stopped(
 
 
 def _occupation(train: TrainInterval) -> tuple[object, ...]:
-    """Return the values that determine the result of comparing a train with other trains."""
+    """Return the values of a train that determine whether its interval overlaps other intervals."""
     return train.span_m, train.tracks, train.stop, train.parted
 
 
 def parted_cleared(state: Interlocking) -> Interlocking:
-    """Return the state in which divided trains that are apart are treated as all other trains."""
+    """Return the state in which the parts of a divided train are separate trains once they are apart."""
     for train in [train for train in state.trains.values() if train.parted is not None]:
         rear = state.trains.get(train.parted or 0)
         if rear is None or not train.overlaps(*rear.span_m):
@@ -78,9 +81,9 @@ def parted_cleared(state: Interlocking) -> Interlocking:
 def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
     """Return the state with the stop of one train released by hand, and the reason for a refusal.
 
-    Points under the train's interval are locked for the train again, as a train that has rolled back may have passed
-    them before. The line of the train is taken from its next report. The route of the train ends in the farthest
-    station of the route that its front end has reached.
+    Points under the train's interval are locked for the train again, because a train that has rolled back may have
+    released them. The next report determines the line of the train. The route is shortened to the farthest of its
+    stations that the train's front end has reached.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -109,7 +112,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
         points[name] = replace(points[name], locked={**points[name].locked, train: None})
     direction = known.direction  # if the train overran its authority, the authority now ends at the front of the train
     end = direction * max(direction * known.end_m, direction * known.front_m)
-    station = known.station  # a station behind the train after a wrong change of ends
+    station = known.station  # after a wrong change of ends, this station may be behind the train
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
         station += direction
     moved = replace(known, stop=None, end_m=end, line=None, station=station)
@@ -130,7 +133,7 @@ def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[Po
 
 
 def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
-    """Return a section that a train occupies, with a bar for which trains inside are stopped, or None."""
+    """Return a section in a train's interval that is barred for a reason in `BARS`, and this reason, or None."""
     occupied = pieces_of(train, layout)
     bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
     return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)
@@ -139,7 +142,7 @@ def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple
 def close_section(
     state: Interlocking, section: str, layout: Layout, reason: str, *, kind: str = CLOSED
 ) -> Interlocking:
-    """Return the state with a section barred, into which no authority is extended, and the trains inside stopped."""
+    """Return the state with a section barred; no authority is extended into it, and trains inside are stopped."""
     state = replace(state, bars=state.bars | {(section, kind)})
     pieces = layout.sections[section]
     inside = [number for number, train in state.trains.items() if overlap(pieces, pieces_of(train, layout))]
@@ -147,12 +150,12 @@ def close_section(
 
 
 def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Interlocking:
-    """Return the state without a bar of a section; trains that were stopped by the bar must be released by hand."""
+    """Return the state with one bar of a section removed; trains that the bar has stopped must be released by hand."""
     return replace(state, bars=state.bars - {(section, kind)})
 
 
 def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[str]) -> Interlocking:
-    """Return the state with sections barred that are detected as occupied while no train's interval includes them."""
+    """Return the state with those sections detected as occupied barred that overlap no train's interval."""
     for section in sections:
         pieces = layout.sections[section]
         if (section, OCCUPIED) not in state.bars and not any(
@@ -165,13 +168,13 @@ def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[st
 def ask_route_back(
     state: Interlocking, train: int, layout: Layout, *, limits: InterlockingLimits
 ) -> tuple[Interlocking, str | None]:
-    """Return the state in which a train is requested to stay in its station, and the reason for a refusal."""
+    """Return the state in which a train is requested to return its route, and the reason for a refusal."""
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"
     direction, base = known.direction, known.station - known.direction
     if base not in known.tracks:
-        return state, "the train has no route to take back"
+        return state, "the train has no route that it could return"
     end = direction * layout.track_end_m(base, direction)
     if known.stop is not None or direction * (known.front_m - known.end_m) > 0.0:
         return state, "the train is stopped, or beyond its authority"
@@ -184,8 +187,8 @@ def ask_route_back(
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
     """Return the state after a report that may answer a request for a shorter end.
 
-    The route is released if the train agrees, otherwise it is kept. An answer of a stopped train, whose report may be
-    wrong, is not used until the train is released.
+    The route is released if the train agrees, otherwise it is kept. While a train is stopped, its answers are not used,
+    because its reports may be wrong.
     """
     known = state.trains[message.train]
     if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:
@@ -206,7 +209,7 @@ def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def answers(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report answers the authority that requests a shorter end."""
+    """Return whether a report answers an authority that requests a shorter end."""
     held = message.authority
     return held is not None and message.authority_end_cm is not None and held >= known.asked_number
 

@@ -23,10 +23,11 @@ with needs_extra():
     from sqlalchemy import event
 
 _META: Final = sql.MetaData()
-#: Largest number of log lines that are kept while the database fails, and in the database.
+#: Largest number of log lines that are kept in memory while the database fails.
 MOST_NOTES: Final = 10_000
+#: Largest number of log lines in the database.
 MOST_LINES: Final = 1_000_000
-#: Document that names the process in charge.
+#: Name of the document that identifies the process in charge.
 _IN_CHARGE: Final = "centre in charge"
 TRAINS: Final = sql.Table(
     "trains",
@@ -53,7 +54,7 @@ LOG: Final = sql.Table(
 
 
 class DatabaseError(OutputError):
-    """Error of a database that does not accept data at present."""
+    """Error raised if the database does not accept data at present."""
 
 
 class Store:
@@ -75,11 +76,11 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self.abandoned = False  #: Whether a thread with a hanging commit keeps the connection.
+        self.abandoned = False  #: Whether a thread whose commit has not ended still uses the connection.
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
-        """Make this process the only writer, so that an earlier centre can no longer commit.
+        """Make this process the only one that can commit; later commits of an earlier centre fail.
 
         Raise InputFileError if another process on this machine uses the SQLite database.
         """
@@ -123,7 +124,7 @@ class Store:
         Raise InputFileError if another centre has taken charge of the database since `take_charge`. Raise DatabaseError
         if the database fails; nothing is stored in this case, and the lines of the log are kept.
         """
-        notes = self._notes[:]  # another thread may add lines meanwhile
+        notes = self._notes[:]  # another thread may add lines during the commit
         try:
             self._save(records, documents or {}, notes)
         except sql.exc.SQLAlchemyError as error:
@@ -142,7 +143,7 @@ class Store:
         ]  # fmt: skip
         with self._connection.begin():
             if self._token is not None:
-                # the row is written before it is read, so that it stays locked until the commit
+                # the row is written, not only read, so that it stays locked until the commit
                 mine = (DOCUMENTS.c.name == _IN_CHARGE) & (DOCUMENTS.c.text == self._token)
                 if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
                     raise InputFileError(
@@ -159,7 +160,7 @@ class Store:
                 self._forget_old_lines(len(notes))
 
     def _forget_old_lines(self, added: int) -> None:
-        """Delete the oldest log lines beyond the limit; checked once per hundredth of the limit."""
+        """Delete the oldest log lines beyond the limit, each time a hundredth of the limit has been added."""
         self._written += added
         if self._written <= self._most_lines // 100:
             return
@@ -207,7 +208,7 @@ class Store:
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
     def _put(self, key: sql.Column[Any], rows: list[dict[str, Any]]) -> None:
-        """Replace rows by their key; of rows with the same key the last is used."""
+        """Replace the rows with the same keys; if `rows` has several rows with one key, the last is used."""
         if rows := list({row[key.name]: row for row in rows}.values()):
             self._connection.execute(
                 key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]
@@ -216,7 +217,7 @@ class Store:
 
 
 def _time_outs(url: str) -> dict[str, Any]:
-    """Return the time-outs of a connection for connecting, for a statement, and for an interrupted network."""
+    """Return a connection's time-outs for connecting, for a statement, and for an interrupted network."""
     if url.startswith("postgresql"):
         return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
     if url.startswith(("mysql", "mariadb")):

@@ -1,6 +1,6 @@
-"""Supervision of a line's trains by the centre: authorities from reports, without input or output.
+"""Supervision of a line's trains by the centre, without input or output: authorities are computed from reports.
 
-The supervision is common to `railfix.ground.control` (the centre with its store and page) and simulated traffic
+The supervision is used by `railfix.ground.control` (the centre with store and page) and by simulated traffic
 (`railfix.ground.traffic`).
 """
 
@@ -39,13 +39,14 @@ from railfix.io.train_message import TrainMessage
 
 #: Distance to the end of its track within which a train gets the next route [m].
 ROUTE_AHEAD_M = 700.0
-#: Longest time between two authorities to a train, which also gets an authority after each report and at a stop [s].
+#: Longest time between two authorities to a train [s]; further authorities follow each report and each change of its
+#: stop.
 AUTHORITY_S = 1.0
-#: Least number of authority numbers that are skipped at a start.
+#: Smallest number of authority numbers that are skipped at a restart.
 SKIPPED: Final = 1 << 20
-#: Time after the answered report at which an authority has certainly lapsed on board, above `LONGEST_FRESH_S` [s].
+#: Time after the answered report at which an authority has certainly lapsed on board [s]; it exceeds `LONGEST_FRESH_S`.
 LAPSED_S: Final = 60.0
-#: Largest drift between clocks of a train and of the centre.
+#: Largest relative drift between the clocks of a train and the centre.
 CLOCK_DRIFT: Final = 1e-4
 
 
@@ -55,7 +56,8 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    #: Function that is called with points to be moved and the target track; `set_detected` processes the detection.
+    #: Function that is called with the points to be moved and the track to which they shall lead; the detection that
+    #: follows is passed to `set_detected`.
     command: Callable[[PointName, int], None] = lambda *_: None
 
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -66,23 +68,26 @@ class Supervision:
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since authorities were last computed.
     #: Time of the last authority sent to a train [s], and whether it was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
-    granted_s: dict[int, float] = field(default_factory=dict)  #: Time of the last authority to run sent to a train [s].
+    #: Time at which a train was last sent an authority that permits it to run [s].
+    granted_s: dict[int, float] = field(default_factory=dict)
 
-    #: Time of sending, and number, of a train's order to brake that it has not acknowledged yet.
+    #: Order to brake of each stopped train: time of the last sending [s] (infinite once acknowledged), and number.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)
-    issued: dict[int, set[int]] = field(default_factory=dict)  #: Numbers of all orders to brake since the start.
-    begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
-    #: Trains that must report before anything is granted (`begin_again`).
+    #: Numbers of all orders to brake sent to each train since the start.
+    issued: dict[int, set[int]] = field(default_factory=dict)
+    begun_s: float = -math.inf  #: Centre's clock at a start with a stored state [s].
+    #: Trains that must report before any authority is extended or any route is set (`begin_again`).
     awaited: set[int] = field(default_factory=set)
-    #: Whether each section is detected as occupied; None if there is no answer, or if the last answer is too old.
+    #: Whether each section is detected as occupied; None if there is no answer, or the last answer is too old.
     detected: dict[str, bool | None] = field(default_factory=dict)
-    #: Time of a section detection's last answer [s], for detections that must be repeated.
+    #: Time of the last answer of each section detection that must answer repeatedly [s].
     answered_s: dict[str, float] = field(default_factory=dict)
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
     _asked_s: dict[PointName, float] = field(default_factory=dict)
     _nearby: NearbyTrains = field(init=False)
-    _checked: Mapping[int, TrainInterval] = field(default_factory=dict)  #: Trains that have been compared in pairs.
+    #: Trains as they were when they were last compared in pairs.
+    _checked: Mapping[int, TrainInterval] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._nearby = NearbyTrains(self.state, self.layout)
@@ -99,7 +104,7 @@ class Supervision:
                 self.awaited.discard(number)
             elapsed_s, clock, is_new = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
-            # the delay of a contradicted report by the same clock would permit longer distances later
+            # with the delay of a contradicted report, longer distances would be accepted later
             if is_new or self.state.trains[number].contradiction is None:
                 self._clocks[number] = clock
             self.state = answer_received(self.state, message)
@@ -109,7 +114,7 @@ class Supervision:
         return reason
 
     def _take_answer(self, message: TrainMessage) -> None:
-        """Process a report's statement on the order to brake that the train obeys."""
+        """Process what a report states about the order to brake that the train obeys."""
         number, held = message.train, message.brake_order
         sent_s, first = self.ordered.get(number, (0.0, 0))
         if number in self.ordered and is_obeyed(message, first):
@@ -125,10 +130,10 @@ class Supervision:
     ) -> tuple[float | None, tuple[float, float], bool]:
         """Return the longest time since the train's previous position, and the delay of the train's clock [s].
 
-        The time, None if unknown, is computed with the least delay of earlier reports; after an on-board start,
-        whose clock is new, only the centre's clock is used. The delay is returned with the time of its observation. The
-        third value is True for a new clock and for a clock that has been set back, whose earlier delays would lengthen
-        the time since every later position.
+        The time, None if unknown, is computed with the least delay of earlier reports. After a restart on board, the
+        train's clock is new, and only the centre's clock is used. The delay is returned with the time at which it was
+        observed. The third value is True for a new clock, and for a clock that was set back: with the delays from
+        before, the time since later positions would be too long.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -146,7 +151,7 @@ class Supervision:
 
     @property
     def awaited_text(self) -> str:
-        """Trains that have not reported since the start, in words."""
+        """List of the trains that have not reported since the start, in words."""
         return ", ".join(f"train {number}" for number in sorted(self.awaited))
 
     def set_detected(self, point: PointName, track: int | None) -> None:
@@ -157,8 +162,8 @@ class Supervision:
     def has_lapsed(self, train: int, now_s: float) -> bool:
         """Return whether every authority by which a train may run has lapsed on board.
 
-        An authority answers a report that arrived before the authority was sent, so that on board its age is counted
-        from an instant no later than its sending.
+        On board, the age of an authority is counted from the sending of the report that it answers, which is before the
+        sending of the authority.
         """
         record = self.records.get(train)
         counted_s = math.inf if record is None or record.counted_s is None else record.counted_s
@@ -168,12 +173,12 @@ class Supervision:
     def begin_again(self, now_s: float, *, wall_us: int) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
-        Nothing is granted until every train has sent a report that names an order of this start. Such a report includes
-        authorities unknown to the database, and the train no longer accepts late authorities of the earlier centre. The
-        stored detection of points is dropped.
+        No authority is extended until every train has sent a report that names an order of this start. This report also
+        states an authority that the database does not contain, and the train no longer accepts late authorities of the
+        earlier process. The stored detection of points is dropped.
 
-        Numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers of every
-        earlier start, or if that clock was set back, the numbers in the database.
+        Authority numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers
+        of every earlier start. If that clock was set back, they still exceed the numbers in the database.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
         first = max(last + SKIPPED, wall_us)
@@ -184,10 +189,10 @@ class Supervision:
         return tuple(points)
 
     def set_section_detected(self, section: str, occupied: bool | None, now_s: float = -math.inf) -> None:
-        """Process the detection of a section; None where it is unknown.
+        """Process the detection of a section: occupied, free, or None if unknown.
 
-        An occupied section is compared with the intervals of the trains at once: a wrong report that arrives later can
-        extend an interval into the section, and the occupation would then be attributed to that train.
+        An occupied section is compared with the intervals of the trains at once. Otherwise, a wrong report that arrives
+        later could extend an interval into the section, and the occupation would be attributed to that train.
         """
         self.detected[section] = occupied
         if section in self.answered_s:
@@ -219,7 +224,7 @@ class Supervision:
         return reason
 
     def command_points(self, stored: Interlocking) -> None:
-        """Give the due commands to points of a stored state; no commands are given before every train has reported."""
+        """Command points according to a stored state; no commands are given before every train has reported."""
         if self.awaited:
             return
         self.state, commands = due_commands(self.state, self.layout, stored, self._locate())
@@ -235,14 +240,14 @@ class Supervision:
             self.awaited.discard(number)
 
     def advance(self, now_s: float) -> list[Authority]:
-        """Find trains to be stopped, extend authorities and command points, without a store; return the authorities."""
+        """Run `watch`, `work` and `command_points` without a store; return the authorities."""
         self.watch(now_s)
         authorities = self.work(now_s)
         self.command_points(self.state)
         return authorities
 
     def watch(self, now_s: float) -> list[BrakeOrder]:
-        """Find trains that have to stop, without use of the store; return the orders to brake that are to be sent.
+        """Find trains that have to stop, and return the orders to brake to be sent; no commit is required.
 
         An order is repeated every `AUTHORITY_S` until a report of the train names it.
         """
@@ -277,8 +282,8 @@ class Supervision:
     def work(self, now_s: float) -> list[Authority]:
         """Release points, set routes, extend authorities; return the messages to send once the state is stored.
 
-        Trains are processed that have reported since the last call, whose stop has changed, or that were sent nothing
-        for `AUTHORITY_S`.
+        The trains processed are those that have reported since the last call, whose stop has changed, or to which no
+        authority was sent for `AUTHORITY_S`.
         """
         stopped = stop_orders(self.state)
         if not self.awaited:
@@ -315,7 +320,7 @@ class Supervision:
         return self._nearby
 
     def _list_due(self, now_s: float, stopped: Mapping[int, str]) -> list[int]:
-        """Return the trains that have reported, whose stop has changed, or that were sent nothing for `AUTHORITY_S`."""
+        """Return the trains that have reported, whose stop has changed, or that got no authority for `AUTHORITY_S`."""
         stop, sent, least_s = self.state.stopped, self.sent, AUTHORITY_S - 1e-6
         return [
             number
@@ -358,12 +363,12 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names the order to brake of a number, or a later order."""
+    """Return whether a report names the order to brake with a given number, or a later order."""
     return (message.brake_order or -1) >= number
 
 
 def counts(reason: Rejection | None) -> bool:
-    """Return whether a report is accepted, as there is no reason for rejecting it."""
+    """Return whether a report is accepted: there is no reason for rejecting it."""
     return reason is None
 
 
@@ -386,7 +391,7 @@ def standing_train(
 
 
 def at_start(layout: Layout, trains: list[TrainInterval]) -> Interlocking:
-    """Return the interlocking with trains at rest and every point detected on track 1."""
+    """Return the interlocking with trains at rest, and every set of points detected in its position for track 1."""
     return Interlocking(
         trains={train.train: train for train in trains}, points={name: PointState() for name in layout.points()}
     )

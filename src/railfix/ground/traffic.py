@@ -1,4 +1,4 @@
-"""Simulated traffic of a line: trains and points, with every invariant checked at each time step."""
+"""Simulated traffic of a line with trains and points; safety invariants are checked at each time step."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from railfix.io.train_message import MessageStatus, TrainMessage
 BRAKING_MPS2: Final = 0.7
 ACCELERATION_MPS2: Final = 0.5
 STEP_S: Final = 1.0
-#: Distance before the end of its authority at which a train stops [m].
+#: Distance before the end of the authority at which a train stops [m].
 STOP_SHORT_M: Final = 2.0
 
 
 def line_with_loops(stations: int = 6) -> Layout:
-    """Return a line of equal stations, 500 m long, which begin every 1,500 m."""
+    """Return a line with stations of 500 m length at intervals of 1,500 m."""
     begins = [1500.0 * k for k in range(stations)]
     return Layout(
         stations=tuple(LoopStation(name=chr(65 + k), begin_m=b, end_m=b + 500.0) for k, b in enumerate(begins))
@@ -31,11 +31,11 @@ def line_with_loops(stations: int = 6) -> Layout:
 
 @dataclass(kw_only=True)
 class SimulatedTrain:
-    """Train with its on-board supervision."""
+    """Simulated train with its on-board supervision."""
 
     number: int
     front_m: float
-    tracks: dict[int, int]  #: Track in each station that the points have led the train to.
+    tracks: dict[int, int]  #: Track, in each station, to which the points have led the train.
     on_board: OnBoard
     length_m: float = 80.0
     speed_mps: float = 0.0
@@ -100,7 +100,7 @@ class SimulatedTrain:
         )
 
     def step(self, now_s: float) -> None:
-        """Run for a step of time at the speed that is permitted up to the end of the authority."""
+        """Move the train for one time step, at most at the permitted speed."""
         wanted = min(self.top_mps, self.speed_mps + ACCELERATION_MPS2 * STEP_S, self.permitted_mps())
         if self.on_board.brake_reason(now_s) is not None or now_s < self.blind_until_s:
             wanted = 0.0
@@ -112,11 +112,11 @@ class SimulatedTrain:
 
     @property
     def safe_front_m(self) -> float:
-        """Safe front end from the erroneous position and its bound, plus the driver's margin `STOP_SHORT_M` [m]."""
+        """Safe front end: reported position plus its bound plus the driver's margin `STOP_SHORT_M` [m]."""
         return self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M)
 
     def permitted_mps(self) -> float:
-        """Return the speed that the authority permits [m/s]."""
+        """Return the permitted speed according to the train's authority [m/s]."""
         found = self.on_board.supervised()
         return 0.0 if found is None else found.permitted_mps
 
@@ -125,7 +125,7 @@ class SimulatedTrain:
 class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
 
-    Subclasses carry the messages in `send_report` and `exchange`.
+    Subclasses transmit the messages in `send_report` and `exchange`.
     """
 
     trains: dict[int, SimulatedTrain]
@@ -135,7 +135,7 @@ class Traffic:
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)  #: Number of broken invariants in all steps, by kind.
     moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
-    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that points lead to; 1 by default.
+    lie: dict[PointName, int] = field(default_factory=dict)  #: Track to which each set of points leads; 1 by default.
     _stopped_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -179,7 +179,7 @@ class Traffic:
         self.trains[authority.train].on_board.receive(authority)
 
     def command(self, name: PointName, track: int) -> None:
-        """Move points; they are detected at their new track after some seconds."""
+        """Begin to move points; their new position is detected after some seconds."""
         self.moving[name] = self.now_s + self.random.uniform(3.0, 7.0), track
         self.centre.set_detected(name, None)
         low, high = self.layout.zone_m(name)
@@ -247,7 +247,7 @@ class Traffic:
                 self.violations["opposing trains in a section"] += 1
 
     def _check_stops(self) -> None:
-        """Check that trains brake once their authority is too old, and are at rest in time after an order to stop."""
+        """Check that trains brake when their authority is too old, and come to rest in time after an order to stop."""
         stopped = self.centre.state.stopped and self.centre_works
         self._stopped_s = (self.now_s if self._stopped_s is None else self._stopped_s) if stopped else None
         for train in self.trains.values():

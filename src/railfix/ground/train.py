@@ -1,4 +1,4 @@
-"""A train's unit: its end of the links, and its supervision by the newest authority and the authority's time limit."""
+"""On-board unit of a train: the train's end of the links, and supervision by the newest authority."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from railfix.io.train_message import MessageError, TrainMessage, encode
 
 #: Interval between checks of the age of the authority and of the braking curve [s].
 LOOK_S = 0.1
-#: Longest wait for the answer to the last report, after the end of the positions [s].
+#: Longest time for which the unit waits for the answer to the last report after the last position [s].
 ANSWER_S: Final = 5.0
-#: Largest age of the integrity device's statement [s].
+#: Largest age of the file in which the integrity device states that the train is complete [s].
 INTEGRITY_S = 2.0
 
 
@@ -37,15 +37,15 @@ async def run_train(
     integrity: Path | None = None,
     for_s: float | None = None,
 ) -> tuple[int, int]:
-    """Send the newest position every second, and write authorities and braking as lines of JSON.
+    """Send the newest position every second, and write authorities and changes of braking as lines of JSON.
 
-    The function returns the numbers of reports and of authorities when the last report is answered, or `ANSWER_S` after
-    the end of the positions.
+    The function returns the numbers of reports sent and of authorities received. After the last position, it ends when
+    the last report is answered, or after `ANSWER_S`.
 
-    The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as written
-    by `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
-    (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, `is_complete` of this file
-    replaces the messages' value. Raise InputFileError if a key is missing.
+    The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as
+    `railfix.io.train_message.to_json` writes them, by default from the standard input; other lines are reported as
+    rejected (`railfix.ground.positions`). `integrity` is a file of the train's integrity device; if it is given,
+    `is_complete` determines whether the train is reported as complete. Raise InputFileError if a key is missing.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()
@@ -78,14 +78,14 @@ def is_complete(path: Path) -> bool:
 
 
 class _Desk:
-    """State of a train's unit: newest position, newest authority, and the reason for braking."""
+    """State of a train's on-board unit: newest position, newest authority, and reason for braking."""
 
     def __init__(
         self, *, train: int, write: Callable[[str], None], limits: OnBoardLimits, integrity: Path | None
     ) -> None:
         self._train, self._write, self._limits, self._integrity = train, write, limits, integrity
         self._newest: TrainMessage | None = None
-        # a random number identifies the start, independent of any clock
+        # a random number identifies this session, independent of any clock
         self._session, self._sequence, self._answered = draw_session(), 0, 0
         self._on_board: OnBoard | None = None
         self._reason: str | None = ""
@@ -170,7 +170,7 @@ class _Desk:
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(now), 3), **self._speeds(now))
 
     def _speeds(self, now_s: float) -> dict[str, float]:
-        """Return the permitted speed, its target, and the release speed; no values before the first position."""
+        """Return the permitted speed, its target, and the release speed; nothing before the first position."""
         assert self._on_board is not None
         if (found := self._on_board.supervised(now_s)) is None:
             return {}

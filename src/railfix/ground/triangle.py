@@ -1,13 +1,13 @@
 """Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points, and monitor.
 
-In P3 (reference triangle) each fix is compared with its point by a circle of allowable error, and the vectors between
-neighbouring fixes (distance and bearing) with the vectors between the points. P3 treats a fix inside its circle as the
-point itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes. Errors
-common to the three receivers cancel in these vectors, so that their limit can be far below the radius, and a drift
-inside the circle is detected.
+In P3, each fix must lie inside a circle of allowable error around its known point. In addition, the vectors between
+neighbouring fixes (distance and bearing) are compared with the vectors between the points. P3 treats a fix inside its
+circle as the point itself, so that a drift inside the circle cannot be detected. Here, the vectors are computed between
+raw fixes. Errors common to the three receivers cancel in these vectors; the limit of the vectors can therefore be far
+below the radius, and a drift inside the circle is detected.
 
-The monitor is a pure state machine that suspends satellite positioning, with a latched stop and release by hand:
-`advance` takes the state and one sample, and returns the new state with the orders to be sent.
+The monitor is a pure state machine: `advance` takes the state and one sample, and returns the new state and the orders
+to be sent. Once satellite positioning has been suspended, trains remain stopped until a release by hand.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from railfix.core.options import option
 from railfix.core.settings import Settings
 from railfix.ground.fixes_at_stations import StationFixes
 
-#: Receivers of each side of the triangle.
+#: Pair of receivers at the ends of each side of the triangle.
 SIDES: Final = ((0, 1), (1, 2), (2, 0))
 #: Seconds of a year of 365.25 days.
 YEAR_S: Final = 31_557_600.0
@@ -40,7 +40,7 @@ class TriangleVerdict(IntEnum):
     HEALTHY = 0
     #: Every fix is inside its circle, but one side, or both sides of one receiver, differ: a warning.
     RECEIVER_DRIFTING = 1
-    #: One fix is outside its circle, and both its sides differ.
+    #: One fix is outside its circle, and both sides at this fix differ.
     ONE_RECEIVER = 2
     #: All fixes are outside their circles, and all sides within their limits, as after a satellite fault or jamming.
     SATELLITES_OR_JAMMING = 3
@@ -61,8 +61,8 @@ STOPPING: Final = frozenset(verdict for verdict in TriangleVerdict if verdict >=
 class TriangleLimits(Settings):
     """Limits of the triangle."""
 
-    #: Radius of the circle of allowable error. An error of up to this size is not detected, and must be part of the
-    #: error budget of the trains.
+    #: Radius of the circle of allowable error. An error common to all receivers is not detected up to this size, and
+    #: must be part of the error budget of the trains.
     radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
     #: Largest deviation of the vector between two fixes from the vector between their points.
     side_m: float = option("Largest deviation of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
@@ -79,7 +79,7 @@ class TriangleLimits(Settings):
 def limits_for_false_stops(
     sigma_m: float, own_sigma_m: float, *, stops_per_year: float, independent_s: float = 100.0
 ) -> TriangleLimits:
-    """Return the limits for a number of false stops per year.
+    """Return the limits that lead to an accepted number of false stops per year.
 
     The length of a horizontal error of standard deviation sigma per axis is Rayleigh distributed:
     ``P(e > R) = exp(-R^2 / (2 sigma^2))``. Half of the false stops are allotted to the three circles, half to the
@@ -90,12 +90,12 @@ def limits_for_false_stops(
     sigma_m : float [m]
         Standard deviation of a fix per axis.
     own_sigma_m : float [m]
-        Standard deviation per axis of the part of the error that is not common to all receivers; the error of a side
-        contains this part of both receivers.
+        Standard deviation per axis of the part of the error that is not common to all receivers; this part of both
+        receivers makes up the error of a side.
     stops_per_year : float
         Accepted number of false stops per year.
     independent_s : float [s]
-        Time after which the errors of a fix are independent of earlier errors.
+        Time after which the error of a fix is independent of its earlier errors.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def compare_triangle(
     Parameters
     ----------
     points_m : ndarray, shape (3, 2) [m]
-        Known points, east and north of any origin.
+        East and north coordinates of the known points, relative to any origin.
     fixes_m : ndarray, shape (T, 3, 2) [m]
         Raw fixes from the same satellites at the same epoch, in the same frame; NaN for an absent fix.
     cn0_fallen : ndarray of bool, shape (T, 3), optional
@@ -220,17 +220,18 @@ class Order(Enum):
     RESUME = "resume satellite positioning"
 
 
-#: Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: a growing error moves one fix out of its
-#: circle before the others.
+#: Time after a stop in which the cause `GROUND_LOST` may be replaced by a more exact cause [s]. This is needed because
+#: a growing error moves one fix out of its circle before the other fixes.
 _SETTLE_S: Final = 10.0
 
 
 class MonitorLimits(Settings):
     """Times of the monitor."""
 
-    #: Time after which a set of three fixes is late; with the period of the fixes it is below the time to alert of 6 s.
+    #: Time after which a set of three fixes is late; the sum of this time and the period of the fixes must not exceed
+    #: the time to alert of 6 s.
     late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
-    healthy_s: float = Field(default=300.0, gt=0)  #: Healthy time before a stop can be released.
+    healthy_s: float = Field(default=300.0, gt=0)  #: Time of uninterrupted healthy fixes before a stop can be released.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,17 +239,18 @@ class MonitorState:
     """State of the monitor."""
 
     stopped: bool = True  #: Whether trains are stopped; true at the start, and from a stop until its release.
-    cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None at the start.
-    receiver: int = -1  #: Receiver that the cause names, -1 if it names none.
+    cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None before the first stop.
+    receiver: int = -1  #: Receiver that the cause names; -1 if the cause names none.
     since_s: float = 0.0  #: Time of the stop [s].
     complete_s: float = 0.0  #: Time of the last set of three fixes [s].
-    healthy_since_s: float | None = None  #: Start of the present healthy time [s]; None if fixes are not healthy.
+    #: Time since which all fixes have been healthy [s]; None if the newest are not healthy.
+    healthy_since_s: float | None = None
 
 
 def advance(
     state: MonitorState, now_s: float, verdict: TriangleVerdict | None, *, receiver: int = -1, limits: MonitorLimits
 ) -> tuple[MonitorState, tuple[Order, ...]]:
-    """Return the state after a sample, and the orders to be sent.
+    """Return the state of the monitor after a sample, and the orders to be sent.
 
     Parameters
     ----------
@@ -297,7 +299,7 @@ def _stop(
 def release(
     state: MonitorState, now_s: float, *, limits: MonitorLimits
 ) -> tuple[MonitorState, tuple[Order, ...], str | None]:
-    """Return the state after a release by hand, the orders, and the reason for a rejected release.
+    """Return the state after a release by hand, the orders to be sent, and the reason if the release is rejected.
 
     A stop can be released after `MonitorLimits.healthy_s` of uninterrupted healthy fixes, if the last fixes are not
     late.
@@ -312,7 +314,7 @@ def release(
 
 @dataclass(frozen=True, kw_only=True)
 class MonitoredLog:
-    """Result of the monitor over a log."""
+    """Result of monitoring a log."""
 
     fixes: StationFixes
     triangle: TriangleResult
@@ -339,7 +341,10 @@ class MonitoredLog:
 
 @dataclass(kw_only=True)
 class Monitor:
-    """Monitor of fixes in order of time, in blocks of any number of epochs; trains are not stopped at the start."""
+    """Monitor of fixes in order of time, processed in blocks of any number of epochs.
+
+    Trains are not stopped at the start.
+    """
 
     limits: TriangleLimits
     times: MonitorLimits
@@ -347,15 +352,15 @@ class Monitor:
     begun: bool = False
 
     def begin(self, now_s: float) -> None:
-        """Begin at a clock time [s]; first fixes are late `MonitorLimits.late_s` after this time."""
+        """Begin at a clock time [s]; the first fixes are late `MonitorLimits.late_s` after this time."""
         self.state, self.begun = replace(self.state, complete_s=now_s), True
 
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
-        """Process fixes at a clock time, by default each at its tag; return the verdicts and the orders to be sent.
+        """Process fixes at a clock time, by default at their time tags; return the verdicts and the orders to be sent.
 
-        Trains are stopped if fixes are late after the previous fixes, in logs as well as in streams. The cause of an
-        order is the cause of the stop after all these fixes, which may have become more exact. Raise SettingsError if
-        the sides of the triangle are too short for the limits.
+        Trains are stopped if fixes are late after the previous fixes, in logs as well as in streams. The cause given
+        with each order is the cause of the stop after all these fixes, because later fixes may make the cause more
+        exact. Raise SettingsError if the sides of the triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9

@@ -1,6 +1,6 @@
-"""Page of the control centre: the line with trains, intervals and authorities, links, alarms and log.
+"""Page of the control centre, which shows the line with trains, intervals and authorities, the links, alarms and log.
 
-The page can be read without a log-in; orders require a log-in. The page loads nothing from other servers.
+No log-in is required to read the page; orders require a log-in. The page loads nothing from other servers.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ with needs_extra():
     from starlette.routing import Route
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-#: Time between two events of the page [s].
+#: Time between two events that update the page [s].
 EVENT_S: Final = 0.5
 #: A log-in ends after this time without an order [s].
 SESSION_S: Final = 1800.0
-#: Number of wrong passwords of an address within `WRONG_S` after which its log-ins are refused for that time.
+#: Number of wrong passwords from one address within `WRONG_S` after which further log-ins from there are refused.
 MOST_WRONG: Final = 10
+#: Time for which a wrong password is counted [s].
 WRONG_S: Final = 60.0
-#: A connection without a complete request for this time is ended, at the latest after twice this time [s].
+#: A connection without a complete request is ended after this time to twice this time [s].
 REQUEST_S: Final = 10.0
-#: Largest number of connections, beyond which further connections are refused; and largest number of a peer's
-#: connections without a complete request.
+#: Largest number of connections; further connections are refused.
 MOST_CONNECTIONS: Final = 500
+#: Largest number of connections of one peer that have no complete request.
 MOST_IDLE: Final = 20
 #: Author of the orders of a person who has logged in without a name.
 OPERATOR: Final = "operator"
@@ -53,7 +54,8 @@ _HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 
-#: Function of an order, called with the values and the author of the request; it returns the reason for a refusal.
+#: Function that carries out an order: it is called with the values and the author, and returns the reason for a
+#: refusal.
 Order = Callable[..., str | None]
 
 
@@ -73,7 +75,10 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
-        """Open a session and return its token; None for a wrong password, or after `MOST_WRONG` from this address."""
+        """Open a session and return its token.
+
+        Return None if the password is wrong, or after `MOST_WRONG` wrong passwords from this address.
+        """
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
@@ -90,7 +95,7 @@ class Sessions:
         return token
 
     def name_of(self, token: str) -> str:
-        """Return the owner of a session."""
+        """Return the name of a session's owner."""
         return self._names[token]
 
     def log_out(self, token: str) -> None:
@@ -107,7 +112,7 @@ class Sessions:
 
 
 def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
-    """Return the web application, which shows the snapshot, and accepts the orders at ``/orders/NAME``.
+    """Return the web application, which shows the snapshot and accepts each order at ``/orders/NAME``.
 
     Events with the snapshot are sent until ``done`` in the snapshot is true.
     """
@@ -115,7 +120,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     newest: tuple[float, str, bool] | None = None
 
     def snapshot_text() -> tuple[str, bool]:
-        """Return the snapshot as JSON, computed once for all readers within `EVENT_S`, and whether it is the last."""
+        """Return the snapshot as JSON, computed at most once per `EVENT_S`, and whether it is the last."""
         nonlocal newest
         now = time.monotonic()
         if newest is None or now - newest[0] >= 0.9 * EVENT_S:
@@ -154,7 +159,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
 
 
 def _session_routes(sessions: Sessions) -> list[Route]:
-    """Return the routes that open and end a session."""
+    """Return the web routes for log-in and log-out."""
 
     async def login(request: Request) -> Response:
         values, address = await _values(request), "" if request.client is None else request.client.host
@@ -199,7 +204,8 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 async def _values(request: Request) -> dict[str, Any] | None:
     """Return the JSON object of a request; None if the request has no object of at most `_LONGEST_BODY` bytes.
 
-    Another site cannot send this content type without a preflight request, which is refused.
+    The content type must be ``application/json``: a page of another site cannot send it without a preflight request,
+    which is refused.
     """
     if request.headers.get("content-type") != "application/json":
         return None
@@ -217,16 +223,16 @@ async def _values(request: Request) -> dict[str, Any] | None:
 
 
 class _TimedProtocol(H11Protocol):
-    """HTTP protocol that ends connections without a complete request, however slowly its bytes arrive.
+    """HTTP protocol that ends connections without a complete request in time, even if bytes of a request still arrive.
 
-    At most `MOST_IDLE` connections of a peer wait for a request; a further connection ends the connection that has
-    waited longest, so that a peer with many connections blocks neither other peers nor its own next request.
+    At most `MOST_IDLE` connections of a peer wait for a request; each further connection ends the one that has waited
+    longest. A peer with many connections therefore blocks neither other peers nor its own next request.
     """
 
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to check the connection every `REQUEST_S`, and close the peer's idle connections beyond `MOST_IDLE`."""
+        """Begin to check the connection every `REQUEST_S`; close the peer's oldest idle ones beyond `MOST_IDLE`."""
         super().connection_made(transport)
         peer = id(self.server_state), self.client[0] if self.client else ""
         mine = self.waiting.setdefault(peer, {})
@@ -238,7 +244,7 @@ class _TimedProtocol(H11Protocol):
         self._look(waited=False)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Drop the connection."""
+        """Remove the connection from the peer's connections."""
         mine = self.waiting.get(self._peer, {})
         mine.pop(self, None)
         if not mine:
@@ -270,7 +276,7 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """Server of the page; port 0 takes a free port, and TLS is used if a certificate and its key are given."""
+    """Server of the page; port 0 selects a free port, and TLS is used if a certificate and its key are given."""
 
     def __init__(
         self, app: Starlette, *, host: str = "127.0.0.1", port: int = 0, certificate: tuple[Path, Path] | None = None

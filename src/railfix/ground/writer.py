@@ -1,4 +1,7 @@
-"""Sequential commits to the database in a thread: a slow database delays only messages whose commit is pending."""
+"""Sequential commits to the database in a thread.
+
+A slow database delays only messages that require a commit in progress.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from typing import Final
 
 from railfix.ground.store import DatabaseError
 
-#: A commit that takes longer is an alarm [s].
+#: Duration of a commit above which an alarm is raised [s].
 HANGS_S: Final = 1.0
 #: Time between attempts to write to a database that fails [s].
 RETRY_S: Final = 1.0
@@ -30,13 +33,13 @@ class ThreadWriter:
         self._thread.start()
 
     def submit(self, work: Callable[[], None]) -> Future[None]:
-        """Queue a function, and return the future of its outcome."""
+        """Queue a function, and return the future that will have its outcome."""
         outcome: Future[None] = Future()
         self._queue.put((work, outcome))
         return outcome
 
     def stop(self, wait_s: float) -> bool:
-        """End the thread after the work in progress; return whether it has ended in time."""
+        """End the thread after the work in progress; return whether the thread has ended within `wait_s`."""
         self._queue.put(None)
         self._thread.join(wait_s)
         return not self._thread.is_alive()
@@ -60,19 +63,19 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
 
 @dataclass(kw_only=True)
 class Commits:
-    """Commits of the centre, at most one in progress, and the fault of the store.
+    """Commits of the centre, of which at most one is in progress, and the alarm if the store fails.
 
-    `alarm` is the reason why the store rejects the state, None without a fault. During a fault no authority is sent;
-    orders to brake are still sent.
+    `alarm` is the reason why the store rejects the state, otherwise None. While there is an alarm, no authority is
+    sent; orders to brake are still sent.
     """
 
-    writer: ThreadWriter | None = None  #: Executor of the commits; with None a commit is carried out at once.
+    writer: ThreadWriter | None = None  #: Executor of the commits; with None, each commit is carried out at once.
     alarm: str | None = None
     _open: tuple[Future[None], Callable[[], None], float] | None = None
     _failed_s: float = float("-inf")
 
     def may_begin(self, now_s: float) -> bool:
-        """Return whether a commit may begin: none is in progress, and none has just failed."""
+        """Return whether a commit may begin: none is in progress, and none has failed within `RETRY_S`."""
         return self._open is None and now_s - self._failed_s >= RETRY_S
 
     def begin(self, work: Callable[[], None], then: Callable[[], None], now_s: float) -> None:
