@@ -315,7 +315,7 @@ def test_epochs_outside_the_period_of_a_message_have_no_level(tmp_path: Path, fi
     assert since[-1] == 90.0
     for levels in (result["front"].araim.along.level_m, result["front"].araim.space.level_m):
         np.testing.assert_array_equal(np.isfinite(levels[:, 0]), inside & np.isfinite(result["front"].chainage_m))
-    assert any("epochs outside this time have no ARAIM level" in note for note in result.notes)
+    assert any("Epochs outside this period have no ARAIM level" in note for note in result.notes)
 
 
 @pytest.mark.requirement("C5")

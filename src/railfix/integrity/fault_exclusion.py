@@ -30,7 +30,7 @@ from railfix.positioning.search_index import SearchIndex
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RaimResult(NotebookTable):
-    """Detection and exclusion of T epochs."""
+    """Result of fault detection and exclusion at T epochs."""
 
     outcome: Codes  #: `raim.Outcome`, shape (T,).
     #: Test statistic before any exclusion, shape (T,); in noise variances, or in m^2 with the fixed limit.
@@ -132,7 +132,7 @@ def exclude_faults(
         return ranges, fix, raim
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
-    # Without the fault, another section may fit best; the remaining ranges must be consistent on that section, too.
+    # Without the fault, another section may fit best; the remaining ranges must also be consistent on that section.
     still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
     raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim

@@ -137,7 +137,7 @@ def reject_persistent_biases(
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
-    """Return the mask (T, K) of each epoch's used range with the largest absolute mean, if it exceeds the limit."""
+    """Return the mask (T, K) of each epoch's used range with the largest absolute mean, if above the limit."""
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
-_BINS: Final = 100  #: Number of bins per axis, which extends to twice the alarm limit.
+_BINS: Final = 100  #: Number of bins per axis; both axes extend to twice the alarm limit.
 _GAP: Final = 1.5  #: Two epochs are separated by a gap if their interval exceeds this multiple of the median interval.
 
 
@@ -59,10 +59,10 @@ class Stanford:
     available_rate: float  #: Fraction of the T epochs with a level within the alarm limit; NaN without epochs.
     beyond: Indices  #: Indices of the epochs whose error exceeds the level, the largest excess first.
     continuity: tuple[Continuity, ...]  #: One entry per window length.
-    #: Number of time blocks with epochs, and number of blocks with an error above the level. A block counts as one
-    #: independent sample because errors are correlated over tens of seconds.
+    #: Number of time blocks that contain epochs. A block counts as one independent sample, because errors are
+    #: correlated over tens of seconds.
     blocks: int
-    misleading_blocks: int
+    misleading_blocks: int  #: Number of time blocks in which an error exceeds the level.
     #: Edges of the bins of error and level, shape (N + 1,); the last edge is infinite.
     edges_m: Floats
     histogram: Integers  #: Number of epochs by bins of the absolute error (axis 0) and the level (axis 1); (N, N).
@@ -154,7 +154,7 @@ def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuit
     until = time + _nanoseconds(window_s)
     started = available & (until <= time[-1])
     last = np.searchsorted(time, until, side="right") - 1
-    # A window that ends inside a gap is interrupted, too, because the next epoch is after the gap.
+    # A window that ends inside a gap is also interrupted, because the next epoch is after the gap.
     ends = np.append(across, False)[last] & (until > time[last])
     kept = started & (broken[last] == broken) & ~ends
     windows = int(started.sum())

@@ -1,8 +1,8 @@
 """Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of measured features.
 
-P2 uses the positions of changes instead of the values, so that slow sensor biases have no effect. A position is
-accepted if the distance from the last accepted feature agrees, the values of the second quantity agree with the map,
-and no other position fits the measurement nearly as well.
+P2 uses the positions at which gradient and curvature change, instead of their values, so that slow sensor biases have
+no effect. A position is accepted under three conditions. The distance from the last accepted feature agrees, the values
+of the second quantity agree with the map, and no other position fits the measurement nearly as well.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from railfix.track.trajectory import Trajectory
 Quantity = Literal["gradient", "curvature"]
 QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 
-#: Smallest change that is a feature: 3 permille, and from straight track to a radius of 1000 m.
-_GRADIENT_CHANGE: Final = 0.003
+_GRADIENT_CHANGE: Final = 0.003  #: Smallest change of gradient that is a feature: 3 permille.
+#: Smallest change of curvature that is a feature: from straight track to a radius of 1000 m [1/m].
 _CURVATURE_CHANGE_1PM: Final = 1e-3
 #: Smallest likelihood ratio of the accepted position to any other position in the window.
 _LIKELIHOOD_RATIO: Final = 1e3
@@ -30,11 +30,11 @@ _FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
 HALF_LENGTH_M: Final = 60.0  #: Length of line that is compared before and after a feature.
-#: Changes below this fraction of a larger change within `HALF_LENGTH_M` are ignored, because a curve through sparse
-#: points ripples.
+#: Changes below this fraction of a larger change within `HALF_LENGTH_M` are ignored, because the curvature of a line
+#: through sparse points has ripples.
 _RIPPLE: Final = 0.2
-#: Length over which a change is computed, about the distance between a vehicle's bogies; a vehicle smooths shorter
-#: changes.
+#: Length over which a change is computed. This is about the distance between the bogies of a vehicle, which smooths
+#: shorter changes.
 BASE_M: Final = 15.0
 
 
@@ -82,8 +82,9 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
     """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
-    A feature is at the middle of its change. `least` gives, for each quantity of a measured line, a lower bound of
-    changes at each point, shape (N,); a change must also exceed the root sum of squares of the bounds at its two ends.
+    A feature is at the middle of its change. For a measured line, `least` has a lower bound of changes at each point,
+    shape (N,), by quantity. A change must then also exceed the root sum of squares of the bounds at the two ends of the
+    change.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []
@@ -113,7 +114,7 @@ class LocatedFeature:
     verdict: Literal["accepted", "ambiguous", "none"]
     arc_m: float  #: Arc length of the middle of the series; NaN unless accepted.
     #: Standard deviation ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity q; NaN
-    #: without a change that is sharper than the prediction.
+    #: if the series does not determine the position better than the prediction.
     sigma_m: float
     reason: str = ""  #: Reason for a rejection.
 
@@ -150,8 +151,9 @@ def locate(
     Returns
     -------
     LocatedFeature
-        Verdict "ambiguous" if another position fits nearly as well or the best fit is at the edge of the window, "none"
-        if the series has no sharp change or contradicts the second quantity or `last`.
+        The verdict is "ambiguous" if another position fits nearly as well, or if the best fit is at the edge of the
+        window. It is "none" if the series has no sharp change, or if the second quantity or `last` contradicts the
+        position.
     """
     offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + STEP_M, 0.25 * STEP_M)
     at = predicted_m + offsets[:, None] + measured.arc_m

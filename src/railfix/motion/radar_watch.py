@@ -13,25 +13,25 @@ from railfix.core.nearest_times import nearest_rows
 from railfix.motion.samples import RadarSpeeds
 
 _WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].
-_LEAST_SPEEDS: Final = 10  #: Minimum number of speeds in a window.
-_NEAR_NS: Final = 150_000_000  #: Largest time between a radar speed and the satellite speed compared with it [ns].
+_LEAST_SPEEDS: Final = 10  #: Minimum number of pairs of speeds in a window.
+#: Largest time between a radar speed and the satellite-derived speed with which it is compared [ns].
+_NEAR_NS: Final = 150_000_000
 _MOVING_MPS: Final = 3.0  #: Lowest speed of the train at which speeds are compared [m/s].
-#: Minimum and maximum number of windows before a step, and number of windows after a step.
-_LEAST_BEFORE: Final = 5
-_MOST_BEFORE: Final = 20
-_AFTER: Final = 3
+_LEAST_BEFORE: Final = 5  #: Minimum number of windows before a step.
+_MOST_BEFORE: Final = 20  #: Maximum number of windows before a step.
+_AFTER: Final = 3  #: Number of windows after a step.
 _SILENT: Final = 2  #: Number of consecutive windows without a radar speed that raises an alarm.
-#: Smallest reported step of the ratio, absolute and as a multiple of the scatter of the windows before the step.
-_STEP: Final = 0.01
-_SCATTERS: Final = 5.0
+_STEP: Final = 0.01  #: Smallest reported step of the ratio.
+_SCATTERS: Final = 5.0  #: Smallest reported step, as a multiple of the scatter of the windows before the step.
 _LEAST_SCATTER: Final = 0.001  #: Lower bound of the scatter of the windows before the step.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """Alarm raised by the comparison of radar speeds with satellite speeds."""
+    """Alarm raised by the comparison of radar speeds with satellite-derived speeds."""
 
-    kind: Literal["mounting", "silent"]  #: Step of the ratio of the speeds, or no radar speed while the train moves.
+    #: "mounting": the ratio of the speeds has a step. "silent": there is no radar speed while the train moves.
+    kind: Literal["mounting", "silent"]
     time: np.datetime64  #: Start of the first window with the fault.
     #: Ratio of the radar speed to the satellite-derived speed, minus 1, before and after a step; NaN if the kind is
     #: "silent".
@@ -40,22 +40,22 @@ class RadarAlarm:
 
     @property
     def sentence(self) -> str:
-        """Note for the user."""
+        """Text of the alarm for the user."""
         at = np.datetime_as_string(self.time, unit="s")
         if self.kind == "silent":
             return f"radar: no speed since {at} while the train moves; check whether snow or dirt covers the radar"
         after, before = (f"{round(100.0 * share, 1) + 0.0:+.1f} %" for share in (self.after, self.before))
         return (
             f"radar: from {at} on, its speeds differ from satellite speeds by {after} ({before} before); "
-            "check its mounting"
+            "check the mounting of the radar"
         )
 
 
 @dataclass(kw_only=True)
 class RadarWatch:
-    """Ratios of radar to satellite speed in the last windows of GPS time; memory is bounded in a long session."""
+    """Ratios of radar speed to satellite-derived speed in the last windows of GPS time."""
 
-    #: Ratio of radar to satellite speed less 1, in each window.
+    #: Ratio of the radar speed to the satellite-derived speed, minus 1, in each window.
     ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
     #: Number of each window, counted from the origin of datetime64.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
@@ -64,9 +64,9 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Add radar and satellite speeds, later than all speeds added before, and return the alarms raised.
+        """Add radar and satellite-derived speeds, later than all previous ones, and return the alarms raised.
 
-        All arrays have shape (N,). `right_mps` are the satellite speeds. A speed is NaN if it was not measured.
+        All arrays have shape (N,). `right_mps` are the satellite-derived speeds. Speeds that were not measured are NaN.
         """
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])
@@ -83,12 +83,12 @@ class RadarWatch:
         return found
 
     def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
-        """Add satellite speeds, each with the radar speed nearest in time, and return the alarms raised."""
+        """Add satellite-derived speeds, each with the radar speed nearest in time, and return the alarms raised."""
         row = nearest_rows(radar.time, time, within_ns=_NEAR_NS)
         return self.take(time, np.append(radar.speed_mps, np.nan)[row], right_mps)
 
     def _close(self) -> list[RadarAlarm]:
-        """Close the open window, and return the alarms raised by it."""
+        """Close the open window, and return the alarms that this window raises."""
         moving, count, product, square = self._sums.tolist()
         if moving >= _LEAST_SPEEDS:
             self.silent = self.silent + 1 if count == 0 else 0

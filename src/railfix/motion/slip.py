@@ -43,33 +43,31 @@ class MotionState(IntEnum):
     EXPIRED = 7  #: The inertial speed is too old or implausible; no speed.
 
 
-#: Limit of the difference of the pitch sines of vehicle and line: 0.15 m/s2 between wheel and train.
+#: Limit of the difference between the pitch sines of vehicle and line; it equals 0.15 m/s2 between wheel and train.
 _MAP_LIMIT: Final = 0.015
-#: Lower bound of the limit, in standard deviations of the difference while the wheel rolls, and time constant of their
-#: estimate. A pitching body accelerates its accelerometer, the more the higher it is mounted.
+#: Lower bound of the limit, in standard deviations of the difference while the wheel rolls. This bound is needed
+#: because a pitching body accelerates the accelerometer, the more the higher the accelerometer is mounted.
 _NOISE_SIGMAS: Final = 5.0
-_NOISE_S: Final = 30.0
-#: A slip ends when wheel and inertial speeds agree within the larger of these two limits for this time.
-_LATCH_MPS: Final = 0.15
-_LATCH_SHARE: Final = 0.01
-_LATCH_S: Final = 0.5
+_NOISE_S: Final = 30.0  #: Time constant of the estimated standard deviation.
+_LATCH_MPS: Final = 0.15  #: Difference of wheel and inertial speeds within which a slip ends.
+_LATCH_SHARE: Final = 0.01  #: The same difference as a fraction of the speed; the larger of both differences is used.
+_LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
 LOOK_BACK_S: Final = 0.3  #: Time before the detection at which the inertial speed begins.
 #: Time after which the inertial speed expires; `carry_drift_mps2` then amounts to 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
-#: Time constant of the low-pass filter of the pitch, against pitching of the body at about 1 Hz and vibration.
+#: Time constant of the low-pass filter of the pitch, which suppresses pitching of the body (about 1 Hz) and vibration.
 SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
 _STANDING_MPS: Final = 0.5  #: Largest inertial speed that agrees with a stationary wheel.
-_PITCH_S: Final = 20.0  #: Time constant of the correction of the gyro's pitch.
-#: Largest plausible sine of the pitch; a line has at most 0.035, the rest is margin for body and mounting.
+_PITCH_S: Final = 20.0  #: Time constant with which the pitch integrated from the gyro is corrected.
+#: Largest plausible sine of the pitch; a line has at most 0.035, and the rest is a margin for body and mounting.
 _STEEPEST: Final = 0.1
 _FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
-#: Time for which the body still pitches after a stop; only then its pitch is used as the pitch at standstill.
+#: Time for which the body still pitches after a stop. After this time, its pitch is used as the pitch at standstill.
 _SETTLING_S: Final = 2.0
-#: Change of the pitch sine at standstill, its duration, and the inertial speed that indicate rolling away.
-_ROLLING_LIMIT: Final = 0.002
-_ROLLING_S: Final = 0.3
-_ROLLING_MPS: Final = 0.05
+_ROLLING_LIMIT: Final = 0.002  #: Change of the pitch sine since standstill that indicates rolling away.
+_ROLLING_S: Final = 0.3  #: Time for which this change must persist.
+_ROLLING_MPS: Final = 0.05  #: Inertial speed that the train must also have reached.
 
 
 class SlipLimits(Settings):
@@ -80,7 +78,7 @@ class SlipLimits(Settings):
     rule: Literal["map", "p2"] = "map"
     #: Largest sine of the pitch without slip, for the rule "p2": 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
-    confirm_s: float = Field(default=0.1, ge=0)  #: Time for which the limit is exceeded before a slip is declared.
+    confirm_s: float = Field(default=0.1, ge=0)  #: Time for which the limit must be exceeded before a slip is declared.
     #: Drift of the inertial speed, by which the speed limit of the latch grows. 1e-3 of gravity covers accelerometer
     #: offset and pitch error together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
@@ -96,13 +94,13 @@ class SlipResult:
     state: Codes  #: `MotionState`, shape (N,).
     #: Wheel speed in NORMAL, NaN in INIT and EXPIRED, 0 or inertial speed in other states; shape (N,).
     speed_mps: Floats
-    #: Integral of the speed from the first sample, shape (N,). A slip is bridged by inertia from its look-back on. At
-    #: the end of the slip, the distance is corrected for the difference of wheel and inertial speeds, assumed to grow
-    #: linearly.
+    #: Integral of the speed from the first sample, shape (N,). From `LOOK_BACK_S` before the detection of a slip, the
+    #: inertial speed is integrated. At the end of the slip, the distance is corrected for the difference of wheel and
+    #: inertial speeds, which is assumed to have grown linearly.
     distance_m: Floats
-    #: Sine of the pitch by wheel and accelerometer less `pitch`; NaN without pulses; shape (N,).
+    #: Sine of the pitch by wheel and accelerometer minus `pitch`; NaN without pulses; shape (N,).
     metric: Floats
-    smooth: Floats  #: Metric less the accelerometer offset, low-pass filtered with `SMOOTHING_S`; shape (N,).
+    smooth: Floats  #: `metric` minus the accelerometer offset, low-pass filtered with `SMOOTHING_S`; shape (N,).
     pitch: Floats  #: Sine of the reference pitch; NaN before the first estimate; shape (N,).
     gyro_bias_radps: Floats  #: Estimated bias of the pitch rate; 0 without a gyro; shape (N,).
 
@@ -118,8 +116,8 @@ class SlipState:
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
     """Compute the rate of the pitch angle from the body rates, shape (N, 3), and the roll, shape (N,) [rad/s].
 
-    The rate is ``w_y cos(phi) - w_z sin(phi)`` with the roll ``sin(phi) = (v w_z - f_y) / g``, as the body leans with
-    the cant. If the roll were ignored, the rate would be wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
+    The rate is ``w_y cos(phi) - w_z sin(phi)`` with the roll ``sin(phi) = (v w_z - f_y) / g``, because the body leans
+    with the cant. If the roll were ignored, the rate would be wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
     """
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
@@ -139,10 +137,9 @@ def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floa
 class MotionSamples(NamedTuple):
     """N samples of wheel and body motion, 10 to 100 per second."""
 
-    time_s: Floats  #: Times in rising order, shape (N,).
-    #: Speed and acceleration of the wheel; NaN without pulses; shape (N,).
-    wheel_mps: Floats
-    wheel_mps2: Floats
+    time_s: Floats  #: Times in ascending order, shape (N,).
+    wheel_mps: Floats  #: Speed of the wheel, NaN without pulses; shape (N,).
+    wheel_mps2: Floats  #: Acceleration of the wheel, NaN without pulses; shape (N,).
     force_mps2: Floats  #: Specific force in the forward direction of the vehicle, shape (N,).
     #: Sine of the line's slope angle at the vehicle, positive if the line rises forward; NaN if unknown; shape (N,).
     line_sine: Floats
@@ -216,7 +213,7 @@ class _Automaton:
     _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=200))
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return a copy with the given limits, so that states already returned stay unchanged."""
+        """Return a copy with the given limits, so that `SlipState` objects already returned stay unchanged."""
         return replace(self, limits=limits, _past=self._past.copy())
 
     def row(self) -> tuple[float, ...]:
@@ -371,14 +368,14 @@ class _Automaton:
         if self.state in (MotionState.STANDING, MotionState.ROLLING):
             self._watch(dt, force)
         elif self.state == MotionState.INIT:
-            return  # a sensor that never sent a sample may be dead
+            return  # a sensor that has never sent a sample may be defective
         elif self._silent >= _STANDING_S and not abs(self.speed) > _STANDING_MPS:
             self._stand(force)
         elif self._carried > _LONGEST_CARRY_S:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """Detect rolling away by a change of the forward force since standstill, which is a gravity component."""
+        """Detect rolling away by a change of the forward force, a component of gravity, since standstill."""
         limits = self.limits
         self._stood += dt
         if self.state == MotionState.STANDING and self._stood < _SETTLING_S:

@@ -21,7 +21,7 @@ from railfix.motion.samples import TachometerPulses
 _UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
 #: Largest relative deviation from the factor of a unit: more than wheel wear (2 %), less than between two units.
 _UNIT_SHARE: Final = 0.05
-LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Lowest speed that is returned: 1 km/h (P2 1).
+LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Speeds below this limit are not returned: 1 km/h (P2 1).
 
 
 class TachometerLimits(Settings):
@@ -33,9 +33,8 @@ class TachometerLimits(Settings):
     #: uneven, use the time of a full turn.
     window_s: float = Field(default=0.1, gt=0)
     silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which the speed is NaN.
-    #: Standard deviation of a pulse time, and resolution of the clock.
-    jitter_s: float = Field(default=5e-6, ge=0)
-    resolution_s: float = Field(default=1e-6, ge=0)
+    jitter_s: float = Field(default=5e-6, ge=0)  #: Standard deviation of a pulse time.
+    resolution_s: float = Field(default=1e-6, ge=0)  #: Resolution of the clock that tags the pulses.
 
     @property
     def pulse_m(self) -> float:
@@ -74,7 +73,7 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
     valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
-    # the time since the last pulse is an upper bound of the speed
+    # the time since the last pulse gives an upper bound of the speed
     valid &= limits.pulse_m / np.maximum(since, 1e-9) >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
     middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
@@ -144,9 +143,9 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses found up to each instant, two pulses after they occur, shape (N,).
+    """Return the number of lost and doubled pulses detected up to each instant, shape (N,).
 
-    Lost pulses that the `pulse` numbers show are not counted.
+    A fault is detected two pulses after it occurs. Lost pulses that `pulse` numbers show are not counted.
     """
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
@@ -162,7 +161,7 @@ class SpeedCheck:
     lag_s: float  #: Delay of the logged speeds.
 
 
-#: Largest delay in the search, of either sign [s].
+#: Largest delay, positive or negative, in the search [s].
 _LARGEST_LAG_S: Final = 3.0
 
 
@@ -186,7 +185,7 @@ def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, righ
             ratios[k] = float((logged * right[use]).sum() / (right[use] ** 2).sum())
             costs[k] = float(np.mean((logged / ratios[k] - right[use]) ** 2))
     if not np.isfinite(costs).any():
-        raise ValueError("fewer than ten speeds over 1 m/s in common; give a longer log")
+        raise ValueError("fewer than ten speeds over 1 m/s in common; provide a longer log")
     best = int(np.argmin(costs))
     ratio = float(ratios[best])
     unit = next((f for f in _UNITS if abs(ratio / f - 1.0) < _UNIT_SHARE), None)

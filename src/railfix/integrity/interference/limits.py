@@ -1,4 +1,4 @@
-"""Suspected causes of interference, limits of the tests, and statistics of C/N0 and front-end gain."""
+"""Suspected causes of interference, limits of the interference tests, and statistics of C/N0 and front-end gain."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Sign(IntFlag):
     RECEIVER_SPOOFING = 1 << 3
     #: All satellites have the same C/N0, as from one transmitter.
     EQUAL_CN0 = 1 << 4
-    #: The receiver clock steps relative to the Dopplers, or its drift steps.
+    #: The receiver clock steps relative to the Dopplers, or the clock drift steps.
     CLOCK_JUMP = 1 << 5
     #: The 3-D velocity changes faster than a train can.
     SPEED_JUMP = 1 << 6
@@ -73,71 +73,71 @@ CAUSES: Final = tuple(cause for cause in Sign if cause)  #: All signs but NONE, 
 class InterferenceLimits(Settings):
     """Limits of the signs of interference.
 
-    No sign occurs on the recordings. The largest statistics of the recordings are in
-    ``tests/references/results/interference.txt``.
+    With the default limits, no sign occurs on the recordings used for tests; the largest statistics on these recordings
+    are in ``tests/references/results/interference.txt``.
     """
 
     use: Literal["on", "off"] = "on"
     least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test over all satellites.
-    fall_db: float = Field(default=5.0, gt=0)  #: Median fall of C/N0 below its recent peak.
-    #: Largest standard deviation of the falls. A jammer raises the noise of all channels equally, walls and roofs do
-    #: not.
+    #: Minimum fall of C/N0 below the recent peak, as the median of all satellites.
+    fall_db: float = Field(default=5.0, gt=0)
+    #: Largest standard deviation of the falls over the satellites. A jammer raises the noise of all channels equally,
+    #: walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
     known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
-    #: Fall of the front-end gain as a fraction of its recent peak. During a start without interference, the fall
-    #: reaches 14 %.
+    #: Minimum fall of the front-end gain, as a fraction of the recent peak. While a receiver starts without
+    #: interference, the fall reaches 14 %.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
-    #: Standard deviation of C/N0 over the satellites up to which it counts as equal; in open sky it is 1.2 dB or more.
+    #: Largest standard deviation of C/N0 over the satellites at which C/N0 counts as equal; 1.2 dB or more in open sky.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Minimum step of the codes relative to the Dopplers, less whole milliseconds. Phone clocks step by 30 m.
+    #: Minimum step of the codes relative to the Dopplers, minus whole milliseconds. Phone clocks step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
-    #: Minimum jumps of clock drift, 3-D velocity and 3-D position, and minimum distance from the line. A yard is some
-    #: 100 m wide.
-    drift_jump_mps: float = Field(default=10.0, gt=0)
-    speed_jump_mps: float = Field(default=5.0, gt=0)
-    position_jump_m: float = Field(default=30.0, gt=0)
+    drift_jump_mps: float = Field(default=10.0, gt=0)  #: Minimum jump of the clock drift.
+    speed_jump_mps: float = Field(default=5.0, gt=0)  #: Minimum jump of the 3-D velocity.
+    position_jump_m: float = Field(default=30.0, gt=0)  #: Minimum jump of the 3-D position.
+    #: Minimum distance of the 3-D position from the line that is a sign. A yard is some 100 m wide.
     off_map_m: float = Field(default=100.0, gt=0)
-    #: Minimum error of the time tags, in seconds and in standard deviations. Errors estimated for correct tags reach
-    #: 0.05 s in towns, and 0.13 s with a phone and seven satellites.
+    #: Minimum estimated error of the time tags. For correct tags, the estimated error reaches 0.05 s in towns, and
+    #: 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
-    tag_sigmas: float = Field(default=6.0, gt=0)
+    tag_sigmas: float = Field(default=6.0, gt=0)  #: Minimum estimated error of the time tags, in standard deviations.
     #: Time for which all positions must fail a check before positions are considered unreliable.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Minimum jumps and distances, and minimum difference between two constellations, in standard deviations.
+    #: Minimum of each jump, and of the distance from the line beyond `position_jump_m`, in standard deviations.
     jump_sigmas: float = Field(default=10.0, gt=0)
+    #: Minimum difference between the positions and clocks of two constellations, in standard deviations.
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Largest acceleration and speed of a train. A jump is the part of a change that exceeds these limits.
+    #: Largest acceleration of a train. A jump is the part of a change that exceeds what a train can do.
     acceleration_mps2: float = Field(default=2.0, gt=0)
-    max_speed_mps: float = Field(default=100.0, gt=0)
+    max_speed_mps: float = Field(default=100.0, gt=0)  #: Largest speed of a train.
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.
-    #: Largest standard deviations of velocities and positions that are compared.
-    largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
-    largest_sigma_m: float = Field(default=30.0, gt=0)
-    #: Times for which signs must persist: `hold_s` for C/N0 or gain fall, equal C/N0 and distance from the map,
-    #: `part_hold_s` for differing constellations.
+    largest_speed_sigma_mps: float = Field(default=2.0, gt=0)  #: Largest standard deviation of a compared velocity.
+    largest_sigma_m: float = Field(default=30.0, gt=0)  #: Largest standard deviation of a compared position.
+    #: Time for which a fall of C/N0 or gain, equal C/N0, or a distance from the map must persist to be a sign.
     hold_s: float = Field(default=3.0, gt=0)
-    part_hold_s: float = Field(default=10.0, gt=0)
-    #: Length of the window over which satellite and wheel distances are compared, and its minimum.
+    part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which a difference of constellations must persist.
+    #: Length of the window over which satellite and wheel distances are compared.
     wheel_window_s: float = Field(default=120.0, gt=0)
-    wheel_least_s: float = Field(default=60.0, gt=0)
-    #: Minimum difference between satellite and wheel distance, in metres and in standard deviations.
-    wheel_m: float = Field(default=20.0, gt=0)
-    wheel_sigmas: float = Field(default=6.0, gt=0)
+    wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of this window, for example after a slip.
+    wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference between satellite and wheel distance.
+    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum difference of these distances in standard deviations.
     #: Whether the filter's protection level covers a pull along the track that the comparison with the wheel has not
     #: detected yet. The level is then two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
     #: Number of standard deviations of the distance difference that `wheel_level` adds to the level. The default of 2.1
     #: assumes a probability of 1e-7 that a pull has begun within the window, and a risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
-    #: Relative standard deviation of the wheel circumference before positions determine it, and of its later change
-    #: (creep).
+    #: Relative standard deviation of the wheel circumference before it is estimated from positions.
     wheel_scale: float = Field(default=0.01, gt=0)
+    #: Relative standard deviation of later changes of the wheel circumference (creep).
     wheel_change: float = Field(default=0.001, gt=0)
     #: Acceleration above which the wheel has slipped and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Time for which a suspicion remains after its last sign. A jump is visible at one epoch, but its cause persists.
+    #: Time for which a suspicion, other than suspected spoofing, remains after its last sign.
     jamming_release_s: float = Field(default=10.0, ge=0)
+    #: Time for which suspected spoofing remains after its last sign. A jump is visible at one epoch, but its cause
+    #: persists.
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
 
@@ -171,7 +171,7 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class HeldState:
-    """State of C conditions with holding and release times, after a chunk."""
+    """State of C conditions that have holding and release times, carried over from one chunk to the next."""
 
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
     #: Time for which each condition has been true, shape (C,).
@@ -183,8 +183,10 @@ class HeldState:
 def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Return masks of conditions true for their holding time, and of conditions within their release time, and the
-    state.
+    """Apply holding and release times to conditions; return two masks and the state.
+
+    The first mask marks conditions that have been true for their holding time, the second conditions within their
+    release time.
 
     An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
     sufficient. Signs and masks have the shape (T, C), holding and release times the shape (C,) [s]. A condition with a
@@ -214,12 +216,13 @@ _LONGEST_SILENCE_S: Final = 60.0  #: Longest absence of a satellite after which 
 class PowerState:
     """State of C/N0 and front-end gain after a chunk."""
 
-    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: "G01" + "1C", shape (K,).
+    #: Satellite and signal, such as "G011C"; shape (K,).
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
     #: Peak of C/N0 plus the decay since the GPS epoch, shape (K,); -inf before the first observation.
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Times since the GPS epoch at which the current tracking of each channel began and at which the channel was last
-    #: observed, shape (K,); NaN before the first observation.
+    #: Time since the GPS epoch at which the current tracking of each channel began, shape (K,); NaN before the first.
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
+    #: Time since the GPS epoch at which each channel was last observed, shape (K,); NaN before the first observation.
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
     gain: float = -np.inf  #: Peak of the natural logarithm of the gain, plus the decay since the GPS epoch.
 
@@ -228,9 +231,8 @@ class PowerState:
 class PowerSigns:
     """C/N0 and gain statistics of T epochs; the C/N0 statistics are NaN where too few satellites are compared."""
 
-    #: Median and standard deviation of the falls of C/N0 below each satellite's recent peak, shape (T,).
-    fall_db: Floats
-    spread_db: Floats
+    fall_db: Floats  #: Median, over the satellites, of the fall of C/N0 below the recent peak, shape (T,).
+    spread_db: Floats  #: Standard deviation of these falls, shape (T,).
     difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
     #: Fall of the gain as a fraction of its recent peak, shape (T,); NaN where the receiver does not report the gain.
     gain_fall: Floats

@@ -16,12 +16,13 @@ from railfix.integrity.interference.limits import InterferenceLimits
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_time_tags, median_tag_error
 
-#: Range step of a receiver clock step of 1 ms [m]; steps by whole milliseconds are not signs of interference.
+#: Step of the ranges when the receiver clock steps by 1 ms [m]; steps by whole milliseconds are no sign of
+#: interference.
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
 #: Minimum redundancy for a noise estimate; fewer redundant ranges or Dopplers can agree by chance.
 _LEAST_FREEDOM: Final = 3
 _LEAST_MPS: Final = 0.05  #: Minimum noise of Dopplers [m/s].
-_SIZE: Final = 4  #: Number of unknowns per constellation: position and clock.
+_SIZE: Final = 4  #: Number of unknowns of a fit to one constellation: position and clock.
 
 
 class Fix(NamedTuple):
@@ -53,14 +54,13 @@ class MotionSignState:
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Satellite and signal, shape (K,).
-    #: Last code and last range rate (``-lambda D``) of each channel, shape (K,).
-    code_m: Floats = field(default_factory=lambda: np.zeros(0))
+    code_m: Floats = field(default_factory=lambda: np.zeros(0))  #: Last code of each channel, shape (K,).
+    #: Last range rate (``-lambda D``) of each channel, shape (K,).
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Time of the last code and range rate, shape (K,).
+    #: Time of the last code and range rate of each channel, shape (K,).
     since: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
-    #: Last position and last velocity that were accurate enough for a comparison, one epoch each.
-    position: Fix = field(default_factory=_no_fix)
-    velocity: Fix = field(default_factory=_no_fix)
+    position: Fix = field(default_factory=_no_fix)  #: Last epoch whose position is accurate enough for a comparison.
+    velocity: Fix = field(default_factory=_no_fix)  #: Last epoch whose velocity is accurate enough for a comparison.
     on_map: bool = False  #: True once a position has been on the map.
     tags: TagErrors = NO_TAGS  #: Time-tag errors fitted at the last epochs.
 
@@ -69,9 +69,9 @@ class MotionSignState:
 class MotionSigns:
     """Motion statistics of T epochs; NaN where a comparison is not possible."""
 
-    clock_jump_m: Floats  #: Median change of codes relative to Dopplers, less whole milliseconds; shape (T,).
-    #: Part of each change that a train or an oscillator cannot cause, in physical units and in standard deviations;
-    #: (T,).
+    clock_jump_m: Floats  #: Median change of codes relative to Dopplers, minus whole milliseconds; shape (T,).
+    #: Parts of the changes of clock drift, velocity and position that an oscillator or a train cannot cause, each in
+    #: physical units and in standard deviations; shape (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
@@ -80,13 +80,11 @@ class MotionSigns:
     position_jump_sigmas: Floats
     #: Largest difference between the positions and clocks of any two constellations, in standard deviations; (T,).
     part_sigmas: Floats
-    #: Distance of the 3-D position from the line, and its excess over `InterferenceLimits.position_jump_m` in standard
-    #: deviations, shape (T,) each; NaN until a position has been on the line.
-    off_line_m: Floats
+    off_line_m: Floats  #: Distance of the 3-D position from the line, shape (T,); NaN until a position has been on it.
+    #: Excess of `off_line_m` over `InterferenceLimits.position_jump_m` in standard deviations, shape (T,).
     off_line_sigmas: Floats
-    #: Median time-tag error of the last epochs, positive for late tags, and its ratio to its sigma; (T,).
-    tag_error_s: Floats
-    tag_error_sigmas: Floats
+    tag_error_s: Floats  #: Median time-tag error of the last epochs, positive for late tags; shape (T,).
+    tag_error_sigmas: Floats  #: Absolute value of `tag_error_s` in standard deviations, shape (T,).
 
 
 class MotionFit(NamedTuple):
@@ -94,9 +92,8 @@ class MotionFit(NamedTuple):
 
     fixes: Fix
     part_sigmas: Floats  #: As in `MotionSigns`.
-    #: Time-tag error, positive for late tags, and its standard deviation, shape (T,); NaN without redundancy.
-    tag_error_s: Floats
-    tag_sigma_s: Floats
+    tag_error_s: Floats  #: Time-tag error, positive for late tags, shape (T,); NaN without redundancy.
+    tag_sigma_s: Floats  #: Standard deviation of the time-tag error, shape (T,); NaN without redundancy.
 
     def take(self, rows: slice) -> MotionFit:
         """Return the fits of selected epochs."""
@@ -115,7 +112,7 @@ def motion_signs(
 ) -> tuple[MotionSigns, MotionSignState]:
     """Return the clock, velocity and position statistics of T epochs, and the state for the next chunk.
 
-    `fitted` is the result of `fit_motion` for the same inputs, which is computed here by default.
+    `fitted` is the result of `fit_motion` for the same inputs; by default, it is computed here.
     """
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
@@ -196,10 +193,10 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return the distance from the extrapolated position, less the largest deviation of a train, in m and in sigmas.
+    """Return by how much a position is beyond a train's reach from the previous one, in m and in sigmas.
 
-    The extrapolation uses the velocity at the previous position. Without a velocity, the train may have moved in any
-    direction at its largest speed.
+    The previous position is extrapolated with the velocity at that position. Without a velocity, the train may have
+    moved in any direction at the largest speed of a train.
     """
     dt = seconds(now.time - before.time)
     velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
@@ -215,7 +212,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Strings, Floats, Floats, Datetimes]]:
-    """Return the median change of codes relative to Dopplers, less whole milliseconds (T,) [m], and the new state."""
+    """Return the median change of codes relative to Dopplers, minus whole milliseconds (T,) [m], and the last codes."""
     young = seconds(inputs.time[0] - state.since) <= limits.longest_gap_s
     joined = join_channels(inputs.channel, [state.channel], [young])
     code, rate = (joined.arrange(values, np.nan) for values in (state.code_m, state.rate_mps))

@@ -21,22 +21,20 @@ class MotionInputs(NamedTuple):
     break_before: Masks  #: True where an epoch is not compared with the previous epoch, shape (T,).
     channel: Strings  #: Satellite and signal, shape (K,).
     group: Indices  #: Receiver clock of each channel, shape (K,).
-    near_ecef_m: Floats  #: Position accurate to some kilometres, shape (T, 3); NaN if unknown.
-    #: Satellite positions and velocities, shape (T, K, 3).
-    sat_ecef_m: Floats
-    sat_velocity_mps: Floats
+    near_ecef_m: Floats  #: Approximate position, accurate to some kilometres, shape (T, 3); NaN if unknown.
+    sat_ecef_m: Floats  #: Satellite positions, shape (T, K, 3).
+    sat_velocity_mps: Floats  #: Satellite velocities, shape (T, K, 3).
     code_m: Floats  #: Observed pseudoranges, shape (T, K).
     rate_mps: Floats  #: Range rates from Dopplers, ``-lambda D``, shape (T, K).
-    #: Corrected pseudoranges and their standard deviations, shape (T, K).
-    corrected_code_m: Floats
-    sigma_m: Floats
+    corrected_code_m: Floats  #: Corrected pseudoranges, shape (T, K).
+    sigma_m: Floats  #: Standard deviations of the corrected pseudoranges, shape (T, K).
     used: Masks  #: Channels without a rejection reason, shape (T, K).
-    named: Masks  #: Channels rejected only because of an error of the single satellite, shape (T, K).
+    named: Masks  #: Channels rejected only because of an error of this one satellite, shape (T, K).
     noise_scale: Floats  #: Ratio of the receiver's range standard deviation to `sigma_m`, shape (T,).
-    #: Known offsets between the receiver clocks, and their standard deviations, shape (T, G).
-    clock_offset_m: Floats
-    clock_sigma_m: Floats
-    off_line_m: Floats  #: Lateral distance of the 3-D position from the line, shape (T,); NaN beyond an end.
+    clock_offset_m: Floats  #: Known offsets between the receiver clocks, shape (T, G).
+    clock_sigma_m: Floats  #: Standard deviations of these offsets, shape (T, G).
+    #: Lateral distance of the 3-D position from the line, shape (T,); NaN beyond an end of the line.
+    off_line_m: Floats
     #: True where codes have gross errors or are rejected as faulty, or the position failed a check, shape (T,).
     doubted: Masks
     antenna: Indices  #: Index of each epoch's antenna in `lines`, shape (T,).
@@ -66,7 +64,7 @@ def clock_columns(inputs: MotionInputs) -> Floats:
 
 
 def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
-    """Return approximate positions (T, 3), unit vectors to the satellites (T, K, 3) and codes less ranges (T, K)."""
+    """Return approximate positions (T, 3), unit vectors to satellites (T, K, 3) and codes minus ranges (T, K)."""
     near = inputs.near_ecef_m
     to_satellite = inputs.sat_ecef_m - near[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2)

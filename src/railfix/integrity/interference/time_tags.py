@@ -1,8 +1,8 @@
 """Test for a common time-tag error, which is fitted together with position and receiver clocks.
 
-With wrong time tags, satellite positions are computed for the wrong time; the design column of the error is thus the
-negative range rate. The alternative hypotheses are bad codes and a train off its map. A time-tag error is accepted only
-if it explains the residuals clearly better than the alternatives.
+With wrong time tags, satellite positions are computed for the wrong time; the design column of the time-tag error is
+therefore the negative range rate. The alternative hypotheses are bad codes and a train off its map. A time-tag error is
+accepted only if it explains the residuals clearly better than the alternatives.
 """
 
 from __future__ import annotations
@@ -18,22 +18,21 @@ from railfix.integrity.interference.range_fits import MotionInputs, clock_column
 
 #: Order of magnitude of a satellite's range rate, by which the design column of the error is divided [m/s].
 _RATE_MPS: Final = 500.0
-#: Largest and smallest number of epochs for the median error, and the largest age of an epoch.
-_TAG_EPOCHS: Final = 10
-_TAG_LEAST: Final = 3
-_TAG_WINDOW: Final = np.timedelta64(60, "s")
-_STEPS: Final = 6  #: Largest number of steps of a fit; next, its limits of convergence, of error [s] and position [m].
-_SETTLED_S: Final = 0.05
-_SETTLED_M: Final = 100.0
-_ROUNDS: Final = 2  #: Reweighted fits per step.
-_FITS_WELL: Final = 3.0  #: Multiple of the median up to which residuals have full weight.
-_SHOWN: Final = 3.0  #: Errors above this many standard deviations are compared with the alternative hypotheses.
+_TAG_EPOCHS: Final = 10  #: Largest number of epochs over which the median error is computed.
+_TAG_LEAST: Final = 3  #: Smallest number of epochs over which the median error is computed.
+_TAG_WINDOW: Final = np.timedelta64(60, "s")  #: Largest age of an epoch in the median error.
+_STEPS: Final = 6  #: Largest number of steps of a fit.
+_SETTLED_S: Final = 0.05  #: Largest change of the time-tag error in the last step of a fit [s].
+_SETTLED_M: Final = 100.0  #: Largest change of the position in the last step of a fit [m].
+_ROUNDS: Final = 2  #: Number of reweighted fits per step.
+_FITS_WELL: Final = 3.0  #: Multiple of the median residual up to which residuals have full weight.
+_SHOWN: Final = 3.0  #: Time-tag errors above this many standard deviations are compared with the alternatives.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's distance from its line, across and up.
 _LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree on an error.
 #: Residuals up to this many standard deviations agree; the cost contains residuals clipped at this limit.
 _AGREES: Final = 5.0
-#: Minimum reduction of the cost. The value exceeds the cost of one clipped residual, because a time-tag error can
-#: absorb one bad code.
+#: Minimum reduction of the cost by an accepted time-tag error. The value exceeds the cost of one clipped residual,
+#: because a time-tag error can absorb one bad code.
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
@@ -86,7 +85,7 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
     # without a redundant range, the accepted ranges fit exactly, and the rejected ranges count as wrong
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise of the fit with a time-tag error, but at most the receiver's noise, which may contain such an error
+    # noise scale of the fit with a time-tag error, at most the receiver's, which such an error may have increased
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -153,7 +152,7 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 
 
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median time-tag error of the last epochs, the ratio to its standard deviation, and the new state.
+    """Return the median of the last time-tag errors, its size in standard deviations, and the last errors.
 
     The standard deviation is the larger of two values: the median of the epochs' standard deviations, and the robust
     spread of their errors. The results are NaN for fewer than `_TAG_LEAST` epochs.

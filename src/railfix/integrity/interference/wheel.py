@@ -20,7 +20,7 @@ from railfix.integrity.interference.limits import HeldState, InterferenceLimits,
 _LEAST_M: Final = 1.0
 #: Largest speed at which a tachometer may have no output [m/s].
 _SLOW_MPS: Final = 0.5
-#: Interval of the positions used, and time by which a tag may precede the whole second.
+#: `_SECOND`: interval of the positions used. `_TAG`: largest time by which a tag may precede the whole second.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
@@ -29,43 +29,39 @@ class WheelSamples(RowArrays):
     """Satellite positions and wheel distances, at most once per second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Satellite position along the line, and its standard deviation.
-    arc_m: Floats = field(default_factory=lambda: np.empty(0))
-    sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start.
+    arc_m: Floats = field(default_factory=lambda: np.empty(0))  #: Satellite position along the line.
+    sigma_m: Floats = field(default_factory=lambda: np.empty(0))  #: Standard deviation of the satellite position.
+    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start of the run.
     #: Largest distance since the start that may be missing in `distance_m`, because the tachometer has no output at low
     #: speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Number of the part; a part is an interval without slip and without a gap in the wheel data.
+    #: Number of the part of the run; within a part, there is neither slip nor a gap in the wheel data.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelState:
-    """State of the comparison after a chunk."""
+    """State of the comparison of satellite and wheel distances, carried over from one chunk to the next."""
 
     #: First sample of the current part, and the samples of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
-    #: `WheelSamples.distance_m` and `doubt_m` at the last epoch, and the last known wheel speed (NaN before).
-    distance_m: float = 0.0
-    doubt_m: float = 0.0
-    speed_mps: float = float("nan")
-    #: Number of the current part, and GPS second of the last epoch.
-    part: int = 0
-    second: int = -1
+    distance_m: float = 0.0  #: `WheelSamples.distance_m` at the last epoch.
+    doubt_m: float = 0.0  #: `WheelSamples.doubt_m` at the last epoch.
+    speed_mps: float = float("nan")  #: Last known wheel speed; NaN before the first.
+    part: int = 0  #: Number of the current part.
+    second: int = -1  #: GPS second of the last epoch.
     held: HeldState = field(default_factory=HeldState)
-    #: Fields of `WheelSigns` at the last sample, and whether the difference exceeds its limits at this sample.
-    difference_m: float = float("nan")
-    bound_m: float = float("nan")
-    beyond: bool = False
+    difference_m: float = float("nan")  #: `WheelSigns.difference_m` at the last sample.
+    bound_m: float = float("nan")  #: `WheelSigns.bound_m` at the last sample.
+    beyond: bool = False  #: Whether the difference exceeds its limits at the last sample.
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSigns:
     """Differences between satellite and wheel distances at T epochs."""
 
-    #: Satellite distance less scaled wheel distance over the window, shape (T,); NaN where not compared.
+    #: Satellite distance minus scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
     #: Bound of the position error for a pull that began within the window, shape (T,). The bound is the absolute
     #: difference plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since then.
@@ -143,20 +139,21 @@ def _wheel_distances(
 def _compare(
     samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
 ) -> tuple[Floats, Floats, Masks]:
-    """Return differences, bounds and the mask of differences over their limits, for the window before each sample from
-    `first`.
+    """Compare the distances over the window before each sample from `first` on.
+
+    Return differences, bounds, and the mask of differences that exceed their limits.
 
     The wheel scale factor is estimated from the part before each window and applied to the wheel distance.
     """
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))
     begun = np.searchsorted(time, time[now] - limits.wheel_window_s - 0.5)
-    start = np.searchsorted(samples.part, samples.part[now])  # part numbers rise
+    start = np.searchsorted(samples.part, samples.part[now])  # part numbers never decrease
     begun = np.maximum(begun, start)
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Return satellite less wheel distance, wheel distance, and the variance without the second position."""
+        """Return satellite minus wheel distance, wheel distance, and their variance without the position at `b`."""
         arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
             arc, distance = np.abs(arc), np.abs(distance)

@@ -44,11 +44,11 @@ class AraimBudget(Settings):
     The defaults are the LPV-200 values of ADD 3.0, with the vertical budget also used along the track.
     """
 
-    #: Probability of hazardously misleading information per approach (or per sample).
+    #: Probability of hazardously misleading information per approach (or per sample), by component.
     phmi_along: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_vertical: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_horizontal: float = Field(default=2e-9, gt=0, lt=1)
-    #: Probability that noise alone makes the separations inconsistent.
+    #: Probability that noise alone makes the separations inconsistent, by component.
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
@@ -61,14 +61,13 @@ class AraimBudget(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class AraimGeometry:
-    """N observations at each of T epochs: the ranges and, with a map, its two constraints."""
+    """N observations at each of T epochs: the ranges and, with a map, the two constraints of the map."""
 
     #: Partial derivatives of each observation by the P unknowns (position, then one clock per constellation), shape
     #: (T, N, P). Values of unused observations are ignored.
     design: Floats
-    #: Standard deviations for integrity and for accuracy, shape (T, N); NaN for unused observations.
-    sigma_int_m: Floats
-    sigma_acc_m: Floats
+    sigma_int_m: Floats  #: Standard deviations for integrity, shape (T, N); NaN for unused observations.
+    sigma_acc_m: Floats  #: Standard deviations for accuracy, shape (T, N); NaN for unused observations.
     bias_m: Floats  #: Largest nominal bias of each observation, shape (T, N).
     prior: Floats  #: Prior probability of a fault of a single observation, shape (N,).
     together: Masks  #: Sets of observations that are faulty together (of a constellation, or of the map), shape (C, N).
@@ -87,9 +86,8 @@ class AraimLevels:
     #: Protection levels, shape (T, Q); infinite where unmonitored faults are more probable than the risk, NaN without a
     #: position.
     level_m: Floats
-    #: Standard deviations of the position from all observations, for integrity and for accuracy, shape (T, Q).
-    sigma_int_m: Floats
-    sigma_acc_m: Floats
+    sigma_int_m: Floats  #: Standard deviations for integrity of the position from all observations, shape (T, Q).
+    sigma_acc_m: Floats  #: Standard deviations for accuracy of the position from all observations, shape (T, Q).
     modes: Integers  #: Number of fault modes, shape (T,).
     unmonitored: Floats  #: Probability of faults that are not modes, or that leave no position, shape (T,).
 
@@ -172,7 +170,7 @@ def _block(
 
 
 def _event_priors(geometry: AraimGeometry, used: Masks) -> Floats:
-    """Return the probability of each event, shape (T, E); 0 where none of its observations is used."""
+    """Return the probability of each event, shape (T, E); 0 where no observation of the event is used."""
     alone = np.where(used, geometry.prior, 0.0)
     some = (used[:, None] & geometry.together).any(axis=2)
     return np.concatenate([alone, np.where(some, geometry.together_prior, 0.0)], axis=1)
@@ -231,7 +229,7 @@ class SatelliteSupport(Protocol):
         """Return whether the support is valid at epochs, shape (T,)."""
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return sentences on its validity at epochs, shape (T,)."""
+        """Return sentences on the validity of the support at epochs, shape (T,)."""
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
         """Return the support of each channel from the name of its satellite ("G07"); NaN without support."""

@@ -53,7 +53,7 @@ class Forms(NamedTuple):
         return np.where(possible, np.fmin(radius, _FURTHEST_M), 0.0)
 
 
-_BOUND_SIZE: Final = 200_000  #: Largest number of epochs of a block times its squared number of channels.
+_BOUND_SIZE: Final = 200_000  #: Limit of the number of epochs in a block, times the squared number of channels.
 
 
 def places_beyond_the_level(

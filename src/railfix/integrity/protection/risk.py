@@ -66,16 +66,16 @@ class RiskBudget(Settings):
     #: and SBAS corrections change within minutes (DO-229D appendix J counts 10 samples per hour). A larger number is
     #: conservative. From 10 to 3600 samples, the fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
-    #: Fractions of the risk of an epoch for the three parts of the level, with a sum of at most 1. The level is lowered
-    #: from the largest part until the sum of all tails equals the sum of the fractions. Doubling a fraction lowers a K
-    #: of 6 by only 0.1, and a K of 3 by 0.2, so the default is thirds.
+    #: Fractions of an epoch's risk for the parts of the level (no, one and two faults), with a sum of at most 1. The
+    #: level is lowered from the largest part until the sum of all tails equals the sum of the fractions. Doubling a
+    #: fraction lowers a K of 6 by only 0.1, and a K of 3 by 0.2, so the default is thirds.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that are not hypotheses. If the faults exceed this fraction, further faults
-    #: become hypotheses, up to four simultaneous satellites and three shared faults (constellation, side, map).
+    #: Fraction of the risk for faults that are not hypotheses. If these faults are more probable, further faults become
+    #: hypotheses, up to four simultaneous satellites and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite, and for epochs with two excluded satellites.
+    #: Fraction of the risk for epochs with one excluded satellite, and again for epochs with two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability per epoch that noise alone makes the separations inconsistent; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
@@ -94,9 +94,9 @@ class RiskBudget(Settings):
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
     #: Elevation up to which satellites count as low. 45 deg is the top of a wall whose height equals its distance.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
-    #: Satellites that are faulty together: the low satellites left or right of the track ("beside"), or in addition all
-    #: satellites ahead or behind, as in the filter ("all"). Without the satellites ahead or behind, a single epoch has
-    #: a weak geometry along the track, so that the levels become up to three times as large.
+    #: Satellites assumed to be faulty together: the low satellites left or right of the track ("beside"), or also all
+    #: satellites ahead or behind, as in the filter ("all"). With "all", levels are up to three times as large, because
+    #: the geometry of a single epoch along the track is weak without the satellites ahead or behind.
     late_sides: Literal["beside", "all"] = "beside"
     #: Whether the priors were measured on this line (``railfix error-model``). Levels with assumed priors are called
     #: indicative in every output, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.
@@ -180,8 +180,9 @@ def set_sums(prior: Floats, most: int) -> Floats:
 
 #: Largest number of shared faults in a hypothesis; the probability of more shared faults is subtracted from the risk.
 _MOST_SHARED: Final = 3
-FEW: Final = 2  #: Largest number of epochs in a chunk for which the allocation is cached (two antennas live).
-REMEMBERED: Final = 512  #: Number of cached allocations, since satellites disappear and reappear behind obstacles.
+FEW: Final = 2  #: Largest number of epochs for which the allocation is cached; a live chunk of two antennas has two.
+#: Number of cached allocations; they are used again when satellites reappear from behind obstacles.
+REMEMBERED: Final = 512
 _MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class, the number of sets of four of 34 satellites.
 
 
@@ -207,12 +208,12 @@ class Allocation:
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
     members: Masks  # (T, B, M) satellites affected by each set of shared faults
     shared_prior: Floats  # (T, B) probability of each set of shared faults, 0 where absent
-    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if it is not a hypothesis
+    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if the set is no hypothesis
     beyond: Floats  # (T,) probability of the classes that are not hypotheses
-    fault_free: Floats  # (T,) risk for no fault; `one`, `two` and `more` for one, two and three or more faults
-    one: Floats
-    two: Floats
-    more: Floats  # 0 where three faults are not hypotheses
+    fault_free: Floats  # (T,) risk allocated to no fault
+    one: Floats  # (T,) risk allocated to one fault
+    two: Floats  # (T,) risk allocated to two faults
+    more: Floats  # (T,) risk allocated to three or more faults, 0 where these are not hypotheses
     reserved: Floats  # (T,) probability of satellite pairs, where pairs are not hypotheses, else 0
     k_false_alarm: Floats  # (T,) factor K of the thresholds
 
@@ -225,7 +226,7 @@ def allocate(
     The following classes are always hypotheses: single satellites, alone and with a wrong map; pairs of satellites,
     where pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and every
     class that is more probable than the risk for unchecked faults. `out`, shape (T,), is the number of excluded
-    satellites; `sides`, shape (T, S, M), are the sets of satellites that are faulty together.
+    satellites; `sides`, shape (T, S, M), are the sets of satellites that may be faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
@@ -276,7 +277,7 @@ def _allocate(
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
     members = np.concatenate([used[:, None] & of_letter, sides], axis=1)
-    # A constellation needs at least one used satellite to be a shared fault, a side two.
+    # A constellation needs at least one used satellite to be a shared fault; a side needs two.
     nominal = np.array([risk.constellation_prior[s] for s in letters] + [risk.side_prior] * sides.shape[1])
     least = np.array([1] * len(letters) + [2] * sides.shape[1])
     event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)
@@ -320,9 +321,7 @@ def _allocate(
 
 @lru_cache(maxsize=64)
 def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
-    """Return the B sets of up to three shared faults, smaller sets first, and for each the mask (B, B) of its subsets
-    with one fault less.
-    """
+    """Return the B sets of up to three shared faults, smaller sets first, and the mask `_Classes.within` (B, B)."""
     sets = []
     for size in range(_MOST_SHARED + 1):
         for some in combinations([*events, -1] if wrong_map else events, size):
@@ -340,7 +339,7 @@ class _Classes:
     """Classes of hypotheses of T epochs: B sets of shared faults, each with 0 to `MOST_TOGETHER` single satellites."""
 
     each: Floats  # (T, B) prior of each set of shared faults
-    within: Masks  # (B, B) subsets with one fault less
+    within: Masks  # (B, B) true where the second set is a subset of the first with one fault less
     sums: Floats  # (T, MOST_TOGETHER + 2) `set_sums` of the satellite priors
     further: Floats  # (T,) probability of more than `_MOST_SHARED` shared faults
     least: Sequence[int]  # length B, number of single satellites always left out with each set; -1 for no hypothesis

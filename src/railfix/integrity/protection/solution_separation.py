@@ -242,8 +242,8 @@ class Asked(NamedTuple):
     shared_prior: Floats  # (T, B)
     order: Indices  # (T, B)
     k_false_alarm: Floats  # (T,)
-    first: Indices  # (B, MOST_TOGETHER + 1) first hypothesis with 0, 1, ... single satellites; -1 for none
-    bounds: Indices  # (5,) first hypothesis with no fault, one, two, and more faults; total number
+    first: Indices  # (B, MOST_TOGETHER + 1) index of the first hypothesis with 0, 1, ... single satellites; -1 for none
+    bounds: Indices  # (5,) index of the first hypothesis with no, one, two, and more faults; then the number of all
 
 
 class _Names(NamedTuple):
@@ -251,7 +251,7 @@ class _Names(NamedTuple):
 
     asked: Asked
     share: Floats  # (T, 4) risk for no fault, one, two, and more faults
-    letters: Strings  # single faults after the n channels: constellation letters, then empty
+    letters: Strings  # names of the single faults after the n channels: constellation letters, then empty
     pairs: Indices  # (K, 2) pairs of channels; the last entry is (-1, -1)
 
 

@@ -25,8 +25,9 @@ Satellite = Annotated[str, Field(pattern=r"^[GJECR][0-9]{2}$")]
 class StatedSupport(Settings):
     """Integrity support of a satellite."""
 
-    #: Standard deviations of the range error due to orbit and clock, for integrity and for accuracy and continuity.
+    #: Standard deviation of the range error due to orbit and clock, for integrity.
     sigma_ura_m: float = Field(gt=0)
+    #: Standard deviation of the range error due to orbit and clock, for accuracy and continuity.
     sigma_ure_m: float = Field(gt=0)
     bias_m: float = Field(ge=0)  #: Largest nominal bias of the range (b_nom).
     prior: float = Field(ge=0, lt=1)  #: Probability that the satellite is faulty at a given time (P_sat).
@@ -43,9 +44,9 @@ class IntegritySupport(Settings):
     """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
-    #: Validity period of the message [GPS time]; None if not stated. Epochs outside the period have no ARAIM level.
+    #: Start of the validity period [GPS time]; None if not stated. Epochs outside this period have no ARAIM level.
     valid_from: datetime | None = None
-    valid_until: datetime | None = None
+    valid_until: datetime | None = None  #: End of the validity period [GPS time]; None if not stated.
     #: Support by constellation letter; a constellation without support is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
     #: Support of single satellites, which replaces the support by constellation.
@@ -75,8 +76,8 @@ class IntegritySupport(Settings):
             return ()
         first = "" if self.valid_from is None else f"from {self.valid_from} "
         return (
-            f"integrity support message: valid {first}until {self.valid_until} (GPS time); epochs outside "
-            "this time have no ARAIM level; give a message that is valid at their time",
+            f"the integrity support message is valid {first}until {self.valid_until} (GPS time). Epochs outside "
+            "this period have no ARAIM level; provide a message that covers them",
         )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:

@@ -103,7 +103,8 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
     """Return the noncentrality that the chi-square test misses with probability `missed_detection` (P4), same shape.
-    The value is NaN below 1 degree of freedom.
+
+    NaN below 1 degree of freedom.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -131,7 +132,7 @@ def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floats) -> Floats:
-    """Return the slopes for errors of single satellites, shape (T, M) [m]; infinite if no other channel tests it."""
+    """Return the slopes for errors of single satellites, shape (T, M) [m]; infinite where undetectable."""
     effect = np.sqrt((model.gain_m**2).sum(axis=2))
     checked = share > LEAST_REDUNDANCY
     unchecked = np.where(effect > _NO_EFFECT * sigma[:, None], np.inf, 0.0)

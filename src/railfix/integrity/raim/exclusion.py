@@ -44,9 +44,9 @@ class RaimLimits(Settings):
     #: (chi-square, one degree of freedom). If another exclusion of as many satellites passes and fits worse by less
     #: than the separation, the epoch is inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: If the positions after two exclusions are closer than this, the exclusions do not compete, because the choice
-    #: hardly changes the position (for example with the two satellites of a separate clock). With 0, exclusions always
-    #: compete.
+    #: If the positions after two exclusions are closer than this distance, the exclusions do not compete, because the
+    #: choice hardly changes the position (for example with the two satellites of a separate clock). With 0, exclusions
+    #: always compete.
     same_position_m: float = Field(default=0.0, ge=0)
     #: Two-sided probability of noise beyond K sigma in the protection level; 1 gives K = 0, which is P4's ``HSlope
     #: sigma0 sqrt(lambda)``.
@@ -106,7 +106,7 @@ def detect(
         error, residuals of a `Constrained` position do not. Both residuals are equal only for an exact map (a sigma of
         a millimetre), as in P1.
     freedom : array_like of int, shape (T,)
-        Number of ranges less unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space ``- 3`` instead.
+        Ranges minus unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space with ``- 3`` for ``- 1``.
     scale : array_like, shape (T,) or ()
         Ratio of the receiver's range standard deviation to the sigmas of the weights. Not used in fixed mode.
     """
@@ -208,7 +208,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     error of each satellite of the subset exceeds the noise (chi-square mode) or the square root of the limit (fixed
     mode). Single satellites are preferred to pairs. Of several subsets, the subset with the smallest statistic is
     excluded. The epoch is inseparable if another subset of the same size could also be excluded, and its statistic is
-    larger only within the noise (`separation_risk`). `scale`, shape (T,) or (), is the noise scale as for `detect`.
+    larger by no more than noise explains (`separation_risk`). `scale`, shape (T,) or (), is used as in `detect`.
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape

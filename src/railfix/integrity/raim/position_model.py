@@ -52,11 +52,12 @@ class LinearModel:
     #: Derivative of the whitened range by the position, clocks eliminated (B), shape (T, M, 3) [1/m]; 0 for unused
     #: ranges.
     design: Floats
-    #: Covariance of the position, prior included (Q), shape (T, 3, 3); NaN where the ranges do not determine it.
+    #: Covariance of the position, prior included (Q), shape (T, 3, 3); NaN where the position is undetermined.
     covariance_m2: Floats
     prior: Floats  #: Prior information on the position, from the map sigmas across and up, shape (3, 3) [1/m^2].
-    misfit: Floats  #: Whitened code less range at the position (y), up to a clock, shape (T, M); 0 for unused ranges.
-    freedom: Integers  #: Degrees of freedom, the number of ranges less unknowns, shape (T,); may be negative.
+    #: Whitened code minus range at the position (y), except for the clock, shape (T, M); 0 for unused ranges.
+    misfit: Floats
+    freedom: Integers  #: Degrees of freedom, the number of ranges minus unknowns, shape (T,); may be negative.
     interest: int  #: Number of components of interest: 1 on the line, 2 (horizontal) in space.
 
     def __len__(self) -> int:
@@ -107,8 +108,7 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused ranges and for ranges that no other range
-        tests.
+        """Redundancy numbers (diagonal of S), shape (T, M); 0 for ranges unused, or tested by no other range.
 
         A redundancy number is the fraction of a range error that appears in the residual of the same range.
         """
@@ -208,8 +208,8 @@ def update_model(
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
     """Whiten the ranges, eliminate the clocks, and invert the normal matrix.
 
-    `axes`, shape (T, 3, 3), are the unit vectors of the unknowns at the positions (T, 3), NaN without a position;
-    `prior`, shape (3, 3) [1/m^2], is `LinearModel.prior`.
+    `axes`, shape (T, 3, 3), are the unit vectors of the unknowns at the positions `place_ecef_m`, NaN without a
+    position; `prior`, shape (3, 3) [1/m^2], is `LinearModel.prior`.
     """
     arrays = ranges.arrays
     root, clocks, design, covariance, misfit = kernels.model.linearise_ranges(
