@@ -82,7 +82,7 @@ class Authority(Message):
 class BrakeOrder(Authority):
     """Order to brake to a stop, sent without waiting for a commit and repeated until a report names this order.
 
-    `number` is the latest authority's number. A later authority without `stopped` ends the order.
+    `number` is the number of the latest authority. A later authority without `stopped` ends the order.
     """
 
     kind: ClassVar[int] = 2

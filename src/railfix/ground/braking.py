@@ -16,7 +16,7 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 GRAVITY_MPS2: Final = 9.80665
-#: `_largest`: upper limit of the search for a speed [m/s], and number of bisections.
+#: `_TOP_MPS`: upper limit of the search for a speed [m/s]. `_HALVINGS`: number of bisections of the search.
 _TOP_MPS, _HALVINGS = 150.0, 40
 
 
@@ -28,7 +28,8 @@ class BrakeLimits(Settings):
     safety: float = Field(default=0.9, gt=0, le=1)
     least_mps2: float = Field(default=0.05, gt=0)  #: Lower limit of the deceleration assumed on downhill gradients.
     build_up_s: float = Field(default=2.0, ge=0)  #: Time from the intervention until the brakes act.
-    cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most `build_up_s`.
+    #: Time from the intervention until traction is cut off, at most `build_up_s`.
+    cut_s: float = Field(default=0.5, ge=0)
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
     #: Driver's reaction time; the permitted-speed curve is this time ahead of the intervention curve.
@@ -44,14 +45,14 @@ class Target(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Stepwise gradients, positive uphill; each applies up to the next position, and 0 before the first."""
+    """Gradients, positive uphill, each from its position to the next position; 0 before the first position."""
 
     from_m: Sequence[float] = ()
     gradient: Sequence[float] = ()
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed at `at_m` from which a braking train reaches the target at its speed [m2/s2].
+    """Return the square of the speed at `at_m` from which braking leads to the target speed at the target [m2/s2].
 
     ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)`` from `at_m` to the target, with a: `braking_mps2`,
     g: gravity, i: gradient, least: `least_mps2`. Beyond the target, the result is below ``v_target^2``.

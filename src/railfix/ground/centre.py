@@ -21,8 +21,8 @@ from railfix.core.arrays import Floats, copy_with, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Acceleration of the reference run curve [m/s^2], and distance from a stopping position within which a train is at the
-#: station [m].
+#: `_RUN_MPS2`: acceleration of the reference run curve [m/s^2]. `_AT_STATION_M`: distance from a stopping position
+#: within which a train is at the station [m].
 _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
 
 
@@ -121,9 +121,9 @@ class CentreLimits(Settings):
     #: Largest delay of a train's clock behind the times of the train's positions. The time between two positions is
     #: assumed to be longer by this value, because the delay of the clock may vary.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest accepted lead of a sequence number over the newest sequence number, at the arrival of the newest.
+    #: Largest accepted lead over the newest sequence number, immediately after this number has arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of the largest accepted lead per second since the newest sequence number arrived.
+    #: Increase of the largest accepted lead per second since the newest sequence number has arrived.
     rate: float = Field(default=20.0, gt=0)
 
     @model_validator(mode="after")
@@ -227,7 +227,7 @@ def time_passed(
     authority_m: float | None = None,
     limits: CentreLimits,
 ) -> TrainRecord:
-    """Return the record at a later instant if the train has not reported: state and displayed position.
+    """Return the record with state and displayed position at a later instant, if the train has not reported.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 class StationFixes(FrozenArrays):
     """Single point positions of N receivers at T epochs.
 
-    At each epoch, all receivers use the same satellites and weights.
+    Where they are computed here, all receivers use the same satellites and weights at each epoch.
     """
 
     time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
@@ -225,7 +225,7 @@ def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
     return np.asarray(level_dbhz < usual[len(earlier_dbhz) :] - FALLEN_DBHZ)
 
 
-#: Largest number of epochs for which receivers are waited for that have not sent them yet.
+#: Largest number of epochs that wait until every receiver has sent them.
 _LONGEST_QUEUE: Final = 1000
 
 

@@ -105,9 +105,9 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest accepted delay in excess of the shortest observed delay.
     #: Largest relative drift between the clocks of both ends; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Largest accepted lead of a sequence number over the newest sequence number, at the arrival of the newest.
+    #: Largest accepted lead over the newest sequence number, immediately after this number has arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of the largest accepted lead per second since the newest sequence number arrived.
+    #: Increase of the largest accepted lead per second since the newest sequence number has arrived.
     rate: float = Field(default=100.0, gt=0)
 
 

@@ -266,7 +266,7 @@ def due_commands(
 
 
 def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
-    """Return the state in which points are released that safe rear ends passed `InterlockingLimits.release_s` ago."""
+    """Return the state with points released that a safe rear end passed `InterlockingLimits.release_s` ago."""
     points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
         if not point.locked:

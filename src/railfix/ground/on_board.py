@@ -20,7 +20,7 @@ ROLLED_M: Final = 50.0
 #: Number of newest reports whose times of sending are stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
-#: Longest time limit of authorities: an authority older than this on arrival is rejected.
+#: Longest permitted time limit of authorities [s]; an authority that is older on arrival is rejected.
 LONGEST_FRESH_S: Final = 45.0
 
 
@@ -147,9 +147,9 @@ class OnBoard:
         """Process an authority; return whether it is accepted.
 
         An authority must be newer than the last accepted authority, and have the train's direction. An authority that
-        answers a report sent before the last change of ends is rejected: it may be for the present direction, but from
-        before the last two changes of ends. An authority that has lapsed in transit is rejected. An order to brake is
-        always accepted; a late order lasts until the next authority.
+        answers a report sent before the last change of ends is rejected, even if its direction is the present one,
+        because it may have been granted two changes of ends ago. An authority that has lapsed in transit is rejected.
+        An order to brake is always accepted; a late order lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
             # an order may have a number below that of the authority, if the centre's database is an older copy

@@ -51,7 +51,7 @@ ASKING_S: Final = 0.01
 #: Size of the receive buffer for packets that arrive while the centre is busy. With a thousand trains, the default
 #: buffer overflows after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
-#: Number of packets of connected peers that are processed for one packet of a handshake.
+#: Number of packets of connected peers that are processed per packet of a handshake.
 TURN: Final = 16
 #: Time after which a waiting packet of a connected peer is dropped, because the peer has sent a newer message [s].
 LATE_S: Final = 1.0
@@ -182,7 +182,7 @@ class LinkProtocol(QuicConnectionProtocol):
             self.reject()
 
     def reject(self) -> None:
-        """End the connection because of its certificate."""
+        """End the connection because of the peer's certificate."""
         self.peer = None
         self._rejected()
         self.close(error_code=_REJECTED, reason_phrase="certificate")

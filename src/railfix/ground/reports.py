@@ -362,7 +362,7 @@ def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float |
     return by_train_s if by_centre_s is None or by_train_s < 0.0 else max(min(by_train_s, by_centre_s), 0.0)
 
 
-#: Numbers from this value on are not adopted from a report that names an authority unknown to the database.
+#: Reported authority numbers from this value on are not adopted for the next authorities.
 _MOST_NUMBERS: Final = 1 << 62
 
 

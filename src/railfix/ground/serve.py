@@ -268,7 +268,7 @@ async def run_centre(
 async def _run_until(
     end: asyncio.Event, work: Coroutine[Any, Any, None], judge: Coroutine[Any, Any, None], *, for_s: float | None
 ) -> None:
-    """Run the centre's tasks until the event, the end of `work`, or for a time; an error of `work` is raised."""
+    """Run the centre's tasks until the event `end`, the end of `work`, or for a time; raise an error of `work`."""
     working, ending, judging = (asyncio.create_task(each) for each in (work, end.wait(), judge))
     await asyncio.wait([working, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
     if working.done():

@@ -129,7 +129,7 @@ class PointState:
 
     wanted: int = 1  #: Commanded track.
     detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
-    #: Whether the field has received the command since `wanted` was stored.
+    #: Whether the command to move to `wanted` has been given, or is not needed.
     commanded: bool = True
     #: Trains that lock the points, each with the time at which it releases them [s]; None until its rear end has
     #: passed.

@@ -17,8 +17,8 @@ from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, T
 from railfix.io.train_message import TrainMessage
 
 #: Reasons why a section is barred: `CLOSED` by hand; `OCCUPIED` by vehicles that do not report, as entered by hand or
-#: as detected; or `UNKNOWN`, because its detection has not answered. For the reasons in `BARS`, trains inside the
-#: section are stopped.
+#: as detected; or `UNKNOWN`, because the detection of the section has not answered. For the reasons in `BARS`, trains
+#: inside the section are stopped.
 CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
@@ -70,7 +70,7 @@ def _occupation(train: TrainInterval) -> tuple[object, ...]:
 
 
 def parted_cleared(state: Interlocking) -> Interlocking:
-    """Return the state in which the parts of a divided train are separate trains once they are apart."""
+    """Return the state with `TrainInterval.parted` cleared for divided trains whose parts no longer overlap."""
     for train in [train for train in state.trains.values() if train.parted is not None]:
         rear = state.trains.get(train.parted or 0)
         if rear is None or not train.overlaps(*rear.span_m):

@@ -39,8 +39,8 @@ from railfix.io.train_message import TrainMessage
 
 #: Distance to the end of its track within which a train gets the next route [m].
 ROUTE_AHEAD_M = 700.0
-#: Longest time between two authorities to a train [s]; further authorities follow each report and each change of its
-#: stop.
+#: Longest time between two authorities to a train [s]. A train also gets an authority after each report, and when its
+#: stop begins or ends.
 AUTHORITY_S = 1.0
 #: Smallest number of authority numbers that are skipped at a restart.
 SKIPPED: Final = 1 << 20
@@ -174,7 +174,7 @@ class Supervision:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
         No authority is extended until every train has sent a report that names an order of this start. This report also
-        states an authority that the database does not contain, and the train no longer accepts late authorities of the
+        states any authority that the database does not contain, and the train no longer accepts late authorities of the
         earlier process. The stored detection of points is dropped.
 
         Authority numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers

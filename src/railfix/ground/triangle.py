@@ -1,4 +1,4 @@
-"""Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points, and monitor.
+"""Reference triangle: verdict on satellite positioning from three fixes at known points, and monitor of the verdicts.
 
 In P3, each fix must lie inside a circle of allowable error around its known point. In addition, the vectors between
 neighbouring fixes (distance and bearing) are compared with the vectors between the points. P3 treats a fix inside its
@@ -38,9 +38,9 @@ class TriangleVerdict(IntEnum):
 
     #: Every fix is inside its circle, and every side within its limit.
     HEALTHY = 0
-    #: Every fix is inside its circle, but one side, or both sides of one receiver, differ: a warning.
+    #: Every fix is inside its circle, but one side, or both sides at one receiver, exceed their limit: a warning.
     RECEIVER_DRIFTING = 1
-    #: One fix is outside its circle, and both sides at this fix differ.
+    #: One fix is outside its circle, and both sides at this fix exceed their limit.
     ONE_RECEIVER = 2
     #: All fixes are outside their circles, and all sides within their limits, as after a satellite fault or jamming.
     SATELLITES_OR_JAMMING = 3
@@ -179,7 +179,7 @@ def _verdicts(
 ) -> tuple[Codes, Integers]:
     """Return the verdict on each set of fixes and the receiver that it names, shape (T,) each."""
     outside = (~inside).sum(axis=1)
-    # a receiver i is named if both sides at this receiver differ, and the third side does not
+    # a receiver i is named if both sides at this receiver exceed their limit, and the third side does not
     alone = np.stack([~small[:, i] & ~small[:, i - 1] & small[:, i - 2] for i in range(3)], axis=1)
     named = np.where(alone.any(axis=1), alone.argmax(axis=1), -1)
     own_outside = np.take_along_axis(~inside, np.maximum(named, 0)[:, None], axis=1)[:, 0] & (named >= 0)
