@@ -96,7 +96,7 @@ def test_a_position_of_the_stream_is_taken_from_its_headers(drive: Drive) -> Non
     )
     nowhere, known = (with_place(drive.base[:1], place) for place in (np.full(3, np.nan), PLACE))
     first, state = processor.process({"front": drive.train[:1]}, base=nowhere)
-    assert any("no epoch of known position" in note for note in first.notes)
+    assert any("no epoch with a known station position" in note for note in first.notes)
     assert base_errors(state) is None
     second, state = processor.process({"front": drive.train[1:2]}, state, base=known)
     assert not any("base station" in note for note in second.notes)

@@ -204,7 +204,7 @@ def test_every_state_has_a_reason() -> None:
 
 
 def test_phases_of_one_frequency_are_refused() -> None:
-    with pytest.raises(SettingsError, match="carrier = float uses the phase of one: give carrier = off or smoothed"):
+    with pytest.raises(SettingsError, match="carrier = float uses the phase of one frequency: set carrier = off"):
         parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5", "carrier": "float"})
 
 

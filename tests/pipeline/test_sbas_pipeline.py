@@ -224,7 +224,7 @@ def test_messages_of_another_day_do_not_belong_to_the_log(recording: Recording, 
 def test_precise_orbits_are_not_what_sbas_corrects(recording: Recording) -> None:
     # Never looked into: the refusal comes before.
     navigation = replace(recording.navigation, precise=object())
-    with pytest.raises(SettingsError, match="give --sbas or --sp3"):
+    with pytest.raises(SettingsError, match="use either --sbas or --sp3"):
         make_processor(recording.config(), navigation, {"front": recording.line})
 
 

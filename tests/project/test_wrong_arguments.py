@@ -148,7 +148,7 @@ def test_what_the_command_line_notes_is_a_warning_in_python_once(made: dict[str,
     assert ionosphere.startswith("ionosphere: klobuchar requested")
     late = replace(made["log"], time=made["log"].time + np.timedelta64(3, "D"))
     assert (
-        "front: no epoch has a position: no navigation record is valid at the time of the log; is it of another day?"
+        "front: no epoch has a position: no navigation record is valid at the time of the log; are the records of another day?"
         in warned(lambda: run(log=late))
     )
     moved = made["track"].latitude_deg + 0.002

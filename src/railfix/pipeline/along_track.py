@@ -34,7 +34,7 @@ from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracke
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Rejection reasons despite which the filter uses a code, because it weights multipath and faults over several epochs.
+#: The filter also uses codes rejected for these reasons, because it weights multipath and faults over several epochs.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -43,18 +43,19 @@ _WEIGHED_BY_FILTER: Final = (
     | Reason.CN0_CURVE
     | Reason.ANTENNA_PAIR
 )
-#: Rejection reasons that concern the code only; the filter uses the satellite's phase and Doppler.
+#: Rejection reasons that apply to the code only; the filter still uses the satellite's phase and Doppler.
 _CODE_ALONE: Final = Reason.GROSS_ERROR
-#: Largest speed, two sigmas included, at standstill [m/s]: 1 km/h, below which tachometers give no output.
+#: At standstill, the speed plus two sigmas is below this limit [m/s]: 1 km/h, below which tachometers give no output.
 STANDSTILL_MPS: Final = 1.0 / 3.6
-#: Number of sigmas, and distance [m], up to which positions beyond an end of the line are moved to the end.
+#: Number of sigmas up to which positions beyond an end of the line are moved to the end.
 _END_SIGMAS: Final = 4.0
+#: Distance up to which positions beyond an end are moved to the end even if the sigma is smaller [m].
 _END_M: Final = 30.0
-#: Gate of two-way ranges around the predicted range, in standard deviations, and its minimum width toward long ranges
-#: [m]. Echoes arrive late, and are separable from 0.3 m on (P2, table 3).
+#: Half-width of the gate of two-way ranges around the predicted range, in standard deviations.
 _GATE_SIGMAS: Final = 3.0
+#: Minimum half-width toward long ranges [m]. Echoes arrive late, and are separable from 0.3 m on (P2, table 3).
 _LATE_M: Final = 0.6
-#: Vertical error of the ionospheric model for which the filter's displacements (`slow_code_m`, `TILT_M`) are set [m].
+#: Vertical error of the ionospheric model that the filter's displacements (`slow_code_m`, `TILT_M`) assume [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
 #: Length of the blocks of GPS time that the filter processes if there are sensors [ns].
 _BLOCK_NS: Final = 5_000_000_000
@@ -118,7 +119,7 @@ def along_track(
 
 
 def single_epochs(solution: Solution, interference: Interference | None, config: Config) -> SingleEpochs:
-    """Return the single-epoch results of an antenna that its filter uses."""
+    """Return those single-epoch results of an antenna that the filter along the track uses."""
     has = with_coordinates(config.failed_checks)[solution.status]
     return SingleEpochs(
         noise_scale=solution.noise_scale,
@@ -132,7 +133,7 @@ def single_epochs(solution: Solution, interference: Interference | None, config:
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
-    """Raise finite levels to `bound_m`, the largest position error that the wheel distance does not reveal."""
+    """Raise finite levels to at least `bound_m`, the largest position error that the wheel distance does not reveal."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
         tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
@@ -154,9 +155,10 @@ def _against_wheel(
 def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions with the verdict on distance and speed of the two antennas, and the state.
+    """Return the positions, doubtful where distance or speed of the two antennas are inconsistent, and the state.
 
-    `spacing` has the screen's verdicts, shape (T,), or is None. A rejection applies until `held_s` after its epoch.
+    `spacing` has the screen's verdicts, shape (T,), or is None. A rejection also applies to the `held_s` seconds after
+    its epoch.
     """
     time, error = result.tracked.time, result.spacing_error_m
     disagreed = np.full(len(time) + 1, state.disagreed)
@@ -176,7 +178,7 @@ def with_passings(
     samples: SensorSamples | None,
     limits: BaliseLimits,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions, whose statuses must be final, with the passings of balises, and the state."""
+    """Return the positions with the passings of balises, and the state; the statuses in `result` must be final."""
     if listed is None:
         return result, state
     readings = samples.balises if samples else BaliseReadings()
@@ -208,8 +210,8 @@ def _run_filter(
 
     `single` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
 
-    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, whose limits do not depend on the
-    chunks. The wheel position, at which the gradient of the map is taken, starts each block at the filter's position.
+    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks. At the start
+    of each block, the dead-reckoned position, at which the map's gradient is read, is set to the filter's position.
     """
 
     def sine_at(arc_m: Floats) -> Floats:
@@ -272,10 +274,10 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return the two-way ranges, NaN where inconsistent with the filter's position or without it (P2 3.3).
+    """Return the two-way ranges; NaN where they contradict the filter's position, or where it is unknown (P2 3.3).
 
-    Echoes arrive late, and ranges to a wrongly surveyed unit are inconsistent. The position is predicted from the start
-    of the block with the filter's speed, so that the gate widens with the square of the elapsed time.
+    The gate rejects echoes and ranges to wrongly surveyed units. The position is predicted from the start of the block
+    with constant speed; a possible acceleration widens the gate with the square of the elapsed time.
     """
     fixed = state.anchor
     if fixed is None:
@@ -338,8 +340,8 @@ def gnss_epochs(
     A code is the corrected pseudorange, NaN at unsure epochs and where it has a rejection reason outside
     `_WEIGHED_BY_FILTER`. Its standard deviation is the range sigma times `noise_scale`, shape (T,).
 
-    Carrier phases are corrected for satellite clock and troposphere. Dopplers are not; the clock drift and tropospheric
-    rate are some millimetres per second each.
+    Carrier phases are corrected for satellite clock and troposphere. Dopplers are not, because the drift of a satellite
+    clock and the tropospheric rate are only some millimetres per second.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state
@@ -367,11 +369,12 @@ def gnss_epochs(
 
 
 def compute_tilt_scale(ranges: CorrectedRanges, line: Line, klobuchar: Floats | None, config: Config) -> Floats:
-    """Return `GnssEpochs.tilt_scale`, shape (T,): 0 for ionosphere-free codes, 1 where SBAS or a base station corrects
-    or no model is used, otherwise the ratio, at least 1, of the error of the Klobuchar model to 1 m.
+    """Return `GnssEpochs.tilt_scale`, shape (T,).
 
-    The error is the fraction `NominalErrors.ionosphere_share` of the vertical delay at the beginning of the line, so
-    that it does not depend on the satellites in view.
+    The scale is 0 for ionosphere-free codes, and 1 where SBAS or a base station corrects the ranges or no model is
+    used. Otherwise it is the error of the Klobuchar model in metres, at least 1: the fraction
+    `NominalErrors.ionosphere_share` of the vertical delay at the beginning of the line, which does not depend on the
+    satellites in view.
     """
     one = np.ones(len(ranges.time))
     if klobuchar is None or config.dual_frequency_sbas:

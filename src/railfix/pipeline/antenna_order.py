@@ -1,8 +1,8 @@
 """Order of two antennas of one vehicle by their positions.
 
-Each antenna is positioned on its own trajectory, with its own offset from the vehicle. With exchanged logs, or a turned
-vehicle, both positions fit their ranges, but the front antenna appears as far behind the rear antenna as it should be
-ahead.
+Each antenna is positioned on its own trajectory, with its own offset from the vehicle. If the two logs are exchanged,
+or if the vehicle is turned round, each position still fits the ranges of its log. The front antenna then appears behind
+the rear antenna, by the distance by which it should be ahead.
 """
 
 from __future__ import annotations
@@ -17,21 +17,23 @@ from railfix.core.arrays import Datetimes
 from railfix.screens.pairs import pair_epochs
 from railfix.track.trajectory import Trajectory
 
-#: Length of a stretch of the line [m]; its pairs of positions count as one sample, as they share reflections.
+#: Length of a stretch of the line [m]. The pairs of positions on one stretch count as one sample, because the same
+#: reflections affect them.
 _STRETCH_M: Final = 50.0
 #: Minimum number of stretches for a verdict; a train at rest has too few.
 _LEAST_STRETCHES: Final = 4
-#: Number of sigmas below zero beyond which the antennas are in the wrong order.
+#: The antennas are in the wrong order if the front antenna is behind the rear antenna by more than this number of
+#: sigmas.
 _CERTAIN: Final = 5.0
-#: Smallest antenna distance with a defined order [m].
+#: Smallest antenna distance at which the order is tested [m].
 _LEAST_DISTANCE_M: Final = 0.5
 
 
 class AntennaOrder:
     """Mean distance of the front antenna ahead of the rear antenna on one track, from their positions.
 
-    `distance_m` is the distance of the front antenna ahead of the rear antenna by the vehicle file [m]. The time tags
-    of a pair of epochs differ by at most `tolerance_s`.
+    `distance_m` is the distance of the front antenna ahead of the rear antenna according to the vehicle file [m].
+    Epochs of the two antennas are paired if their time tags differ by at most `tolerance_s`.
     """
 
     def __init__(self, front: Trajectory, rear: Trajectory, *, tolerance_s: float) -> None:
@@ -44,22 +46,22 @@ class AntennaOrder:
         apart = float(np.median(front.chainage_at(arcs[0]) - rear.chainage_at(arcs[1])))
         self._facing = front.front_sign
         self.distance_m = self._facing * rising
-        self._reference_m = apart - rising  # chainages may refer to a point of the vehicle
+        self._reference_m = apart - rising  # both chainages may refer to the same point of the vehicle
         self._tolerance_s = tolerance_s
         #: For each stretch: number of pairs, sum of distances [m], sum of variances [m^2].
         self._stretches: dict[int, tuple[float, float, float]] = {}
 
     @classmethod
     def between(cls, trajectories: Mapping[str, Trajectory], *, tolerance_s: float) -> AntennaOrder | None:
-        """Return a new test for trajectories by antenna; None without two antennas of one vehicle."""
+        """Return a new test; None unless `trajectories` has the paths of two antennas of one vehicle."""
         if len(trajectories) < 2 or any(t.body_chainage_m is None for t in trajectories.values()):
             return None
         return cls(trajectories["front"], trajectories["rear"], tolerance_s=tolerance_s)
 
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
-        """Add the positions of more epochs; return whether they include a new stretch.
+        """Add the positions of more epochs; return whether any of them is on a new stretch.
 
-        For each antenna the arguments are time tags, chainage [m] and sigma [m], shape (F,) and (R,); NaN without a
+        `front` and `rear` have time tags, chainages [m] and sigmas [m], shape (F,) and (R,) each; NaN without a
         position.
         """
         at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
@@ -82,11 +84,11 @@ class AntennaOrder:
         return len(self._stretches) > seen
 
     def measure(self) -> tuple[float, float]:
-        """Return the mean distance of the front antenna ahead of the rear antenna, and its sigma [m]; NaN on fewer than
-        four stretches.
+        """Return the mean distance of the front antenna ahead of the rear antenna, and the sigma of the mean [m].
 
-        A stretch contributes its mean distance with the variance of a single pair, because position errors on a stretch
-        do not average out; if the stretches scatter more, the sigma grows.
+        The mean distance on a stretch has the variance of a single pair, because position errors on a stretch do not
+        average out. If the stretches scatter more than their variances explain, the sigma is larger. With fewer than
+        four stretches, both values are NaN.
         """
         if len(self._stretches) < _LEAST_STRETCHES:
             return float("nan"), float("nan")
@@ -108,6 +110,6 @@ class AntennaOrder:
         first, second = ("front", "rear") if self.distance_m > 0.0 else ("rear", "front")
         return (
             f"the positions of the {first} log are {-ahead:.1f} m (sigma {sigma:.1f} m) behind those of the {second} "
-            f"log, and the vehicle file has them {right:.1f} m ahead: the logs are exchanged (--front, --rear), or the "
-            "vehicle faces the other way (facing)"
+            f"log, but should be {right:.1f} m ahead by the vehicle file: the logs are exchanged (--front, --rear), or "
+            "the vehicle faces the other way (facing)"
         )

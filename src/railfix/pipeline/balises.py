@@ -1,8 +1,8 @@
 """Balises and virtual balises: filter positions at the readings, and the passing of each balise.
 
 The interval of a passing is the time during which ``|m - s| <= L``, with the arc length m of the balise, the filter's
-position s and its level L along the line. The train certainly changes from one side of the balise to the other in this
-interval, in either direction of travel.
+position s and the protection level L of that position. The train certainly changes from one side of the balise to the
+other in this interval, in either direction of travel.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ AGAIN_S: Final = 60.0
 class BaliseLimits(Settings):
     """Balise reader on the vehicle."""
 
-    #: Distance of the reader ahead of the vehicle's middle, or of the antenna without a vehicle file.
+    #: Distance of the reader ahead of the vehicle's middle, or ahead of the antenna if there is no vehicle file.
     ahead_m: float = 0.0
     #: Minimum standard deviation of a reading along the line: SUBSET-036 requires 1 m for the vital use of a balise's
     #: position.
@@ -46,7 +46,7 @@ class BaliseState:
 
 
 def arcs_of_balises(listed: ListedBalises, trajectory: Trajectory, limits: BaliseLimits) -> Floats:
-    """Return arc lengths of the antenna with the reader over each balise, shape (M,) [m]; NaN beyond the path."""
+    """Return the antenna's arc lengths at which the reader is over each balise, shape (M,) [m]; NaN beyond the path."""
     reader = listed.chainage_m - trajectory.front_sign * limits.ahead_m
     along = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
     return np.interp(reader, along, trajectory.arc_m, left=np.nan, right=np.nan)
@@ -63,8 +63,8 @@ def balise_epochs(
     """Assign each reading to the next epoch; return the measured balise positions, and the state for the next chunk.
 
     Unlisted balises and readings repeated within `AGAIN_S` are left out. Successive balises alternate between two
-    columns. A single wrong balise therefore does not affect the sub-filter without its column. `edges` has the epoch
-    before the chunk and the epochs of the chunk, shape (T + 1,).
+    columns. Each column is excluded by one sub-filter, which a wrong balise in that column therefore does not affect.
+    `edges` has the epoch before the chunk and the epochs of the chunk, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.find_index(readings.balise), arcs_of_balises(listed, trajectory, limits)
@@ -88,12 +88,12 @@ VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
 #: Odometer accuracy by SUBSET-041 5.2.1.1: a constant [m], and a fraction of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
-#: Longest time between epochs for interpolation, and between a reading and the interval of its passing [s].
+#: Longest time between epochs for interpolation, and between a reading and the time at which its balise was passed [s].
 _APART_S: Final = 2.0
-#: Number of sigmas between a balise and the filter's position beyond which the reading is wrong.
+#: A reading is wrong if the balise and the filter's position differ by more than this number of sigmas.
 _CONTRADICTION_SIGMAS: Final = 5.0
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Filter values at each epoch.
+#: Values of the filter that are used at each epoch (fields of `Tracked`).
 _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
 
 
@@ -106,38 +106,35 @@ class Passing:
     #: contradicts the filter; reading of an unlisted balise.
     verdict: int
     chainage_m: float  #: Listed chainage; NaN if unlisted.
-    #: Time of the passing by the filter, and start and end of its interval; for a wrong reading, its time and NaT.
-    time: np.datetime64
-    earliest: np.datetime64 = _NEVER
-    latest: np.datetime64 = _NEVER
+    time: np.datetime64  #: Time of the passing according to the filter; time of the reading if the reading is wrong.
+    earliest: np.datetime64 = _NEVER  #: Start of the interval of the passing; NaT for a wrong reading.
+    latest: np.datetime64 = _NEVER  #: End of the interval of the passing; NaT for a wrong reading.
     read: np.datetime64 = _NEVER  #: Time of the reading; NaT without a reading.
-    read_error_m: float = float("nan")  #: Listed chainage less the filter's chainage at the reading.
+    read_error_m: float = float("nan")  #: Position of the balise minus the filter's position at the reading.
     here: str = ""  #: For a contradicting reading, the listed balise nearest to the filter's position.
-    #: At the passing or reading: speed; standard deviation, level, and over- and under-reading amount of the position;
-    #: and odometer accuracy of SUBSET-041 since the previous balise.
-    speed_mps: float = float("nan")
-    sigma_m: float = float("nan")
-    level_m: float = float("nan")
-    amount_m: float = float("nan")
-    odometer_m: float = float("nan")
+    speed_mps: float = float("nan")  #: Speed at the passing or reading.
+    sigma_m: float = float("nan")  #: Standard deviation of the filter's position at that time.
+    level_m: float = float("nan")  #: Protection level of the filter's position at that time.
+    amount_m: float = float("nan")  #: Over- and under-reading amount of the filter's position at that time.
+    odometer_m: float = float("nan")  #: Odometer accuracy by SUBSET-041 since the previous balise.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PassingState:
-    """State of the passings after a chunk; M points."""
+    """State of the search for passings after a chunk; M balises and virtual balises."""
 
-    time: Datetimes  #: Shape (1,) or (0,).
+    time: Datetimes  #: Time of the last epoch with a position; shape (1,), or (0,) without an epoch.
     values: Floats  #: `_VALUES` of the last epoch with a position; shape (1, 5) or (0, 5).
-    #: Last certain side of the train at each point: -1 before the point, 1 beyond, 0 unknown; shape (M,).
+    #: Side of each balise on which the train last certainly was: -1 before the balise, 1 beyond it, 0 unknown; shape
+    #: (M,).
     side: Integers
-    #: Time at which the train left `side`, and time at which the filter's position was last over the point; shape (M,).
-    since: Datetimes
-    over: Datetimes
+    since: Datetimes  #: Time at which the train left `side`, shape (M,).
+    over: Datetimes  #: Time at which the filter's position was last over the balise, shape (M,).
     over_values: Floats  #: `_VALUES` at the time `over`, and odometer accuracy; shape (M, 6).
-    read: Datetimes  #: Time of the last reading, shape (M,).
-    #: Readings after the last epoch, which the next chunk compares.
+    read: Datetimes  #: Time of the last correct reading of each balise, shape (M,).
+    #: Readings after the last epoch, which are compared in the next chunk.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Times of correct readings with the filter's positions [m], from the last reading older than `_APART_S` on.
+    #: Time and filter position [m] of each correct reading, from the last reading older than `_APART_S` on.
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -159,9 +156,9 @@ def find_passings(
     state: PassingState | None,
     limits: BaliseLimits,
 ) -> tuple[tuple[Passing, ...], PassingState]:
-    """Return the passings that ended in a chunk, its wrong readings, and the state for the next chunk.
+    """Return the passings that ended in a chunk, the wrong readings of the chunk, and the state for the next chunk.
 
-    `listed` has balises and virtual balises, `readings` the readings since the previous chunk; `tracked` has levels.
+    `listed` has balises and virtual balises; `readings` has the balise readings since the previous chunk.
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)
@@ -190,7 +187,7 @@ def _judge(
     state: PassingState,
     limits: BaliseLimits,
 ) -> tuple[PassingState, list[Passing]]:
-    """Return the state with the correct readings, and the wrong readings."""
+    """Return the state with the correct readings added, and the wrong readings."""
     wrong: list[Passing] = []
     read, right = state.read.copy(), list(state.right)
     heard = readings.time <= time[-1]
@@ -222,7 +219,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return the odometer accuracy at a point since the previous correct balise reading [m]; NaN without a reading."""
+    """Return the accuracy [m] of an odometer that was reset at the last correct balise reading; NaN without one."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 
@@ -230,7 +227,7 @@ def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.date
 def _pass(
     listed: ListedBalises, arcs_m: Floats, turn_m: float, time: Datetimes, values: Floats, state: PassingState
 ) -> tuple[list[Passing], PassingState]:
-    """Return the passings that ended, and the new state."""
+    """Return the passings that ended, and the state after the epochs."""
     level = np.where(np.isfinite(values[:, 3]), values[:, 3], np.inf)[:, None]
     ahead = short_distance_m(arcs_m - values[:, :1], turn_m)
     far = np.abs(ahead) > 0.25 * turn_m
@@ -250,7 +247,7 @@ def _pass(
             continue
 
         def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
-            """Return the time of a value's zero crossing between epochs; the first epoch if it is unknown."""
+            """Return the time at which a value is zero between two epochs; the earlier epoch if unknown."""
             span = float(seconds(time[k] - time[k - 1]))
             known = np.isfinite(first - last) and first != last and span <= _APART_S
             return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))
@@ -292,9 +289,9 @@ def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
         elif passing.verdict == CONTRADICTS:
             which = f", next to {passing.here}" if passing.here and passing.here != passing.balise else ""
             notes.append(
-                f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, the train "
-                f"was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; its "
-                "identity, or its position in the list, is wrong"
+                f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, but the "
+                f"train was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; the "
+                "identity of the balise, or its position in the list, is wrong"
             )
         elif passing.verdict == NOT_LISTED:
             notes.append(f"{name}, read at {at}, is not listed on this line; the reading is not used")

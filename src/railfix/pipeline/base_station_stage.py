@@ -1,4 +1,4 @@
-"""Range errors of a base station from its observations, with the corrections of the train's ranges."""
+"""Range errors of a base station, from observations that are corrected like those of the train."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from railfix.ranges.base_station import LONGEST_AGE_S, BaseErrors
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
+#: Half length of an artificial north-south track through the station, which the corrections require [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
-_NO_EPOCH: Final = "base station: no epoch of known position so far, so nothing is subtracted"
+_NO_EPOCH: Final = "base station: no epoch with a known station position so far, so no errors are subtracted"
 #: Station positions within this distance count as equal [m].
 _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed positions of ground units, base station and balises, and line features by antenna. With "stream", the
-    observation headers give the position of the base station.
+    """Surveyed positions of ground units, base station and balises, and the feature search of each antenna. If the base
+    station is "stream", its position is read from the headers of its observations.
     """
 
     units: GroundUnits | None = None
@@ -55,11 +55,11 @@ class BaseState:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Note on a station without an epoch of known position; empty for other stations."""
+        """Note on a station that had no epoch with a known position so far; empty for other stations."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
-        """Return the received data with the errors of the station and a note on its missing data."""
+        """Return the received data with the errors of the station and, without errors, a note."""
         notes = tuple(note for note in received.notes if note != _NO_EPOCH)
         return replace(received, base=self.errors, notes=(*notes, *self.notes))
 
@@ -67,9 +67,9 @@ class BaseState:
 class BaseStation:
     """Base station at a known ECEF position, shape (3,) [m], in the reference frame of the satellite orbits.
 
-    Its pseudoranges are corrected as those of the train, and smoothed by carrier phase where available, which reduces
-    the station's noise. The station's multipath remains. With "stream" the position is taken from the headers of the
-    observations. The state restarts if the position changes by more than a centimetre, as it does with the next virtual
+    The station's pseudoranges are corrected like those of the train, and smoothed by carrier phase where available.
+    Smoothing reduces the station's noise, but not its multipath. With "stream" the position is taken from the headers
+    of the observations. The state restarts if the position changes by more than a centimetre, as at a change of virtual
     station.
     """
 
@@ -87,7 +87,7 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Return the state after more observations of the station, without errors too old for epochs from `began`."""
+        """Return the state after more observations of the station, without errors too old for epochs after `began`."""
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
@@ -104,7 +104,7 @@ class BaseStation:
         return replace(state, errors=state.errors.drop_before(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:
-        """Return a short trajectory through the station."""
+        """Return the rows of an antenna on a short trajectory through the station."""
         if self._antenna is None or np.any(self._antenna[0] != ecef_m):
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
@@ -115,7 +115,7 @@ class BaseStation:
     def errors(
         self, obs: Observations, received: Received, carrier: CarrierState, ecef_m: Floats
     ) -> tuple[BaseErrors, CarrierState]:
-        """Return the range errors of the station at its epochs, and the new state of its carrier-phase stages."""
+        """Return the station's range errors at the epochs of `obs`, and the new state of the carrier-phase stages."""
         own = replace(received, base=None)
         channels = self._book.of(obs, received.navigation)
         rows, source = self._rows(ecef_m), correction_source(own, self._config)
@@ -152,8 +152,8 @@ class BaseStation:
 
 
 def check_base(config: Config, base: BaseStation | None) -> None:
-    """Raise SettingsError if settings require a base station that is missing, or exclude one that is given."""
+    """Raise SettingsError if the settings require a missing base station, or do not allow the base station given."""
     if config.carrier == "fixed" and base is None:
-        raise SettingsError("carrier = fixed: integers need a base station; give one (--base), or carrier = float")
+        raise SettingsError("carrier = fixed: integers require a base station (--base); otherwise set carrier = float")
     if config.sbas and base is not None:
-        raise SettingsError("both SBAS and a base station correct the ranges; give one of the two")
+        raise SettingsError("both SBAS and a base station correct the ranges; use only one of the two")

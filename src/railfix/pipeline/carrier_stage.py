@@ -45,7 +45,7 @@ LOWEST_WEIGHTED_DEG = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class CarrierState:
-    """Carrier-phase state of one antenna; None before the first epoch.
+    """Carrier-phase state of one antenna; the fields are None before the first epoch.
 
     `base_arc` is the number of the last arc of a base station's phase, by satellite and signal.
     """
@@ -80,7 +80,7 @@ def smooth_ranges(
     config: Config,
     states: Sequence[CarrierState],
 ) -> tuple[CorrectedRanges, list[CarrierState]]:
-    """Return the ranges with smoothed codes and the weights of raw codes.
+    """Return the ranges with smoothed codes, but with the weights of raw codes, and the new state of each antenna.
 
     Smoothing does not raise the weights, because multipath and the error floor do not average out as white noise does.
     """
@@ -112,10 +112,10 @@ def code_and_phase(
     config: Config,
     state: CarrierState,
 ) -> tuple[PhasePositions, CarrierState]:
-    """Return positions from code and phase of the current and earlier epochs, and the state (requirement A5; P4).
+    """Return positions from code and phase of this and earlier epochs, and the new state (requirement A5; P4).
 
-    A phase is used if its code is used. `slips` covers all channels of the observations; `arc_m` has positions from
-    codes only, shape (T,).
+    A phase is used if the code of the same channel is used. `slips` covers all channels of the observations; `arc_m`
+    has positions from codes only, shape (T,).
     """
     time, columns, satellites = corrected.time, corrected.columns, corrected.satellites
     satellite, signal = corrected.satellite, corrected.signal
@@ -152,7 +152,7 @@ def code_and_phase(
 
 
 def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks, dict[tuple[str, str], int]]:
-    """Return the epochs at which the arc of the base station's phase changes, shape (T, K), and its last arcs."""
+    """Return a mask (T, K), true where a new arc of the base station's phase begins, and each channel's last arc."""
     assert corrected.base is not None
     keys = list(zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True))
     before = np.array([state.base_arc.get(key, -1) for key in keys], dtype=np.int64)
@@ -163,7 +163,7 @@ def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks,
 def _lasting(
     corrected: CorrectedRanges, ranges: Ranges, phases: Phases, limits: PhaseLimits, state: CarrierState
 ) -> tuple[Ranges, Phases]:
-    """Return ranges and phases with weights reduced for multipath correlated over `PhaseLimits.correlation_s`.
+    """Return ranges and phases with weights reduced because multipath persists for `PhaseLimits.correlation_s`.
 
     The first epoch of an arc has full weight, so that the weights of an arc sum to its number of independent epochs.
     """
@@ -176,7 +176,7 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return wavelengths, and groups of channels with a common clock and signal; -1 for GLONASS, which is not fixed."""
+    """Return wavelengths, and groups of channels with a common clock and signal; group -1 is GLONASS, never fixed."""
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

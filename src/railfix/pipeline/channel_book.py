@@ -1,4 +1,4 @@
-"""Channels of a log that the settings allow.
+"""Selection of the channels of a log that the settings allow.
 
 The selection is computed once for each set of observed channels, because most epochs have the same set.
 """
@@ -17,10 +17,10 @@ from railfix.ranges.corrected import SecondCodes
 
 
 def missing_notes(received: Received, config: Config, second: SecondCodes | None) -> tuple[str, ...]:
-    """Return notes where navigation records are missing, and where one frequency is used though two are requested."""
+    """Return notes if navigation records are missing, or if one frequency is used although two are requested."""
     known, notes = received.navigation, []
     if known.precise is None and not len(known.kepler) and not len(known.glonass):
-        notes.append("no navigation record is known; give navigation to EpochProcessor or to process")
+        notes.append("no navigation record is known; pass navigation to EpochProcessor or to process")
     if config.frequencies == "two" and (second is None or (second.column.size and (second.column < 0).all())):
         why = "SBAS on L1 corrects a single frequency" if config.sbas else "no satellite has a second code"
         why = why if received.base is None else "a base station corrects a single frequency"
@@ -33,7 +33,7 @@ _REMEMBERED: Final = 64
 
 
 class ChannelBook:
-    """Channels of observations under some settings, computed once for each set of channels."""
+    """Channels of observations that a configuration selects, computed once for each set of observed channels."""
 
     def __init__(self, config: Config) -> None:
         signals: Mapping[str, Sequence[str]] = config.signals

@@ -86,7 +86,7 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
 if TYPE_CHECKING:
 
     class ScreenSettings(Settings):
-        """Limits of the screens, one group each; the class below has the groups of `railfix.screens.SCREENS`."""
+        """Limits of the screens, one field for each screen; at run time the fields are those of `SCREENS`."""
 
         elevation: ElevationLimits = ElevationLimits()
         cn0: Cn0Limits = Cn0Limits()
@@ -129,16 +129,17 @@ class Config(ScreenSettings):
     two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of two codes.
     #: Active screens; health and validity of the satellites are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
-    #: File with the mean C/N0 over elevation (``railfix cn0-curve``); without it only the floor is used.
+    #: File with the mean C/N0 over elevation, written by ``railfix cn0-curve``; without a file only the floor is used.
     cn0_curve: Path | None = None
     #: Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of the check, or
     #: dropped as P1 does.
     failed_checks: Literal["keep", "drop"] = "keep"
-    #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds it is
-    #: `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared. P4 takes
-    #: a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed checks.
+    #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds this
+    #: limit is `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared
+    #: with the limit. P4 takes a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed
+    #: checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)
-    #: Minimum number of satellites for a position. P1 3.2 uses 3; 2 is possible and ambiguous on curves.
+    #: Minimum number of satellites for a position. P1 3.2 uses 3; with 2, positions on curves are ambiguous.
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)  #: Largest along-track dilution [m/m] of a position.
     #: Probability that noise alone moves a position off the map; the noise is estimated from the residuals of the 3-D
@@ -149,7 +150,7 @@ class Config(ScreenSettings):
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the ionospheric delay.
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.
-    #: Largest age of a navigation record, in addition to the limit by its validity.
+    #: Largest age of a navigation record, which also must be valid.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
     #: Standard deviation of the map that replaces the track's own (P1: 0.30 m in plan, 0.60 m in height).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
@@ -166,20 +167,20 @@ class Config(ScreenSettings):
     #: satellites without a valid correction are rejected. Empty for no SBAS.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
     #: Messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free codes
-    #: of GPS L1 C/A and L5, and of Galileo E1 and E5a. Satellites without both codes are rejected.
+    #: of GPS L1 C/A and L5, and of Galileo E1 and E5a. With L5, satellites without both codes are rejected.
     sbas_band: Literal["L1", "L5"] = "L1"
-    #: GEO whose messages are used; "best" is the GEO with the most usable fast corrections (L5: most corrections).
+    #: GEO whose messages are used; "best" is the GEO with the most usable fast corrections (on L5: most corrections).
     sbas_prn: int | Literal["best"] = "best"
     #: SBAS time-outs, use of message type 0, and treatment of missing degradation data.
     sbas_limits: SbasLimits = SbasLimits()
     base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
-    #: File with overbounds of the range errors by direction and C/N0 (``railfix error-model``). In the protection level
-    #: no range sigma is below its overbound; weights, screens and RAIM use `noise`. Without the file, the level is
-    #: based on `noise` times the scale estimated so far, which does not bound the tails.
+    #: File with overbounds of the range errors by direction and C/N0, written by ``railfix error-model``. In the
+    #: protection level no range sigma is below its overbound; weights, screens and RAIM use `noise`. Without the file,
+    #: the level uses `noise` times the noise scale estimated so far, which does not bound the tails.
     error_model: Path | None = None
     #: Satellite and atmospheric errors that are added to a model of local errors without SBAS.
     nominal: NominalErrors = NominalErrors()
-    protection: Literal["on", "off"] = "on"  #: Whether the protection level along the line is computed, with its parts.
+    protection: Literal["on", "off"] = "on"  #: Whether the protection level along the line and its parts are computed.
     #: Integrity risk per hour, its allocation, and the fault probabilities that the level assumes.
     risk: RiskBudget = RiskBudget()
     #: Integrity support message (TOML, ``docs/protection-level.md``) for additional ARAIM levels, along the track and
@@ -191,14 +192,14 @@ class Config(ScreenSettings):
     #: Chainage intervals in which local faults cannot be bounded and no level is given (``railfix error-model`` prints
     #: the intervals of its runs).
     no_level_m: tuple[tuple[float, float], ...] = ()
-    #: Whether positions also get P4's level: the largest slope times the largest undetected bias.
+    #: Whether the protection level of P4 is computed, too: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
     #: Use of the carrier phase: none; smoothing of codes; or code and phase together from this and earlier epochs, with
     #: float ambiguities, or with integer ambiguities, which require a base station ("fixed"). On recordings, smoothing
     #: helps most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither removes large
     #: errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
-    #: Standard deviation of a phase at the zenith, multipath included.
+    #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
     #: Limits of the stages of the carrier phase.
     slips: CycleSlipLimits = CycleSlipLimits()
@@ -248,7 +249,7 @@ class Config(ScreenSettings):
     @classmethod
     def _codes_and_each_once(cls, value: tuple[FilterSource, ...]) -> tuple[FilterSource, ...]:
         if "code" not in value or len(set(value)) != len(value):
-            raise ValueError("give each measurement once, code among them: the filter starts from codes")
+            raise ValueError("list each measurement once, and include code, from which the filter starts")
         return tuple(name for name in FILTER_SOURCES if name in value)
 
     @field_validator("sbas_prn")
@@ -262,8 +263,8 @@ class Config(ScreenSettings):
     def _codes_with_l5(self) -> Self:
         if self.dual_frequency_sbas and self.carrier in ("float", "fixed"):
             raise ValueError(
-                f"sbas_band = L5 corrects codes of two frequencies, carrier = {self.carrier} uses the phase of one: "
-                "give carrier = off or smoothed"
+                f"sbas_band = L5 corrects codes of two frequencies, but carrier = {self.carrier} uses the phase of one "
+                "frequency: set carrier = off or smoothed"
             )
         return self
 
@@ -275,7 +276,7 @@ class Config(ScreenSettings):
     @model_validator(mode="after")
     def _support_without_sbas(self) -> Self:
         if self.integrity_support is not None and self.sbas:
-            raise ValueError("integrity_support and SBAS both state satellite errors: give one of the two")
+            raise ValueError("integrity_support and SBAS both state satellite errors: use only one of the two")
         return self
 
     @cached_property
@@ -295,7 +296,7 @@ class Config(ScreenSettings):
 
 
 def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge settings over a preset: groups are merged by key, limits given as an object are unchanged."""
+    """Merge settings over a preset; groups are merged by key, but limits given as an object replace the preset's."""
     both = {**preset, **values}
     for name, group in preset.items():
         given = values.get(name)

@@ -26,7 +26,7 @@ class LineCoordinates:
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Distance along the line of the trajectory's vehicle point, shape (T,) [m]."""
+        """Chainage of the vehicle point to which the trajectory refers, shape (T,) [m]."""
         return self.trajectory.chainage_at(self.arc_m)
 
     @cached_property

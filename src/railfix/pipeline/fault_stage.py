@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Largest ratio of an epoch's residual variance to the assumed variance that is explained by noise: (100 sigmas)^2.
+#: Ratio of an epoch's residual variance to the assumed variance above which noise is not the cause: (100 sigmas)^2.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -118,10 +118,11 @@ def _chi_square_limit(risk: float, freedom: int) -> float:
 
 
 def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Masks:
-    """Return the epochs whose ranges contradict the map at the position, or lie beyond an end of the map, shape (T,).
+    """Return the epochs whose ranges contradict the map, or place the antenna beyond an end of the map, shape (T,).
 
     Ranges contradict the map if the position on the line fits significantly worse than the 3-D position (chi-square
-    test with `Config.off_map_risk`). The unit is the residual variance of the 3-D fit, at least 1.
+    test with `Config.off_map_risk`). The difference of the weighted squares is divided by the residual variance of the
+    3-D fit, at least 1.
     """
     point, constrained = fix.point, fix.constrained
     wsse = constrained.wsse

@@ -35,11 +35,9 @@ class LineFeatures:
 
     series: LineSeries
     features: tuple[Feature, ...]
-    #: Arc lengths of the vertices of the antenna's trajectory, and of the body's middle on the line at each vertex;
-    #: shape (V,).
-    antenna_m: Floats
-    body_m: Floats
-    line: Line  #: Line, which states whether it is closed.
+    antenna_m: Floats  #: Arc lengths of the vertices of the antenna's trajectory, shape (V,).
+    body_m: Floats  #: Arc lengths on the line of the body's middle when the antenna is at each vertex, shape (V,).
+    line: Line  #: The line itself, for distances that may cross the join of a closed line.
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
@@ -58,7 +56,8 @@ class LineFeatures:
         return np.interp(antenna_m, self.antenna_m, self.body_m)
 
 
-#: Minimum standard deviation of a feature's position, by errors of the map and of the body on its bogies [m].
+#: Minimum standard deviation of a feature's position, due to errors of the map and to the body's motion on the bogies
+#: [m].
 _FEATURE_SIGMA_M: Final = 0.5
 
 
@@ -98,24 +97,25 @@ class FeatureFix:
 
     @property
     def correction_m(self) -> float:
-        """Position less wheel position [m]; NaN unless accepted."""
+        """Position by the feature minus the wheel position [m]; NaN unless the feature is accepted."""
         return self.located.arc_m - self.feature.arc_m
 
 
 class _Stretch(NamedTuple):
-    """Ticks without a break from `first` on, and the whole metres passed up to the last of them."""
+    """Consecutive usable ticks from `first` on, and the whole metres passed without a break up to the last tick."""
 
     first: int
     sense: float  #: Direction: 1 toward rising arc length, else -1.
-    distance_m: Floats  #: Values at all ticks of the chunk, with the preceding tick at index 0.
+    distance_m: Floats  #: Wheel distance at all ticks of the chunk; index 0 is the tick before the chunk.
     body_m: Floats  #: Position of the body's middle at each tick of the stretch.
-    behind_m: Floats  #: Position that a feature must be behind to be compared.
+    #: Position `HALF_LENGTH_M` behind the body's middle, up to which features are compared, at each tick.
+    behind_m: Floats
     metre: Integers
     heading_rad: Floats
     pitch_rad: Floats
 
     def shift_m(self, tick: int) -> float:
-        """Return the offset from distances to positions of the body's middle at a tick."""
+        """Return the position of the body's middle minus the wheel distance at a tick."""
         return float(self.body_m[tick - self.first] - self.distance_m[tick + 1])
 
 
@@ -127,11 +127,13 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the measured profile with a feature; `noise` has the sigmas of wheel position and profile."""
+    """Compare the measured profile with a feature; `noise` has the sigma of the wheel position and those of the
+    profile.
+    """
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
-    # Rates are in rising arc length: for a reversing or turned vehicle the sign of the pitch changes, but the sign of
-    # the heading does not.
+    # The profile is in rising arc length: for a reversing or turned vehicle the sign of the pitch changes, but the sign
+    # of the heading does not.
     passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
     place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
     profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
@@ -231,8 +233,9 @@ def _compare(
     last: tuple[float, float, float] | None,
     noise: tuple[float, float],
 ) -> LocatedFeature | None:
-    """Return the verdict on one feature from arc lengths, headings and pitches; None if it was not passed without a
-    break.
+    """Return the verdict on one feature; None if the train did not pass all of the feature without a break.
+
+    `profile` has arc lengths, headings and pitches at whole metres.
     """
     arc_m, heading_rad, pitch_rad = profile
     about = arc_m - feature.arc_m

@@ -44,7 +44,7 @@ class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
     noise_scale: Floats  #: Ratio of the receiver's code noise to the range sigmas.
-    #: Single-epoch positions; codes are used again after an outage when these agree with dead reckoning.
+    #: Single-epoch positions. After an outage, codes are used again once these positions agree with dead reckoning.
     arc_m: Floats
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
@@ -62,17 +62,16 @@ class FilterState(NotebookTable):
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)  #: State of the filter that computes the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
-    #: Filter position at the last epoch, and at the last epoch before the current block.
-    fixed: FilterFix | None = None
-    anchor: FilterFix | None = None
-
+    fixed: FilterFix | None = None  #: Filter position at the last epoch.
+    anchor: FilterFix | None = None  #: Filter position at the last epoch before the current block.
     gate: ReturnState = field(default_factory=ReturnState)
-    #: State of the comparison of wheel distances with single-epoch distances, and with filter distances.
+    #: State of the comparison of wheel distances with distances between single-epoch positions.
     wheel: WheelState = field(default_factory=WheelState)
+    #: State of the comparison of wheel distances with distances between filter positions.
     filter_wheel: WheelState = field(default_factory=WheelState)
     #: Last epoch at which positions or speeds of the two antennas were inconsistent.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    passings: PassingState | None = None  #: State of balises and virtual balises.
+    passings: PassingState | None = None  #: State of the search for passings of balises and virtual balises.
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -100,9 +99,9 @@ class AlongTrack(LineCoordinates, NotebookTable):
     #: Direction: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
     direction: Codes
     standstill: Masks  #: True where the speed plus two sigmas is below 1 km/h; shape (T,).
-    #: Motion since the previous epoch, and properties of the line under the body, by wheel and inertial unit.
+    #: Motion since the previous epoch, and shape of the line under the body, measured by wheel and inertial unit.
     sensed: SensedMotion
-    #: Distance between the positions of both antennas less the antenna spacing; NaN where not compared; shape (T,).
+    #: Distance between the positions of both antennas minus the antenna spacing; NaN where not compared; shape (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Comparison of satellite with wheel distances; None without a wheel.
     passings: tuple[Passing, ...] = ()  #: Passed balises and virtual balises, and wrong readings.
@@ -136,7 +135,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Filter input for a piece of the run."""
+    """Filter input for consecutive epochs of a run."""
 
     epochs: GnssEpochs
     sensors: SensorEpochs

@@ -18,13 +18,13 @@ from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened, Verdict
 
-#: Key of this stage's verdict.
+#: Name of this stage's verdict.
 NAME: Final = "two_frequencies"
 #: Correlation arc of the ionospheric model error, 1000 km [rad].
 _IONOSPHERE_ARC: Final = 0.157
 #: Deviation of a delay from a plane over the sky, as a fraction of the delay. Galileo delays deviate by 0.06 of 1.5 m
-#: at a station in a solar minimum, 0.02 of 3.9 m on a drive in Japan, 0.05 of 6.4 m on a roof in Japan in 2024 (0.35 m:
-#: Walter et al., Navigation 48, 2001).
+#: at a station in a solar minimum, 0.02 of 3.9 m on a drive in Japan, 0.05 of 6.4 m on a roof in Japan in 2024 (Walter
+#: et al., Navigation 48, 2001, use 0.35 m).
 _IONOSPHERE_REST: Final = 0.05
 
 

@@ -41,11 +41,11 @@ from railfix.ranges.corrected import CorrectedRanges
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
-#: Rejection reasons of satellites with individual errors, if few satellites have them.
+#: Rejection reasons that indicate individual errors of satellites, provided that only few satellites have them.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Largest number of satellites with individual errors, and per clock of satellites with gross errors. A spoofer with a
-#: consistent position affects more.
+#: Largest number of satellites with individual errors; a spoofer with a consistent position affects more satellites.
 _MOST_WRONG: Final = 2
+#: Largest number of satellites of one clock with individual gross errors.
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that suspected spoofing outranks.
@@ -58,7 +58,7 @@ _FAILED: Final = np.isin(np.arange(len(Status)), [
     Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
 _IN_DOUBT: Final = _FAILED | (np.arange(len(Status)) == Status.UNCERTAIN)
-#: Statuses assigned by causes, and the statuses that they outrank.
+#: Suspicions, the statuses that each of them outranks, and the status that replaces these statuses.
 _STATUS_BY_CAUSE: Final = (
     (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
     (Suspicion.SPOOFING_SUSPECTED, _UNDER_SPOOFING, Status.SPOOFING_SUSPECTED),
@@ -67,7 +67,7 @@ _STATUS_BY_CAUSE: Final = (
 )
 #: Interval between the checks for interference [ns].
 _SECOND_NS: Final = 1_000_000_000
-#: Start of the first second of GPS time, 5 ms early, as time tags may be before the whole second [ns].
+#: Start of the count of GPS seconds [ns]: 5 ms before the GPS epoch, because a time tag may be slightly early.
 _FIRST_NS: Final = int(GPS_EPOCH.astype(np.int64)) - 5_000_000
 
 
@@ -79,9 +79,8 @@ class InterferenceState:
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
     second: int = -1  #: GPS second of the last checked epoch.
-    #: Whether there was a break, and receiver alarms, since the last checked epoch.
-    broken: bool = False
-    alarm: int = 0
+    broken: bool = False  #: Whether there was a break since the last checked epoch.
+    alarm: int = 0  #: Receiver alarms since the last checked epoch.
     latest: Interference | None = None  #: Result at the last checked epoch.
 
 
@@ -102,8 +101,8 @@ class Interference(NotebookTable):
 def _motion_inputs(
     corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
-    """Return the inputs of the motion signs at selected epochs, from ranges with all rejection reasons; `broken` marks
-    breaks since the previous selected epoch.
+    """Return the inputs of the motion signs at selected epochs, from ranges with the rejection reasons of all stages;
+    `broken` marks breaks since the previous selected epoch.
     """
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
@@ -136,7 +135,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites with individual errors, which are too few for a spoofer; shape (T, K)."""
+    """Return a mask of satellites with individual errors, where they are too few for a spoofer; shape (T, K)."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -212,17 +211,17 @@ def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
 class _Due(NamedTuple):
     """Epochs of one antenna at which interference is checked: the first epoch of each second."""
 
-    rows: Indices  #: Row indices among all antennas, shape (n,).
+    rows: Indices  #: Indices of these epochs among the rows of all antennas, shape (n,).
     group: Indices  #: Number of checked epochs up to each epoch of the antenna, shape (T,).
-    #: Receiver alarms and breaks since the previous checked epoch, for each checked epoch and for the next one; shape
-    #: (n + 1,).
+    #: Receiver alarms, and breaks, in the interval that ends at each checked epoch, and after the last checked epoch;
+    #: shape (n + 1,).
     alarm: Bytes
     broken: Masks
     last: int  #: GPS second of the last epoch of the chunk.
 
 
 def _due(second: Integers, rows: slice, alarms: Bytes, breaks: Masks, state: InterferenceState) -> _Due:
-    """Return the epochs of one antenna at which interference is checked, from their GPS seconds; shapes (T,)."""
+    """Return the epochs of one antenna at which interference is checked; `second` has the GPS seconds, shape (T,)."""
     due = np.empty(len(second), dtype=np.bool_)
     due[:1], due[1:] = second[:1] != state.second, second[1:] != second[:-1]
     group = due.cumsum()

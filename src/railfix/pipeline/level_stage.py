@@ -35,8 +35,8 @@ from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Kinds of levels: with hypotheses of local faults only, as SBAS covers satellite faults; or with hypotheses of
-#: satellite faults as well (solution separation).
+#: Kinds of protection levels: with hypotheses of local faults only, because SBAS covers satellite faults; or also with
+#: hypotheses of satellite faults (solution separation).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
@@ -121,7 +121,7 @@ def level_stage(
     offset: MapOffset,
     config: Config,
 ) -> tuple[ProtectionResult | None, Masks]:
-    """Return protection levels (None if not computed), and the epochs with possible positions beyond them, (T,)."""
+    """Return protection levels (None if not computed), and a mask (T,): a position beyond the level is possible."""
     fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
@@ -153,10 +153,10 @@ def protection_levels(
     *,
     overbound: RangeBounds | None = None,
 ) -> ProtectionResult:
-    """Return the protection levels of the positions of a chunk, from their model on the line.
+    """Return the protection levels of a chunk, from the linear model of the positions on the line.
 
-    The part of the map offset beyond its sigma is a bias of the level; an undetected offset is covered by the
-    hypothesis of a wrong map. Small residuals do not reduce a level: `level_scale` limits the receiver's noise scale,
+    The part of the map offset that exceeds the sigma of the map is a bias in the level; the hypothesis of a wrong map
+    covers an undetected offset. Small residuals do not reduce a level: `level_scale` limits the receiver's noise scale,
     shape (T,), and with an error model no range sigma is below the overbound. `sides` is the result of `late_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
@@ -171,7 +171,9 @@ def protection_levels(
 
 
 def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
-    """Return the position model with overbounding range sigmas (T, K), and its scale."""
+    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and the noise scale of the model, 1
+    (T,).
+    """
     weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
     found = fix.constrained
     model = linear_model(replace(ranges, weight=weight), antennas, found.arc_m, section=found.section)
@@ -179,8 +181,8 @@ def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix:
 
 
 def late_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, risk: RiskBudget) -> Masks:
-    """Return the sets of satellites whose codes can be late together, shape (T, S, K); `heading_deg` is the track's
-    azimuth (T,).
+    """Return masks (T, S, K) of S sets of satellites whose codes can be delayed simultaneously; `heading_deg` is the
+    azimuth of the track, shape (T,).
 
     The sets are low satellites left and right of the track, and with `RiskBudget.late_sides` "all" also satellites
     ahead and behind.
@@ -227,7 +229,7 @@ def _where_it_holds(level: ProtectionLevel, has: Masks, chainage_m: Floats, conf
     return ProtectionLevel(**values)
 
 
-#: Unknowns of the position.
+#: Number of unknown coordinates.
 _SPACE: Final = 3
 
 
@@ -283,7 +285,7 @@ def compute_araim(
 
 
 def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, Masks]:
-    """Return unit vectors (T, M, 3) and clock columns (M, G) of the M channels used at any epoch."""
+    """Return unit vectors (T, M, 3) and clock columns (M, G) of the M channels used at any epoch, and a mask (K,)."""
     channels = (corrected.reason == 0).any(axis=0)
     to_satellite = corrected.satellites.position_ecef_m[:, channels] - place[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2, keepdims=True)

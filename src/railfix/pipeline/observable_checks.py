@@ -1,8 +1,8 @@
 """Check of signs and units of Dopplers and carrier phases against satellite range rates.
 
-A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The factor
-between a constellation's Dopplers, or changes of its phases, and its range rates is 1; it is -1 with the wrong sign,
-and the wavelength if metres are given for cycles.
+A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The ratio of a
+constellation's Dopplers, or phase changes, to the computed range rates is 1. It is -1 if the sign is wrong, and the
+wavelength if the log has metres in place of cycles.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Minimum difference of a satellite's range rate from its constellation's median, for a factor [m/s].
+#: A satellite contributes to a factor if its range rate differs from the constellation's median by at least this [m/s].
 _LEAST_RATE_MPS: Final = 100.0
-#: Minimum number of satellites for a factor; number of satellites from which on one may deviate; and largest deviation
-#: of a satellite's factor from the median. With four satellites, one cycle slip moves the median rate, and thereby the
-#: factors of the other three.
+#: Minimum number of satellites for a factor; at least one more must be observed, for the median rate.
 _LEAST_SATELLITES: Final = 3
+#: From this number on, one satellite may deviate. Of four, one with a cycle slip changes the factors of the others.
 _MANY: Final = 6
+#: Largest deviation of a satellite's factor from the median factor.
 _SPREAD: Final = 0.3
-#: Largest deviation of a correct factor from 1, which the speed of the train causes.
+#: Largest deviation of a correct factor from 1; the speed of the train causes a deviation.
 _RIGHT: Final = 0.5
-#: Phases of epochs farther apart are not compared [s].
+#: Longest time between two epochs whose phases are compared [s].
 _LONGEST_S: Final = 35.0
 _KINDS: Final = ("Dopplers", "phases")
 _UNITS: Final = ("Hz", "cycles")
@@ -41,11 +41,11 @@ _NAMES: Final = {"G": "GPS", "J": "QZSS", "E": "Galileo", "C": "BeiDou", "R": "G
 class ObservableState:
     """State of the checks of one antenna after a chunk."""
 
-    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), and constellation letters, shape
-    #: (L,); "" is for all constellations together.
+    #: Last factors of Dopplers and of phases, NaN before the first factor; shape (2, L).
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
+    #: Constellation letters, shape (L,); "" is for all constellations together.
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
-    #: Phases and satellite range rates of the last epoch with factors, shape (K,).
+    #: Names, phases and range rates of the channels at the last epoch used for factors, shape (K,) each.
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U6"))
     phase_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
@@ -58,8 +58,8 @@ def check_observables(
     """Return an antenna's ranges without Dopplers and phases of wrong sign or unit, a note on each fault, and the
     state.
 
-    The ratio of observed to computed values of a constellation is used until its next ratio is estimated; before its
-    first estimate, the ratio over all constellations is used.
+    The ratio of observed to computed values of a constellation applies until the next estimate. Before the first
+    estimate, the ratio over all constellations applies.
     """
     second = corrected.time.astype("datetime64[s]")
     chosen = np.diff(second, prepend=np.array([state.time], dtype=second.dtype)) != np.timedelta64(0, "s")
@@ -98,8 +98,8 @@ def check_observables(
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
     """Return the factor between observed and computed satellite rates, shape (T,); NaN where it is unclear.
 
-    The rates are those of one constellation, shape (T, K), less their median over the satellites at each epoch. The
-    factor is the median over the satellites.
+    The rates of one constellation have shape (T, K); their median over the satellites is subtracted at each epoch. The
+    factor is the median of the satellites' ratios.
     """
     known = np.isfinite(observed_mps) & np.isfinite(expected_mps)
     few = known.sum(axis=1) <= _LEAST_SATELLITES
@@ -142,8 +142,8 @@ def _phase_rates(
 
 
 def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
-    """Return the ranges without bad Dopplers and phases, for all signals of the constellations; `bad` has a mask (T, K)
-    per kind.
+    """Return the ranges without bad Dopplers (kind 0) or phases (kind 1), on all signals of a bad constellation; `bad`
+    has a mask (T, K) for each bad kind.
     """
     obs: Observations = corrected.observations
     of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)

@@ -12,11 +12,12 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
 
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Time for which the offset of a train off the map is stored [s].
+#: Time constant of the mean offset of a train off the map [s].
 _REMEMBERED_S: Final = 30.0
-#: A train is back on the line if the mean offset of its positions is below this fraction of the offset while away, or
-#: below this limit [m].
+#: A train is back on the line if the mean offset of its positions is at most this fraction of the mean offset off the
+#: map.
 _BACK_SHARE: Final = 0.5
+#: A train is also back on the line if the mean offset of its positions is at most this limit [m].
 _BACK_M: Final = 1.0
 
 
@@ -29,10 +30,9 @@ class OffMapState:
     #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
     #: `off`.
     since: np.datetime64 = _NEVER
-    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of offsets since then.
-    #: Decayed sum and number of offsets while the train is away, and time of the last offset.
-    away: Floats = field(default_factory=lambda: np.zeros(2))
-    away_at: np.datetime64 = _NEVER
+    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of offsets from `since` on.
+    away: Floats = field(default_factory=lambda: np.zeros(2))  #: Decayed sum and number of offsets off the map.
+    away_at: np.datetime64 = _NEVER  #: Time of the last offset in `away`.
 
 
 def off_map_epochs(
@@ -41,11 +41,11 @@ def off_map_epochs(
     """Return the epochs at which the train is off the map, shape (T,), and the state for the next chunk.
 
     The train leaves the map once all positions of the last `least_s` are off the map; a single position can be off the
-    map by reflected signals. The train returns once all positions of that time are on the map, and their mean offset is
-    within a metre or half of the earlier offset. On an unmapped track beside the line, single positions fit the map by
-    chance. The first position of a log decides alone. `on_map` and `off_map` mark positions that fit the ranges, and
-    that contradict them; `offset_m` is the offset of 3-D positions to the right of the line, NaN if unknown; shapes
-    (T,).
+    map by reflected signals. The train returns once all positions of the same length of time are on the map, and their
+    mean offset is at most a metre or half of the mean offset off the map; on an unmapped track beside the line, single
+    positions fit the map by chance. The first position of a log decides alone. `on_map` and `off_map` mark epochs whose
+    ranges fit the map, and epochs whose ranges contradict it; `offset_m` is the offset of 3-D positions to the right of
+    the line, NaN if unknown; shapes (T,).
     """
     off, known, since, back = state.off, state.known, state.since, state.back
     away, away_at = state.away, state.away_at

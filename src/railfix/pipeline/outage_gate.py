@@ -12,7 +12,7 @@ from railfix.core.timescale import seconds
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.tracking import Line
 
-#: Time without codes after which the position counts as dead-reckoned [s].
+#: Time without codes after which the filter's position counts as dead-reckoned [s].
 _OUTAGE_S: Final = 2.0
 #: Number of positions that must agree before codes are used again.
 _AGREEING: Final = 3
@@ -28,9 +28,8 @@ class ReturnState:
     """State of the gate after a chunk."""
 
     time: np.datetime64 = _NEVER  #: Last epoch whose codes were used; NaT before the first.
-    #: Dead-reckoned position at the last epoch and its standard deviation; NaN without a sensor distance.
-    place_m: float = float("nan")
-    sigma_m: float = float("nan")
+    place_m: float = float("nan")  #: Dead-reckoned position at the last epoch; NaN without a sensor distance.
+    sigma_m: float = float("nan")  #: Standard deviation of the filter position from which dead reckoning started.
     distance_m: float = 0.0  #: Sensor distance since the filter's last position.
     returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without an outage.
     agreeing: int = 0  #: Number of consecutive positions that have agreed since `returned`.

@@ -26,19 +26,17 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Changes of the body's heading and pitch, wheel distances and speeds at K ticks."""
 
-    #: Times of validity, and times at which the rates became known; shape (K,).
-    time: Datetimes
-    known: Datetimes
-    distance_m: Floats  #: Wheel distance since the tick before the first, in rising arc length; shape (K,).
+    time: Datetimes  #: Times at which the rates are valid, shape (K,).
+    known: Datetimes  #: Times at which the rates became known, shape (K,).
+    distance_m: Floats  #: Wheel distance since the tick before the first tick, in rising arc length; shape (K,).
     arc_m: Floats  #: Antenna position by dead reckoning with the wheel, shape (K,); NaN if unknown.
-    #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
-    turned_rad: Floats
-    climbed_rad: Floats
+    turned_rad: Floats  #: Change of heading since the previous tick, positive to the right; shape (K,).
+    climbed_rad: Floats  #: Change of pitch since the previous tick, positive with the nose up; shape (K,).
     speed_mps: Floats  #: Speed in rising arc length, shape (K,).
-    rolls: Masks  #: True where the wheel rolls, shape (K,).
+    rolls: Masks  #: True where the wheel rolls without slip, shape (K,).
 
     def arc_at(self, time: Datetimes) -> Floats:
-        """Return positions at times after the first tick, from the preceding tick [m]."""
+        """Return antenna positions at times after the first tick, extrapolated from the preceding tick [m]."""
         last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
         since = seconds(time - self.time[last])
         return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
@@ -61,11 +59,12 @@ class FeatureState:
 
 
 class PassedFeature(NamedTuple):
-    """Position by a feature that the train has passed."""
+    """Position measured by a feature that the train has passed."""
 
     tick: int  #: Index of the tick after which the feature was passed.
-    correction_m: float  #: Position less wheel position.
-    sigma_m: float  #: Standard deviation of the position, errors of the map and of the body on its bogies included.
+    correction_m: float  #: Measured position minus wheel position.
+    #: Standard deviation of the position, including errors of the map and of the body's position on the bogies.
+    sigma_m: float
 
 
 class FeatureSearch(Protocol):

@@ -122,7 +122,7 @@ def position_stage(
 
 
 def _with_protection_level(checked: CheckedPositions, config: Config) -> RaimResult:
-    """Return RAIM's result with its protection level, NaN where an unidentified fault remains, if the level is on."""
+    """Return the result of RAIM; if it is on, with RAIM's protection level, NaN where an unidentified fault remains."""
     raim = checked.raim
     if "raim" not in config.screens or config.raim_protection != "on":
         return raim
@@ -245,10 +245,10 @@ def _status(
     failed: tuple[Masks, Masks, Masks],
     config: Config,
 ) -> Codes:
-    """Return the status of each epoch, shape (T,), by the most serious condition that is true.
+    """Return the status of each epoch, shape (T,), by the most serious condition that applies.
 
-    `counts` has the numbers of used and of redundant ranges; `failed` marks ranges that contradict the map,
-    inconsistent ranges, and other possible positions; shape (T,) each.
+    `counts` has the numbers of used and of redundant ranges; `failed` has three masks: the ranges contradict the map,
+    the ranges are inconsistent, other positions are possible. The shapes are (T,).
     """
     off_map, inconsistent, open_elsewhere = failed
     (n_used, redundancy), constrained, section = counts, solution.fix.constrained, solution.fix.section

@@ -78,8 +78,8 @@ class EpochProcessor:
     trajectories : mapping of str to Trajectory
         Trajectories of the antennas "front", "rear", or both.
     navigation : Navigation, optional
-        Navigation records known from the start; others may be given with each chunk. Without any, the first chunk must
-        have some, otherwise `process` raises.
+        Navigation records known from the start; others may be given with each chunk. Without records here, the first
+        chunk must have some; otherwise `process` raises `SettingsError`.
     corrections : MessageCorrections, optional
         SBAS corrections (`railfix.ranges.sbas.SbasState`) from the messages known from the start, required if and only
         if ``config.sbas`` requests SBAS. Further messages may be given with each chunk.
@@ -123,7 +123,7 @@ class EpochProcessor:
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not (isinstance(trajectories, Mapping) and trajectories):
-            raise SettingsError("trajectories must name one for each antenna, at least one: {'front': trajectory}")
+            raise SettingsError("trajectories: pass one for each antenna, and at least one: {'front': trajectory}")
         if unknown := sorted(set(trajectories) - {"front", "rear"}, key=str):
             raise SettingsError(f"trajectories: unknown antenna {unknown[0]!r}; the antennas are front and rear")
         models, stations = models or Models(), stations or Stations()
@@ -156,7 +156,7 @@ class EpochProcessor:
         self._error_model, self._support = models.error_model, models.support
         self._base = None if stations.base_ecef_m is None else BaseStation(config, stations.base_ecef_m)
         if taken := [s.name for s in screens if s.name in SCREEN_NAMES]:
-            raise ValueError(f"there is a screen {taken[0]} already; give it another name")
+            raise ValueError(f"a screen named {taken[0]} exists already; give the additional screen another name")
         chosen = (*(s for s in SCREENS if s.name in config.screens), *screens)
         self.screens = tuple((s, getattr(config, s.name, s.limits)) for s in in_order(chosen))
         kinds = ObservationScreen, PairScreen, PositionScreen
@@ -225,7 +225,7 @@ class EpochProcessor:
         Parameters
         ----------
         observations : mapping of str to Observations
-            By antenna; each antenna keeps its own epochs.
+            Observations by antenna; the antennas may have different epochs.
         state : State, optional
             State after the previous chunk; None at the start of a log.
         navigation : Navigation, optional
@@ -244,7 +244,7 @@ class EpochProcessor:
         ValueError
             The epochs of an antenna are not in ascending order, or do not begin after the end of `state`.
         SettingsError
-            As for the class, or an antenna has no trajectory, or no navigation records were given.
+            A condition of the class applies, an antenna has no trajectory, or no navigation records were given.
         """
         if navigation is None and state is None and not self._navigation_given:
             raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")
@@ -268,11 +268,11 @@ class EpochProcessor:
     ) -> tuple[Chunk, State]:
         """Return the ranges of one chunk after the screens, as the first part of `process`, with the same parameters.
 
-        Each part uses and replaces its own members of the state, so that the parts of successive chunks can be computed
-        at the same time, each with its own state.
+        The parts of `process` use and replace different members of the state. Different parts can therefore process
+        successive chunks at the same time, if each part keeps a state of its own.
         """
         if not (isinstance(observations, Mapping) and observations):
-            raise SettingsError("observations are one log for each antenna, at least one: {'front': log}")
+            raise SettingsError("observations: pass one log for each antenna, and at least one: {'front': log}")
         if unknown := sorted(set(observations) - set(self.trajectories)):
             raise SettingsError(f"no trajectory for antenna {', '.join(unknown)}")
         state = State() if state is None else state
@@ -371,7 +371,7 @@ class EpochProcessor:
     def _filter_antennas(
         self, chunk: Chunk, state: State
     ) -> dict[str, tuple[AlongTrack, tuple[Replay, ...], FilterState]]:
-        """Return the filtered positions by antenna, the filter's input, and its states.
+        """Return, for each antenna, the filtered positions, the filter's input, and the filter's new state.
 
         Two antennas are filtered in two threads.
         """
@@ -421,5 +421,5 @@ def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> No
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")
     if before is not None and len(time) and time[0] <= before.ended:
         raise ValueError(
-            f"{name}: the chunk begins at {time[0]}, not after {before.ended} as the state before it ended"
+            f"{name}: the chunk begins at {time[0]}, not after {before.ended}, the last epoch of the given state"
         )

@@ -38,7 +38,7 @@ class RangeErrorModel(Protocol):
         """Return the overbounding sigma and bias of observations, shape (T, K) [m]; NaN without a value."""
 
     def missing_parts(self) -> tuple[str, ...]:
-        """Return one sentence for each part that the file of an earlier version lacks."""
+        """Return one sentence for each part that is missing because an earlier version of railfix wrote the file."""
 
 
 class Models(NamedTuple):
@@ -90,7 +90,7 @@ def fit_ranges(corrected: CorrectedRanges) -> Ranges:
 
 
 def reject(corrected: CorrectedRanges, mask: Masks, reason: Reason) -> CorrectedRanges:
-    """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
+    """Return the ranges with a rejection reason added to observed channels where `mask`, shape (T, K), is true."""
     if not mask.any():
         return corrected
     hit = mask & ((corrected.reason & int(Reason.NOT_OBSERVED)) == 0)
@@ -123,7 +123,7 @@ def _apply_error_model(
 
 
 def error_model_notes(model: RangeErrorModel | None, config: Config) -> tuple[str, ...]:
-    """Return sentences on an error model whose conditions differ from the run's, or that lacks a part."""
+    """Return sentences on differences between the error model's conditions and the run's, and on missing parts."""
     if model is None:
         return ()
     notes, own = model.missing_parts(), collect_conditions(config)
@@ -133,7 +133,7 @@ def error_model_notes(model: RangeErrorModel | None, config: Config) -> tuple[st
 
 
 def collect_conditions(config: Config) -> Conditions:
-    """Collect the settings that affect range errors, which are the conditions of an error model fitted to the run."""
+    """Collect the settings that affect range errors; an error model fitted to the run stores them as conditions."""
     return Conditions(
         systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
         screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,

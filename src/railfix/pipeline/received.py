@@ -126,7 +126,7 @@ def known_from_start(
 
 
 def check_corrections(config: Config, corrections: MessageCorrections | None) -> None:
-    """Raise SettingsError if corrections were given, but not requested, or the reverse, or for other frequencies."""
+    """Raise SettingsError if SBAS is requested without corrections, or the reverse, or if the frequencies differ."""
     if bool(config.sbas) != (corrections is not None):
         given, state = "not given" if corrections is None else "given", "on" if config.sbas else "off"
         raise SettingsError(
@@ -135,7 +135,7 @@ def check_corrections(config: Config, corrections: MessageCorrections | None) ->
         )
     if corrections is not None and corrections.dual_frequency != config.dual_frequency_sbas:
         used = "L5" if corrections.dual_frequency else "L1"
-        raise SettingsError(f"sbas_band = {config.sbas_band}, but the corrections are of SBAS on {used}; give the same")
+        raise SettingsError(f"sbas_band = {config.sbas_band}, but the corrections are for SBAS on {used}; use the same")
 
 
 def receive(
@@ -151,8 +151,8 @@ def receive(
     `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped, and
     so are repeated and expired records, except for a satellite's newest record. Newer coefficients and precise
     ephemerides replace the older ones. With SBAS, every satellite is rejected until its corrections are complete. Raise
-    SettingsError if SBAS is combined with precise ephemerides, if the messages are of another kind than the
-    corrections, or if there are no corrections.
+    SettingsError if SBAS is combined with precise ephemerides, if the messages do not match the corrections, or if
+    there are no corrections.
     """
     if navigation is None and messages is None:
         return before
@@ -175,7 +175,7 @@ def _with_notes(received: Received, config: Config) -> Received:
     """Return the data with the ionospheric coefficients in use and notes on replacements of requested data."""
     corrections = received.corrections
     if corrections is not None and received.navigation.precise is not None:
-        raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
+        raise SettingsError("SBAS corrects broadcast records, not precise orbits; use either --sbas or --sp3")
     received = _with_ionosphere(received, config)
     return received if corrections is None else replace(received, notes=(*received.notes, *corrections.notes))
 
@@ -225,9 +225,9 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 
 
 def _with_ionosphere(received: Received, config: Config) -> Received:
-    """Return the data with the Klobuchar coefficients in use, and notes if others were requested."""
+    """Return the data with the Klobuchar coefficients in use, and notes if other models were requested."""
     if received.corrections is not None and received.corrections.dual_frequency:
-        # the model helps the screens, and cancels in the combination
+        # the Klobuchar model stays on for the screens; it cancels in the ionosphere-free combination
         modelled = _with_ionosphere(replace(received, corrections=None), config)
         note = (
             f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} requested, ionosphere-free codes used "

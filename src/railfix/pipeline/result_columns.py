@@ -30,7 +30,7 @@ from railfix.screens import SCREENS, ScreenColumn
 from railfix.tracking import Kind
 
 Source = TypeVar("Source")
-#: Unit by the last part of a name.
+#: Unit of a column by the last part of the column's name.
 UNITS: Final[Mapping[str, str]] = {
     "m": "m", "mm": "mm", "mps": "m/s", "mps2": "m/s^2", "deg": "deg", "dbhz": "dB-Hz", "permille": "permille",
     "1pm": "1/m", "s": "s", "db": "dB",
@@ -47,11 +47,11 @@ class Column(Generic[Source]):
     name: str  #: Name, ending with the unit if there is one: ``along_sigma_m``.
     meaning: str
     #: Path of the values in the source of a table (``raim.statistic``), by default the name; or a function of the
-    #: source, or None if the source lacks them. The values are an array with epochs on axis 0, or one value for all
-    #: rows; words are given by number.
+    #: source, or None if the source lacks the values. The values are an array with epochs on axis 0, or one value for
+    #: all rows; values of a column with `words` are indices of words.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
-    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words by number.
+    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words that the values stand for, by index.
 
     @property
     def unit(self) -> str:
@@ -102,7 +102,7 @@ def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
 
 
 def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
-    """Return columns of floats with the same meaning and separate values."""
+    """Return float columns that share one meaning, each with values of its own."""
     return (Column(name, meaning, source) for name, source in values.items())
 
 
@@ -199,8 +199,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
-            "P4's level: error caused by a fault that RAIM misses, plus noise; infinite if a satellite is unchecked, "
-            "empty if a fault remains",
+            "protection level of P4: error caused by a fault that RAIM misses, plus noise; infinite if a satellite is "
+            "unchecked, empty if a fault remains",
             "raim.protection_level_m",
         ),
         Column(
@@ -217,35 +217,35 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_level_m",
-            "level that the error along the line exceeds with the stated risk; infinite for the reason given by "
+            "bound that the error along the line exceeds only with the stated risk; infinite for the reason given by "
             "`protection_cause`, empty where a fault remains",
             "protection.level.level_m",
         ),
         Column(
             "protection_fault_free_m",
-            "level for noise alone, with its part of the risk; may exceed `protection_level_m`",
+            "protection level for noise alone, with the part of the risk for noise; may exceed `protection_level_m`",
             "protection.level.fault_free_m",
         ),
         *of_one_meaning(
-            "level for faults of one satellite, and of two satellites; 0 where such faults are less probable "
-            "than their part of the risk",
+            "protection level for faults of one satellite, and of two satellites; 0 where these faults are less "
+            "probable than the part of the risk for them",
             protection_one_fault_m="protection.level.one_fault_m",
             protection_two_faults_m="protection.level.two_fault_m",
         ),
         *of_one_meaning(
-            "factor K of the level for no, one and two faults",
+            "factor K of the protection level for no, one and two faults",
             protection_k_fault_free="protection.level.k_fault_free",
             protection_k_one_fault="protection.level.k_one_fault",
             protection_k_two_faults="protection.level.k_two_faults",
         ),
         Column(
             "protection_separation",
-            "largest ratio of a hypothesis: distance of its position over the threshold of the distance",
+            "largest ratio, over all fault hypotheses, of the separation of the position to the threshold",
             "protection.level.separation",
         ),
         Column(
             "protection_kind",
-            "basis: `sbas` with local faults, or `separation`, with satellite faults as well",
+            "fault hypotheses of the level: `sbas`, local faults only; `separation`, satellite faults as well",
             "protection.kind",
             words=KINDS,
         ),
@@ -279,12 +279,12 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "araim_horizontal_m",
-            "horizontal ARAIM level of a 3-D position from these ranges, without the map",
+            "horizontal ARAIM level of the 3-D position from the same ranges, without the map",
             "araim.horizontal_m",
         ),
         Column(
             "araim_vertical_m",
-            "vertical ARAIM level of the same 3-D position",
+            "vertical ARAIM level of the 3-D position from the same ranges, without the map",
             lambda r: None if r.araim is None else r.araim.space.level_m[:, 2],
         ),
         *_screen_columns("positions", _get_screened),
@@ -355,7 +355,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column("elevation_deg", "elevation of the satellite", "result.elevation_deg"),
         Column("azimuth_deg", "azimuth of the satellite, from north over east", "result.azimuth_deg"),
         Column("cn0_dbhz", "carrier-to-noise density", "result.cn0_dbhz"),
-        Column("sigma_m", "standard deviation that the weights assume", "result.sigma_m"),
+        Column("sigma_m", "standard deviation of the pseudorange, as the weights assume", "result.sigma_m"),
         Column(
             "corrected_code_m",
             "pseudorange corrected for satellite clock, group delay and atmosphere",
@@ -370,12 +370,12 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "ionosphere_measured_m",
-            "two frequencies: measured ionospheric delay on the first signal, less the delay of the model",
+            "two frequencies: measured ionospheric delay on the first signal, minus the delay of the model",
             lambda o: _second(o, lambda r, _: r.ionosphere_m),
         ),
         Column(
             "metric_two_frequencies_m",
-            "two frequencies: second code less first code and predicted difference, which leaves multipath and noise",
+            "two frequencies: second code minus first code, minus the predicted difference; multipath and noise remain",
             lambda o: _second(o, lambda r, _: r.difference_m),
         ),
         Column(
@@ -391,12 +391,12 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "innovation_code_m",
-            "filter along the track: code less its prediction from earlier epochs, where codes are used (once a "
+            "filter along the track: code minus the code predicted from earlier epochs, where codes are used (once per "
             "second)",
             lambda o: o.innovation(Kind.CODE),
         ),
         *of_one_meaning(
-            "innovation of the carrier phase's change, and of the Doppler",
+            "filter along the track: innovation of the carrier-phase change, and of the Doppler",
             innovation_phase_m=lambda o: o.innovation(Kind.PHASE),
             innovation_doppler_mps=lambda o: o.innovation(Kind.DOPPLER),
         ),

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
-    """Return one row per epoch of one antenna, also without a position: `POSITION_COLUMNS`."""
+    """Return `POSITION_COLUMNS` of one antenna, one row per epoch, also without a position."""
     return make_table(POSITION_COLUMNS, result, len(result.time), antenna=name)
 
 
@@ -56,14 +56,14 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return one row per epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
+    """Return `POSITION_COLUMNS`, one row per epoch and antenna, in order of time, then of the antennas as given."""
     check_type(result, Result, "result")
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
 
 def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack | None = None) -> pl.DataFrame:
-    """Return one row per epoch and observed channel of one antenna: `OBSERVATION_COLUMNS`."""
+    """Return `OBSERVATION_COLUMNS` of one antenna, one row per epoch and observed channel."""
     source = Observed(result, tracked)
     epoch, channel = np.nonzero((result.reason & Reason.NOT_OBSERVED) == 0)
     reasons, inverse = np.unique(result.reason[epoch, channel], return_inverse=True)
@@ -83,7 +83,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def observations_table(result: Result) -> pl.DataFrame:
-    """Return one row per epoch, antenna and observed channel, in this order: `OBSERVATION_COLUMNS`."""
+    """Return `OBSERVATION_COLUMNS`, one row per epoch, antenna and observed channel, sorted in this order."""
     check_type(result, Result, "result")
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
@@ -111,9 +111,9 @@ def to_xarray(
     Returns
     -------
     xarray.Dataset
-        Every column of `POSITION_COLUMNS` over ``time``, with `tracked` those of `TRAIN_COLUMNS` as ``filter_...``, and
-        of `CHANNEL_COLUMNS` over ``time`` and ``channel``, each with its ``units`` and meaning (``long_name``); the
-        positions also as ``ecef_m`` and ``conventional_ecef_m`` over ``xyz`` and along the trajectory (``arc_m``).
+        Variables over ``time`` for `POSITION_COLUMNS` and, with `tracked`, for `TRAIN_COLUMNS` (``filter_...``);
+        variables over ``time`` and ``channel`` for `CHANNEL_COLUMNS`. Each has ``units`` and a ``long_name``. Positions
+        are also in ``ecef_m`` and ``conventional_ecef_m`` over ``xyz``, and in ``arc_m`` along the trajectory.
         ``satellite`` and ``signal`` are coordinates of ``channel``.
     """
     import xarray as xr
@@ -196,17 +196,17 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "number of possible positions", "tracked.hypotheses", dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "level that the error along the line exceeds with the stated risk; infinite where another position is "
+            "bound that the error along the line exceeds only with the stated risk; infinite where another position is "
             "more probable than the risk, or measurements contradict the position",
             "tracked.level_m",
         ),
         Column(
             "protection_level_ground_m",
-            "level of the straight distance on the ground, also on another lap or off the map",
+            "protection level of the straight distance to the train, valid also on another lap or off the map",
             "tracked.ground_level_m",
         ),
-        Column("protection_noise_m", "part of the level for noise without a fault", "tracked.level_noise_m"),
-        Column("protection_separation_m", "largest separation of a sub-filter of the level", "tracked.separation_m"),
+        Column("protection_noise_m", "part of the protection level for noise without a fault", "tracked.level_noise_m"),
+        Column("protection_separation_m", "largest separation of a sub-filter", "tracked.separation_m"),
         Column(
             "protection_unchecked",
             "probability of faults that the level does not bound: a fault of the only constellation in view",
@@ -215,7 +215,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column(
             "over_reading_m",
             "largest distance of the train behind the position: the level, at least 2 % of the distance since codes "
-            "were used (`L_DOUBTOVER` less `Q_LOCACC`)",
+            "were used (`L_DOUBTOVER` minus `Q_LOCACC`)",
             "tracked.amount_m",
         ),
         Column("under_reading_m", "largest distance of the train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
@@ -239,17 +239,17 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "tracked.code_weight",
         ),
         Column("motion_weight", "mean weight of Dopplers and phases", "tracked.motion_weight"),
-        Column("wheel_scale", "estimated scale-factor error, positive for too short a distance", "tracked.wheel_scale"),
-        Column("radar_scale", "estimated scale-factor error, positive for too short a distance", "tracked.radar_scale"),
+        Column("wheel_scale", "scale-factor error, positive if wheel distances are too short", "tracked.wheel_scale"),
+        Column("radar_scale", "scale-factor error, positive if radar distances are too short", "tracked.radar_scale"),
         Column("force_offset_mps2", "estimated offset of the accelerometer", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
-            "factor on the map's length error of 0.03 m per root metre; above 1 if pseudoranges contradict it",
+            "factor on the map's length error of 0.03 m per root metre; above 1 if pseudoranges contradict this error",
             "tracked.map_scale",
         ),
         Column(
             "measured_chainage_m",
-            "chainage of the vehicle's middle, or of the antenna, for the means of the next three columns",
+            "chainage of the vehicle's middle, or of the antenna, to which the next three columns refer",
             "sensed.under_m",
         ),
         Column(
@@ -265,24 +265,24 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "measured_cant_mm",
-            "cant at `measured_chainage_m` from the roll of the body, positive if the left rail is higher; needs a "
-            "vehicle file",
+            "cant at `measured_chainage_m` from the roll of the body, positive if the left rail is higher; empty "
+            "without a vehicle file",
             lambda r: 1e3 * r.sensed.cant_m,
         ),
         Column(
             "metric_antenna_spacing_m",
-            "distance between the two positions less the antenna spacing; empty for one antenna",
+            "distance between the positions of the two antennas minus the antenna spacing; empty for one antenna",
             "spacing_error_m",
         ),
         Column(
             "wheel_difference_m",
-            "satellite distance over the last two minutes less wheel distance",
+            "distance over the last two minutes by satellites minus the distance by the wheel",
             "wheel.difference_m",
         ),
         *(
             Column(
                 f"innovation_{kind.name.lower()}_{unit}",
-                f"measured less predicted: {what}",
+                f"measured minus predicted: {what}",
                 partial(_innovation, kind=kind),
             )
             for kind, unit, what in (
@@ -311,11 +311,11 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
     (
         Column(
             "smoothed_chainage_m",
-            "distance along the line from all measurements before and after",
+            "smoothed chainage, from all measurements before and after the epoch",
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
         Column("smoothed_sigma_m", "standard deviation of the smoothed chainage", "track.sigma_m"),
-        Column("smoothed_speed_mps", "speed along the line from all measurements before and after", "track.speed_mps"),
+        Column("smoothed_speed_mps", "speed along the line, from measurements before and after", "track.speed_mps"),
     )
 )
 
@@ -355,7 +355,7 @@ _TIME: Final = pl.Datetime("ns")
 
 
 def _getter(name: str) -> Any:
-    """Return a function that collects one field of passings in an array."""
+    """Return a function that collects one field of all passings in an array."""
     return lambda passings: np.array([getattr(passing, name) for passing in passings])
 
 
@@ -364,9 +364,9 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
         Column("time_gpst", "time of the passing from the filter, or time of a contradicting reading", _getter("time"),
                dtype=_TIME),
-        Column("earliest_gpst", "earliest time of the passing that the level allows",
+        Column("earliest_gpst", "earliest time of the passing that the protection level allows",
                _getter("earliest"), dtype=_TIME),
-        Column("latest_gpst", "latest time of the passing that the level allows", _getter("latest"), dtype=_TIME),
+        Column("latest_gpst", "latest time that the protection level allows", _getter("latest"), dtype=_TIME),
         EPOCH[1],
         Column("balise", "name in the list, or identity that was read", _getter("balise"), dtype=pl.String()),
         Column(
@@ -377,13 +377,13 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         ),
         Column("chainage_m", "chainage in the list", _getter("chainage_m")),
         Column("read_gpst", "time of the reading", _getter("read"), dtype=_TIME),
-        Column("read_error_m", "for a contradicting reading, listed chainage less the filter's",
+        Column("read_error_m", "for a contradicting reading, listed position minus the filter's position",
                _getter("read_error_m")),
         Column("speed_mps", "speed at the passing, + toward rising chainage", _getter("speed_mps")),
         Column("protection_level_m", "protection level of the position at the passing", _getter("level_m")),
-        Column("doubt_over_m", "largest distance of the train behind the position: `L_DOUBTOVER` less `Q_LOCACC`",
+        Column("doubt_over_m", "largest distance of the train behind the position: `L_DOUBTOVER` minus `Q_LOCACC`",
                _getter("amount_m")),
-        Column("doubt_under_m", "largest distance of the train ahead: `L_DOUBTUNDER` less `Q_LOCACC`",
+        Column("doubt_under_m", "largest distance of the train ahead: `L_DOUBTUNDER` minus `Q_LOCACC`",
                _getter("amount_m")),
         Column("odometer_m", "for comparison: 5 m plus 5 % of the distance since the last balise read (SUBSET-041)",
                _getter("odometer_m")),

@@ -28,7 +28,7 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(Solution, LineCoordinates, NotebookTable):
-    """Results of one antenna at T epochs: positions, without positions that the status drops, and intermediate results.
+    """Results of one antenna at T epochs: positions, except those that the status drops, and intermediate results.
 
     Range arrays have the K channels that the settings allow (`corrected`). Properties have all M channels of the
     observations; these are the channels of all antennas if observations of several antennas are given together.
@@ -167,7 +167,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Config) -> dict[str, AntennaResult]:
     """Return the single-epoch results by antenna, without coordinates that the final status drops.
 
-    The filter along the track, if on, adds the sign of interference by the wheel.
+    If the filter along the track is on, its comparison of satellite with wheel distances adds a sign of interference.
     """
     results = {}
     for k, (name, rows) in enumerate(chunk.rows.items()):
@@ -195,7 +195,7 @@ def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Conf
 
 
 def add_wheel_sign(solution: Solution, interference: Interference, wheel: WheelSigns) -> tuple[Solution, Interference]:
-    """Return positions and interference, with the wheel sign where satellite and wheel distances differ."""
+    """Return positions and interference, with a sign of interference where satellite and wheel distances differ."""
     causes = np.where(wheel.parted, interference.causes | int(Sign.WHEEL_PARTS), interference.causes)
     interference = replace(interference, causes=causes)
     status = with_statuses(solution.status, [interference.suspicion])
@@ -225,7 +225,7 @@ class Result(NotebookTable):
             if observed.any() and not np.isfinite(result.point.ecef_m).any():
                 lost = (result.reason & (Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD)) != 0
                 cause = (
-                    "no navigation record is valid at the time of the log; is it of another day?"
+                    "no navigation record is valid at the time of the log; are the records of another day?"
                     if lost.any()
                     else "see its reasons"
                 )

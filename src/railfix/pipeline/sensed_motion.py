@@ -35,7 +35,7 @@ from railfix.motion.tachometer import (
 from railfix.pipeline.passed_features import SLOWEST_MPS, RateSeries
 from railfix.track.trajectory import Trajectory
 
-#: Sample spacing of the slip detection; samples are at its multiples in GPS time [ns].
+#: Sample spacing of the slip detection [ns]; samples are at multiples of this spacing in GPS time.
 _TICK_NS: Final = 20_000_000
 #: Averaging time of wheel accelerations and inertial means [ns].
 _MEAN_NS: Final = 200_000_000
@@ -65,32 +65,32 @@ _RANK: Final = np.array(
 
 @dataclass(frozen=True, kw_only=True)
 class SensedMotion:
-    """Motion of T intervals between epochs; forward is the vehicle's direction."""
+    """Motion in T intervals between epochs; forward is the direction in which the vehicle's front points."""
 
     state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
     distance_m: Floats  #: Forward distance by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
     doubt_mps: Floats  #: Largest slip speed of a slip not yet detected, shape (T,).
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Properties of the line under the body, toward rising arc length (P2 2.3): gradient from wheel and accelerometer
-    #: (an offset of 0.01 m/s2 causes an error of 0.001); curvature from the yaw rate, positive to the right; cant over
-    #: the wheels' contact points from the roll of the body, positive with the left rail higher; and chainage of the
-    #: body's middle. They are NaN unless the wheel rolls without slip and faster than `SLOWEST_MPS`; cant is also NaN
-    #: without a vehicle; shape (T,).
+    #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an offset of
+    #: 0.01 m/s2 causes an error of 0.001. This and the next three are NaN unless the wheel rolls without slip and
+    #: faster than `SLOWEST_MPS`; shape (T,) each.
     gradient: Floats
-    curvature_1pm: Floats
-    cant_m: Floats
-    under_m: Floats
+    curvature_1pm: Floats  #: Curvature from the yaw rate, positive to the right toward rising arc length.
+    cant_m: (
+        Floats  #: Cant over the wheels' contact points, from roll, left rail higher positive; NaN without a vehicle.
+    )
+    under_m: Floats  #: Chainage of the body's middle.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensedState:
     """State of the sensed motion after a chunk."""
 
-    tick: int = 0  #: Number of the last sample since the start of GPS time; 0 before the first.
+    tick: int = 0  #: Time tag of the last sample (`time`) in units of `_TICK_NS`; 0 before the first sample.
     #: Antenna position at that sample, by dead reckoning with the wheel from the last filter position; NaN if unknown.
     arc_m: float = float("nan")
-    sigma_m: float = float("nan")  #: Standard deviation of the filter's last position.
+    sigma_m: float = float("nan")  #: Standard deviation of that filter position.
     slip: SlipState | None = None
 
     @property
@@ -147,8 +147,8 @@ def sensed_motion(
     distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
-    # the speed by pulses refers to the middle of their interval: a delay of 0.065 s, or 0.2 m after a slip of 3 s at 1
-    # m/s2
+    # the speed by pulses refers to the middle of the pulse interval: without `ago`, a delay of 0.065 s, or 0.2 m after
+    # a slip of 3 s at 1 m/s2
     ago = seconds(when - speed.time)
     found, slip = find_slips(
         MotionSamples(
@@ -168,7 +168,7 @@ def sensed_motion(
     doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
     turned, rolls = heading_rate_radps(force, rates, known_speed), found.state == MotionState.NORMAL
-    # mean rates refer to the middle of their interval
+    # mean rates refer to the middle of the averaging interval
     middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
     passed = distance_m(
         pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer

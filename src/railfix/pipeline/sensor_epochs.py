@@ -30,18 +30,18 @@ from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedS
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import RangeEpochs, SensorEpochs
 
-#: Longest interval between epochs with a distance or a mean force [s].
+#: Longest interval between epochs for which a distance or a mean force is computed [s].
 _LONGEST_S: Final = 5.0
 #: Minimum fraction of finite samples for the mean of an interval.
 _COMPLETE: Final = 0.9
 #: Standard deviation of the inertial speed during a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
-#: Standard deviations of gradient and curvature [1/m] over one metre of distance: pitch oscillations of the body of 1
-#: mrad, and oscillations of its heading.
+#: Standard deviation of the gradient over one metre of distance: pitch oscillations of the body of 1 mrad.
 _GRADIENT_NOISE: Final = 1e-3
+#: Standard deviation of the curvature over one metre, due to oscillations of the body's heading [1/m].
 _CURVATURE_NOISE_1PM: Final = 1e-4
-#: Correlation length of map errors, as `railfix.kernels.tracking.constants.MAP_CORRELATION_M` [m]. With map errors of
-#: 0.3 m, features are located to some metres at best; with 0.05 m, to half a metre.
+#: Correlation length of map errors [m], as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`. With map errors of
+#: 0.3 m, features are located to some metres at best; with map errors of 0.05 m, to half a metre.
 _MAP_LENGTH_M: Final = 50.0
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
@@ -56,8 +56,8 @@ class LineReferences:
     balises: ListedBalises | None = None
 
 
-#: Minimum standard deviation of a two-way range [m]: 0.19 to 0.24 m (P2 3.3), increased for echoes and for drifts of
-#: the unit's reply delay.
+#: Minimum standard deviation of a two-way range [m]: the 0.19 to 0.24 m of P2 3.3, increased because of echoes and
+#: drifts of the unit's reply delay.
 _RANGE_SIGMA_M: Final = 0.5
 _RADAR_SIGMA_MPS: Final = 0.1
 
@@ -106,7 +106,7 @@ class SensorState:
 
 
 def with_samples(state: SensorState, samples: SensorSamples | None) -> SensorState:
-    """Return the state with samples for the next epoch."""
+    """Return the state with samples added for the next epoch."""
     return replace(state, samples=state.samples.merge(samples)) if samples else state
 
 
@@ -132,10 +132,10 @@ def sensor_epochs(
     """Return distances and forces between the epochs, the combined motion of wheel and inertial unit, and the new
     state.
 
-    `samples` are those since the previous chunk, `time` has the antenna's epochs, shape (T,). The trajectory determines
-    the direction of the front; `sine_at` returns the sine of the gradient at arc lengths (None if the line is unknown).
-    `sources` has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and `range`; `references` has
-    features of the line, ground units and listed balises.
+    `samples` has the samples since the previous chunk; `time` has the antenna's epochs, shape (T,). The trajectory
+    determines the direction of the front; `sine_at` returns the sine of the gradient at arc lengths (None if the line
+    is unknown). `sources` has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and `range`;
+    `references` has features of the line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -252,7 +252,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def _places(passed: Iterable[PassedFeature], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
-    """Return the antenna positions from passed features, at the first epoch after each."""
+    """Return the antenna positions from passed features, at the first epoch after each passing."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
     for feature in passed:
@@ -262,7 +262,7 @@ def _places(passed: Iterable[PassedFeature], rates: RateSeries, time: Datetimes)
 
 
 def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
-    """Return the ranging unit's position relative to the antenna: along, right of and above its path (3,) [m]."""
+    """Return the ranging unit's position relative to the antenna: along, right of and above the path (3,) [m]."""
     facing = trajectory.front_sign
     along = facing * limits.range_ahead_m - ahead_m(trajectory)
     return np.array([along, facing * limits.range_right_m, limits.range_above_m])
@@ -311,7 +311,7 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return the mask of intervals that a sensor's samples do not cover to the end: the last interval, or none."""
+    """Return a mask of intervals, true for the last interval if a sensor's samples do not cover it to the end."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 

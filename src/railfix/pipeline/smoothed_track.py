@@ -1,4 +1,4 @@
-"""Smoothed positions of a run: the filter is repeated over its stored input, then processed backward."""
+"""Smoothed positions of a run: the filter runs again over the stored input, and its results are processed backward."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from railfix.tracking import (
     track,
 )
 
-#: Largest number of epochs whose covariances are in memory together.
+#: Largest number of epochs whose covariances are in memory at the same time.
 _EPOCHS: Final = 300
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
-    """Return the smoothed positions of all epochs from the filter's input, given in reverse order of time."""
+    """Return the smoothed positions of all epochs; `backward` has the filter's input in reverse order of time."""
     parts: list[SmoothedTrack] = []
     later: BackwardInformation | None = None
     for replay in backward:
@@ -43,7 +43,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
-    """Split filter input into short pieces, with the states before them; input with sensors is short already."""
+    """Split filter input into short pieces, each with the state before it; input with sensors is short already."""
     size = len(replay.epochs)
     sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
     if size <= _EPOCHS or sensed:

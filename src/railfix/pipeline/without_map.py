@@ -100,7 +100,7 @@ _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OT
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track: the codes give the approximate position.
+    """Return corrected ranges of one antenna without a track, with an approximate position from the codes.
 
     The ranges are corrected by the delay models and by a received base station, not by SBAS.
     """
@@ -215,9 +215,10 @@ def _below(ranges: Ranges) -> Floats:
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True) * _EARTH_RADIUS_M)
 
 
-#: Longest step with range changes, in survey intervals; over longer steps the mean of two Dopplers is too inaccurate.
+#: Longest step for which range changes are computed, in survey intervals; over longer steps the mean of two Dopplers is
+#: too inaccurate.
 _LONGEST_STEP: Final = 2.5
-#: Standard deviation of a Doppler-derived change due to acceleration [m/s^2].
+#: Acceleration that determines the standard deviation of a Doppler-derived range change [m/s^2].
 _CURVED_MPS2: Final = 0.05
 
 
@@ -238,7 +239,7 @@ def survey_run(
             signals.append(replace(own, row=own.row + before, step=own.step + before))
             runs.append(run)
     if sum(int(np.isfinite(run.ecef_m[:, 0]).sum()) for run in runs) < 3:
-        raise ValueError("fewer than three epochs have a position; are the navigation files of the day of the log?")
+        raise ValueError("fewer than three epochs have a position; are the navigation files from the day of the log?")
     return replace(join_rows(runs), name=name, signals=join_rows(signals))
 
 

@@ -49,22 +49,22 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function for each antenna with its search index, rows, and item of each list; return the results."""
+        """Call a function with the search index, rows, and item of each list, for each antenna; return the results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
-        """Call a function for each antenna as `apart` does, and return its results joined along the rows."""
+        """Call a function for each antenna as `apart` does, and return the results joined along the rows."""
         return join_epochs(self.apart(function, *of_antennas))
 
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
-        """Call a function for each antenna; return its first results joined along the rows, and the list of states."""
+        """Call a function that returns a value and a state for each antenna; return joined values, and states."""
         found = self.apart(function, *of_antennas)
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
-        """Yield each antenna's search index and its part of `rows` (ascending); skip antennas without a row."""
+        """Yield the search index and the part of `rows` (ascending) of each antenna; skip antennas without a row."""
         if len(self.parts) == 1:
             if len(rows):
                 yield self.indices[0], rows

@@ -16,7 +16,7 @@ from railfix.positioning.section_search import SectionLimits, find_section
 
 #: Standard deviation of raw ranges for the approximate position of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: The iteration ends at a step shorter than this, after which the error of a range is at most 0.03 m [m].
+#: The iteration ends at a step shorter than this [m]; the error of a range is then at most 0.03 m.
 _TOLERANCE_M: Final = 1000.0
 #: Largest distance of a raw 3-D position from the line at which it is moved to the line [m].
 MAX_FROM_LINE_M: Final = 1e5

@@ -30,7 +30,7 @@ from railfix.gnss.orbits import satellite_states
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_available
 
-_STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [s].
+_STEP_S: Final = 1.0  #: Time step of the numerical derivatives of satellite clocks and tropospheric delays [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _PASSES: Final = 3  #: Number of rounds of outlier rejection; each uses the noise scale of the previous fit.
 _TELLING: Final = 2.0  #: A mean square of residuals up to this many standard deviations above 1 is within the noise.
@@ -60,9 +60,8 @@ class Dopplers(FrozenArrays):
     satellite: Strings
     rate_mps: Floats  #: ``-lambda D``: positive when the satellite recedes; NaN where absent; shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
-    #: Satellite position at the time of transmission, and a second earlier; shape (T, K, 3).
-    sat_ecef_m: Floats
-    earlier_ecef_m: Floats
+    sat_ecef_m: Floats  #: Satellite position at the time of transmission, shape (T, K, 3).
+    earlier_ecef_m: Floats  #: Satellite position one second earlier, shape (T, K, 3).
     sat_velocity_mps: Floats  #: Satellite velocity at the time of transmission, ECEF, shape (T, K, 3).
     clock_rate_mps: Floats  #: c times the drift of the satellite clock, relativity included; shape (T, K).
 
@@ -74,14 +73,13 @@ class Dopplers(FrozenArrays):
 class DopplerSpeed:
     """Speed along the track, T epochs."""
 
-    #: Positive along the tangent; NaN with too few satellites or singular geometry; shape (T,).
+    #: Speed, positive along the tangent; NaN with too few satellites or singular geometry; shape (T,).
     speed_mps: Floats
     sigma_mps: Floats  #: Standard deviation of `speed_mps`, shape (T,).
     clock_drift_mps: Floats  #: c times the drift of the receiver clock, shape (T,).
-    residual_mps: Floats  #: Measured less fitted, of used and rejected Dopplers; NaN elsewhere; shape (T, K).
-    #: Dopplers used in the fit, and Dopplers rejected as outliers; shape (T, K).
-    used: Masks
-    rejected: Masks
+    residual_mps: Floats  #: Measured minus fitted value of used and rejected Dopplers; NaN elsewhere; shape (T, K).
+    used: Masks  #: Dopplers used in the fit, shape (T, K).
+    rejected: Masks  #: Dopplers rejected as outliers, shape (T, K).
     n_used: Integers  #: Number of Dopplers used, shape (T,).
     scale: float  #: Ratio of the receiver's Doppler noise over the whole log to the noise assumed in the limits.
 

@@ -28,7 +28,7 @@ GROSS_M: Final = 100.0
 AGREEING_M: Final = 30.0
 #: Least number of redundant ranges after an exclusion at a 3-D position, so that the remaining ranges are tested.
 _LEFT_IN_SPACE: Final = 3
-#: Where fewer redundant ranges remain, every other exclusion must fit worse by this factor.
+#: Where fewer redundant ranges remain, the fit after every other exclusion must be worse by this factor.
 _CLEARER: Final = 5.0
 #: A corrected code is inconsistent with the other codes if its residual exceeds this multiple of the robust scale.
 _DISAGREE: Final = 5.0
@@ -68,7 +68,7 @@ def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
 
 
 def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, 3), less the median residual of each clock, (T, M) [m]; NaN where not used."""
+    """Return residuals at positions (T, 3), minus the median residual of each clock, (T, M) [m]; NaN where not used."""
     even = replace(ranges, weight=kernel_array((ranges.weight > 0).astype(np.float64)), ties=None)
     residual = normal_equations(even, np.nan_to_num(place_ecef_m)).residual_m
     value = np.where(ranges.weight > 0, residual, np.nan)
@@ -159,12 +159,11 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     return np.asarray(found & enough[:, None])
 
 
-#: Spacing of line points in the coarse scan, and of the points around its best point in the fine scan [m].
-_COARSE_M: Final = 100.0
-_FINE_M: Final = 12.5
-#: Clocks of constellations are usually nearer to each other than the first value [m]: they differ by up to 71 m in the
-#: recordings. A clock with one or two ranges that is farther from the others than the second value is not used.
+_COARSE_M: Final = 100.0  #: Spacing of line points in the coarse scan [m].
+_FINE_M: Final = 12.5  #: Spacing in the fine scan around the best point of the coarse scan [m].
+#: Usual limit of the differences between the clocks of constellations [m]: up to 71 m in the recordings.
 _CLOCKS_APART_M: Final = 200.0
+#: A clock with one or two ranges that differs from the other clocks by more than this is not used [m].
 _CLOCK_AWAY_M: Final = 600.0
 #: Largest product of points, epochs and channels that are computed together.
 _BLOCK: Final = 2_000_000
@@ -187,9 +186,9 @@ class LineScan(NamedTuple):
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
     """Find the point of a line that agrees best with the raw ranges of each epoch, robustly.
 
-    The cost of a point is the sum of absolute residuals, less the median residual of their clock, each limited to
-    `GROSS_M`, so that larger errors do not increase the cost. Points `_COARSE_M` apart are evaluated first, then points
-    around the best of these points.
+    The median residual of each clock is subtracted from the residuals. The cost of a point is the sum of the absolute
+    residuals, each limited to `GROSS_M`, so that larger errors do not increase the cost. Points `_COARSE_M` apart are
+    evaluated first, then points around the best of these points.
     """
     epochs = len(ranges)
     nodes = np.linspace(line.arc_m[0], line.arc_m[-1], max(int(np.ceil(np.ptp(line.arc_m) / _COARSE_M)), 1) + 1)
@@ -217,11 +216,12 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, N, 3), less the median residual of each clock, (T, N, M) [m]; NaN if unused.
+    """Return residuals at positions (T, N, 3), minus the median residual of each clock, (T, N, M) [m]; NaN if unused.
 
-    The lower or the upper median is used where it has a clearly smaller `_capped_cost` than their mean, which fits no
-    range if half of an even number of ranges has a gross error. If some residuals of a clock agree with the median of
-    all residuals to `_CLOCKS_APART_M`, the median of this clock is the median of these residuals alone.
+    The median of an even number is the mean of the lower and the upper median, unless one of these has a clearly
+    smaller `_capped_cost`. The mean fits no range if half of the ranges has a gross error. If some residuals of a clock
+    agree with the median of all residuals to `_CLOCKS_APART_M`, the median of this clock is the median of these
+    residuals alone.
     """
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
@@ -248,7 +248,7 @@ def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 def _medians(value: Floats) -> tuple[Floats, Floats]:
     """Return the lower and the upper median of the finite values along the last axis, which is kept with length 1.
 
-    0 where there is none.
+    Both are 0 where no value is finite.
     """
     ordered = np.sort(value, axis=-1)
     n = np.isfinite(value).sum(axis=-1, keepdims=True)
@@ -273,9 +273,9 @@ class GrossErrors(NamedTuple):
 
 #: Plausible ellipsoidal heights of trains, with a margin [m]. Positions at other heights are not used.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
-#: An epoch is examined if the root of the sum of its squared raw residuals is not below the first value, or its 3-D
-#: position is farther from the line than the second [m].
+#: An epoch is examined if the root of the sum of the squared raw residuals is not below this [m].
 _QUIET_M: Final = 30.0
+#: An epoch is also examined if the 3-D position is farther from the line than this [m].
 _BESIDE_M: Final = 1000.0
 
 
@@ -285,9 +285,9 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
     best point of the line (`scan_line`), if redundant ranges agree with it and the cost of every other exclusion is
     clearly larger. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
-    (`gross_in_space`). Where neither identifies them, the epoch is unsure. The ranges with gross errors at the best
-    point of the line are then returned, so that they do not move the position, if they are at most half of the ranges
-    and redundant ranges agree with the point.
+    (`gross_in_space`). Where neither method identifies gross errors, the epoch is unsure. The ranges with gross errors
+    at the best point are then still returned, so that they do not move the position, if they are at most half of the
+    ranges and redundant ranges agree with the point.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -325,10 +325,10 @@ def gross_alone(
 ) -> Masks:
     """Find the ranges of clocks with few ranges that contradict the clocks of more ranges, shape (T, M).
 
-    No other range tests the sole range of a clock while this clock is estimated freely; the known biases `ties` test it
-    to `GROSS_M`. Without `ties`, one or two ranges are found whose clock differs from the common clock by more than
-    `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks estimated without ties. The common clock is the median of the
-    clocks less their biases, weighted by satellites.
+    While a clock is estimated freely, no other range tests the sole range of this clock. With `ties`, the known biases
+    test the sole range to `GROSS_M`. Without `ties`, the one or two ranges of a clock are found if the clock differs
+    from the common clock by more than `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks estimated without ties. The
+    common clock is the median of the clocks minus their biases, weighted by the number of satellites.
     """
     found = np.zeros(weight.shape, dtype=np.bool_)
     count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)

@@ -28,7 +28,8 @@ class RobustFitLimits(Settings):
 
     keep: float = Field(default=1.5, gt=0)  #: Residuals up to this multiple of the scale have full weight.
     reject: float = Field(default=4.0, gt=0)  #: Residuals above this multiple of the scale have zero weight.
-    #: Number of reweightings. On the demonstration with a 20 m error on one satellite, the fifth changes no decision.
+    #: Number of reweightings. On the demonstration with a 20 m error on one satellite, the fifth reweighting changes no
+    #: decision.
     iterations: int = Field(default=5, ge=1)
 
 
@@ -37,9 +38,9 @@ class RobustFit:
     """Ranges that agree with each other, T epochs by M channels."""
 
     kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
-    #: Weighted sum of squared residuals of the kept ranges divided by `freedom`; NaN where that is 0; shape (T,).
+    #: Weighted sum of squared residuals of the kept ranges over `freedom`; NaN where `freedom` is 0; shape (T,).
     variance: Floats
-    freedom: Integers  #: Number of kept ranges less the clocks and position unknowns, 0 without a fit; shape (T,).
+    freedom: Integers  #: Number of kept ranges minus the clocks and position unknowns; 0 without a fit; shape (T,).
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
@@ -60,7 +61,7 @@ def robust_fit(
 ) -> RobustFit:
     """Find the ranges of each epoch that agree with each other, by IGG-III weights (Yang, Song and Xu, 2002).
 
-    `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which they are linearised.
+    `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which the ranges are linearised.
 
     `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`). The position
     has one unknown with `information`, and three without.

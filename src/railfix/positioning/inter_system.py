@@ -149,9 +149,9 @@ def tie_constellations(
 ) -> tuple[Ranges, PointPositions, list[OffsetState]]:
     """Return ranges tied by the inter-system biases known before each epoch, 3-D positions (P1 5), and the new states.
 
-    Each additional constellation requires one satellite for its clock, unless its bias is known to a metre. A bias is
-    the difference of two receiver clocks, estimated with positions from ranges that agree with each other, and averaged
-    over earlier epochs. The results therefore do not depend on the division of a log into chunks.
+    Each additional constellation requires one satellite for its clock, unless the bias of this clock is known to a
+    metre. A bias is the difference of two receiver clocks, estimated with positions from ranges that agree with each
+    other, and averaged over earlier epochs. The results therefore do not depend on the division of a log into chunks.
 
     Parameters
     ----------

@@ -36,10 +36,11 @@ class MapOffsetLimits(Settings):
     window_s: float = Field(default=120.0, gt=0)
     correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
     least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision.
-    #: False-alarm probability of the note and of the status, by noise alone (chi-square, two degrees of freedom).
-    #: The nominal sigmas are assumptions; on the recordings, with a correct map and all screens, the statistic stays
-    #: below the threshold of the status, 13.8 (``tests/references/results/bounds.txt``).
+    #: False-alarm probability of the note by noise alone (chi-square, two degrees of freedom).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
+    #: False-alarm probability of the status by noise alone. The nominal sigmas are assumptions. On the recordings, with
+    #: a correct map and all screens, the statistic is below the threshold of 13.8
+    #: (``tests/references/results/bounds.txt``).
     risk: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing an offset of the smallest detectable size.
     missed: float = Field(default=1e-2, gt=0, lt=1)
@@ -67,8 +68,8 @@ class MapOffsetState:
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
-    #: Sums of information matrices (across, mixed, up), information times offset (2), covariances of nominal errors (3)
-    #: and samples, of the epochs on the map, then of the epochs off the map; shape (18,).
+    #: Nine sums over the epochs on the map, then nine over the epochs off the map, shape (18,): information matrix
+    #: (across, mixed, up), information times offset (2), covariance of nominal errors (3), and number of samples.
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
@@ -76,9 +77,8 @@ class MapOffsetState:
 class MapOffset(NotebookTable):
     """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples."""
 
-    #: Offset to the right of the line in the direction of rising chainage, and above the line; shape (T,).
-    across_m: Floats
-    up_m: Floats
+    across_m: Floats  #: Offset to the right of the line in the direction of rising chainage, shape (T,).
+    up_m: Floats  #: Offset above the line, shape (T,).
     #: Covariance across and up for a correct map, from noise, satellite and atmospheric errors and the stated error of
     #: the map; shape (T, 2, 2).
     covariance_m2: Floats
@@ -124,8 +124,8 @@ class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
     arc_m: Floats  #: Arc length; NaN without a position; shape (T,).
-    #: Epochs at which the train is off the line, shape (T,). Their sums are separate, because positions off the line
-    #: give no information on the map after the train returns to it.
+    #: Epochs at which the train is off the line, shape (T,). The sums of these epochs are separate, because positions
+    #: off the line give no information on the map.
     off_map: Masks
 
 

@@ -27,7 +27,7 @@ class Windows(NamedTuple):
     def of(
         cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
     ) -> Windows:
-        """Compute the ages from the rows of each antenna and its last earlier epoch (`before`).
+        """Compute the ages from the rows (`parts`) and the last earlier epoch (`before`) of each antenna.
 
         A window is `window_s` or `least_epochs` epochs, whichever is longer. A gap therefore counts as at most 1 /
         `least_epochs` of a window.

@@ -2,7 +2,7 @@
 
 Subtracting the weighted mean over the satellites of a constellation from their residuals and design rows is equivalent
 to solving for the clock of the constellation (the Schur complement of the clock block). Where the biases between the
-clocks are known with a sigma (`InterSystemBiases`), each mean less its bias is an observation of a common clock, which
+clocks are known with a sigma (`InterSystemBiases`), each mean minus the bias is an observation of a common clock, which
 is eliminated in the same way.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
@@ -66,7 +66,7 @@ def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) 
 class ConstrainedLimits(Settings):
     """Limits of the iteration along the line."""
 
-    #: Largest last step inside a section, which leaves an error of 0.03 mm (`railfix.kernels.ranges`).
+    #: The iteration ends at a shorter step inside a section, with an error of 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
     max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including steps to another section.
 
@@ -81,7 +81,7 @@ class Constrained(NotebookTable):
     exact_map_sigma_m: Floats  #: Part of `sigma_m` from the weights alone, as for an exact map; shape (T,).
     #: Sigma along the line for unit weights and an exact map; infinite where not determined; shape (T,).
     dilution: Floats
-    #: Distance beyond an end of the line implied by the ranges of a position clamped to this end; else 0; shape (T,).
+    #: Distance beyond an end of the line that the ranges imply if the position is clamped to the end; else 0; (T,).
     overshoot_m: Floats
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
     wsse: Floats  #: Weighted sum of squared residuals, with the map error taken into account; shape (T,).
@@ -94,10 +94,10 @@ def position_on_line(
 ) -> Constrained:
     """Compute the distance along the line by constrained least squares (P1 2.2(3)): ``R = r_i + d e_i``.
 
-    The iteration consists of Newton steps in d inside a section, with the receiver clocks eliminated. A step beyond the
-    section stops at its end, and the iteration continues in the neighbouring section. Where the steps from both
-    neighbouring sections lead back to their common point, that point is the solution. At an open end of the line, the
-    position is clamped to the end, and `overshoot_m` is the distance beyond the end implied by the ranges.
+    The iteration consists of Newton steps in d inside a section, with the receiver clocks eliminated. A step beyond an
+    end of the section stops at this end, and the iteration continues in the neighbouring section. Where the steps from
+    both neighbouring sections lead back to their common point, that point is the solution. At an open end of the line,
+    the position is clamped to the end, and `overshoot_m` is the distance beyond the end implied by the ranges.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ class SectionArrays(NamedTuple):
 class SinglePointLimits(Settings):
     """Limits of the iteration of 3-D positions, and of their validation (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: Largest last step, which leaves an error of 0.01 mm.
+    tolerance_m: float = Field(default=1.0, gt=0)  #: The iteration ends at a shorter step, with an error of 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
     #: False-alarm probability of the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)

@@ -26,7 +26,7 @@ UNTIED_M: Final = 1e6  #: Sigma of an unknown inter-system bias [m].
 class InterSystemBiases(RowArrays, NotebookTable):
     """Known offsets between the receiver clocks of the constellations."""
 
-    #: Receiver clock of each group less a clock common to all groups; any finite value where unknown; shape (T, G).
+    #: Receiver clock of each group minus a clock common to all groups; arbitrary but finite where unknown; (T, G).
     offset_m: Floats
     sigma_m: Floats  #: Standard deviation of `offset_m`; `UNTIED_M` where the offset is unknown; shape (T, G).
 
@@ -63,8 +63,8 @@ class RangeArrays(NamedTuple):
 class Ranges:
     """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels."""
 
-    sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
-    code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
+    sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; arbitrary but finite where the weight is 0; (T, M, 3).
+    code_m: Floats  #: Corrected pseudorange; arbitrary but finite where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for unused ranges; shape (T, M) [1/m^2].
     groups: tuple[slice, ...]  #: Channels that share one receiver clock are adjacent; one slice per clock.
     ties: InterSystemBiases | None = None  #: Known offsets between the clocks; None for separate clocks.
@@ -108,16 +108,16 @@ class Ranges:
 
     @property
     def redundancy(self) -> Integers:
-        """Number of used ranges less the clocks and the distance along the line, shape (T,); can be negative."""
+        """Number of used ranges minus the clocks and the distance along the line, shape (T,); can be negative."""
         return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
 
     @property
     def space_redundancy(self) -> Integers:
-        """Number of used ranges less the clocks and three coordinates, shape (T,); can be negative."""
+        """Number of used ranges minus the clocks and three coordinates, shape (T,); can be negative."""
         return np.asarray(self.n_used - self.n_clocks - 3, dtype=np.int64)
 
 
-#: Satellite position of unused ranges; any finite value is possible [m].
+#: Satellite position that replaces missing positions of unused ranges; an arbitrary finite value [m].
 FILLER_SATELLITE_M: Final = (2.6e7, 0.0, 0.0)
 
 

@@ -47,9 +47,9 @@ class NoiseState:
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
-    #: Weighted sum of squared residuals, and degrees of freedom, shape (2,), of the ranges kept by the robust fit
-    #: (`robust`), and of the ranges accepted by RAIM (`remaining`).
+    #: Weighted sum of squared residuals, and degrees of freedom, of the ranges kept by the robust fit; shape (2,).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
+    #: The same two sums for the ranges accepted by RAIM, shape (2,).
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
 

@@ -22,7 +22,8 @@ class SearchIndex:
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
         self.tree = scipy.spatial.cKDTree(points)  #: k-d tree of the trajectory points.
-        #: Stretches of each level: index of the middle point, and radius [m] around it that contains all points.
+        #: Stretches of each level: index of the middle point, and radius [m] around this point that contains the
+        #: stretch.
         self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1
         while True:
@@ -46,8 +47,7 @@ class SearchIndex:
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a horizontal distance from positions on the line within which the line lies on its tangent, shape (T,)
-        [m].
+        """Return a horizontal distance from each position within which the line lies on the tangent, shape (T,) [m].
 
         The distance, at most `CLEAR_M`, is computed once per section, and is valid for all positions on the section.
         """

@@ -4,8 +4,8 @@ P1 2.2(2) compares between-satellite single differences of ranges and distances.
 these differences equals the sum for the residuals with the clock of each constellation eliminated. `find_section`
 returns the point with the least ``q`` in a time that hardly depends on the length of the line. Where a 3-D position
 exists, ``q`` increases from this position as a quadratic form, so only the points inside a ball are evaluated.
-Otherwise the search is coarse to fine, and uses that the root of ``q`` changes at most by the root of the summed
-weights times the distance between two points. Both searches are exact.
+Otherwise the search is coarse to fine. It relies on a bound: between two points, the root of ``q`` changes by at most
+their distance times the root of the summed weights. Both searches are exact.
 """
 
 from __future__ import annotations
@@ -71,13 +71,11 @@ class Section:
 class SectionCandidates(NamedTuple):
     """Evaluated points, sorted by epoch and point, with q and half its gradient; n epochs, p points."""
 
-    #: Epochs, and number of points of each epoch (at least 1); shape (n,).
-    at: Indices
-    points: Indices
-    #: Points, q and half the gradient of q; shapes (p,), (p,), (p, 3).
-    vertex: Indices
-    q: Floats
-    half_gradient: Floats
+    at: Indices  #: Epochs, shape (n,).
+    points: Indices  #: Number of points of each epoch, at least 1; shape (n,).
+    vertex: Indices  #: Index of each point in the trajectory, shape (p,).
+    q: Floats  #: Weighted sum of squares at each point, shape (p,).
+    half_gradient: Floats  #: Half the gradient of `q` at each point, shape (p, 3).
     matrix: Floats  #: Normal matrices, shape (m, 3, 3).
     matrix_of: Indices  #: Index of the normal matrix of each point, shape (p,).
 
@@ -162,7 +160,7 @@ def _ball(
 def _in_ball(
     ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
-    """Return the points in the ball of each epoch; q is exact where its quadratic form does not determine the best."""
+    """Return the points in the ball of each epoch; q is recomputed if its quadratic form cannot decide on the best."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
         point.wsse[epochs], weight_norm[epochs],

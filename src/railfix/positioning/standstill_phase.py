@@ -116,9 +116,9 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Largest number of integer vectors in the sum of likelihoods. A vector is left out if its log likelihood, less the log
-#: likelihood of uniform phases, is below the second value.
+#: Largest number of integer vectors in the sum of likelihoods.
 _VECTORS: Final = 20
+#: A vector is left out if its log likelihood, minus the log likelihood of uniform phases, is below this.
 _NEGLIGIBLE: Final = -5.0
 
 
@@ -126,7 +126,7 @@ _NEGLIGIBLE: Final = -5.0
 class MeanPhases:
     """Mean double differences of one antenna's carrier phases, n pairs of satellites."""
 
-    difference_m: Floats  #: Observed less computed value at the origin, up to multiples of the wavelength; shape (n,).
+    difference_m: Floats  #: Observed minus computed value at the origin, up to multiples of the wavelength; shape (n,).
     away: Floats  #: Derivative of the double difference by position east, north and up; shape (n, 3).
     wavelength_m: Floats  #: Wavelength of the carrier of each pair, shape (n,).
     covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).
@@ -151,8 +151,8 @@ def phase_log_likelihood(
     """Return the log density of the phases of A antennas, given their codes, for U hypotheses of position, shape (U,).
 
     A hypothesis has the mean `expected_m` (U, 3 A) and the covariance `prior_m2`. Phases are known modulo the
-    wavelength. With the probability `fault_prior` they do not follow the model (slip, half cycle), and are uniform over
-    the wavelength.
+    wavelength. With the probability `fault_prior`, the phases do not follow the model (slip, half cycle), and are
+    uniform over the wavelength.
     """
     measured = np.concatenate([code.place_m for code in codes])
     of_codes = scipy.linalg.block_diag(*(code.covariance_m2 for code in codes))

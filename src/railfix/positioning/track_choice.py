@@ -24,12 +24,14 @@ from railfix.core.settings import Settings
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UNMAPPED_PRIOR
 
-#: Steps of the integrals along and across the track [m].
+#: Step of the integral along the track [m].
 _ALONG_M: Final = 0.25
+#: Step of the integral across the track [m].
 _ACROSS_M: Final = 0.3
 #: Weight of an unmapped track within the clearance of a mapped track (possible only if the map is displaced), relative
-#: to an unmapped track farther away. The weight is 0 at distances below the second value [m].
+#: to an unmapped track farther away.
 _BETWEEN_SHARE: Final = 0.1
+#: An unmapped track nearer than this to a mapped track has no weight [m].
 _BETWEEN_M: Final = 1.2
 #: No decision is made if the position is farther than this from the most probable track, in standard deviations.
 _LARGEST_MISFIT: Final = 4.0
@@ -133,9 +135,9 @@ def standstill_fix(
 ) -> StandstillFix | None:
     """Estimate the position of an antenna at rest from mean code residuals; None if it is not determined.
 
-    Arrays have shape (K,): `system` are clock letters, `residual_m` means over `seconds` of observed less computed
-    codes at the origin, and `common_m` sigmas of satellite and atmospheric errors. `receivers` is 2 if the codes of a
-    base station are subtracted.
+    Arrays have shape (K,): `system` has clock letters; `residual_m` has means over `seconds` of observed minus computed
+    codes at the origin; `common_m` has the sigmas of satellite and atmospheric errors. `receivers` is 2 if the codes of
+    a base station are subtracted.
     """
     letters = np.unique(system)
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -167,7 +169,9 @@ def standstill_fix(
 
 @dataclass(frozen=True, kw_only=True)
 class YardTrack:
-    """A track near the train: name, and points east and north of the origin, shape (n, 2) [m], in its direction."""
+    """A track near the train: name, and points east and north of the origin, shape (n, 2) [m], in the track's
+    direction.
+    """
 
     name: str
     points_m: Floats
@@ -187,7 +191,7 @@ class TrackPosterior:
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
-        """Return the track (or `NONE`) with a probability above one minus the risk; empty if undecided or no fit."""
+        """Return the track (or `NONE`) with a probability above one minus the risk; empty without decision or fit."""
         best = int(np.argmax(self.probability))
         if not self.fits or self.misfit_sigmas[best] > _LARGEST_MISFIT:
             return ""
@@ -334,7 +338,7 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
 
 
 def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Floats:
-    """Return the weight of each shift of the nearest track: 1 far from tracks, less between tracks, 0 on one."""
+    """Return the weight of each shift of the nearest track: 1 far from tracks, smaller between tracks, 0 on a track."""
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
     share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)
@@ -371,7 +375,7 @@ class _Places:
 def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
 ) -> _Places:
-    """Return the hypotheses for a track at shifts across it, given antenna positions; empty beyond its ends."""
+    """Return the hypotheses for a track at shifts across it; empty if the antennas are beyond the ends of the track."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)

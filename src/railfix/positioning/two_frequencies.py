@@ -28,8 +28,8 @@ from railfix.ranges.corrected import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
 _FIRST_SAMPLES: Final = 2.0  #: Number of prior samples, whose noise is the noise assumed by the weights.
-_CLIP: Final = 2.5  #: Limit of the mean difference of a satellite [sigma].
-_LEAST_SUSPICION_M: Final = 3.0  #: Least difference of the two codes that is suspected [m].
+_CLIP: Final = 2.5  #: Limit to which the mean difference of a satellite is clipped [sigma].
+_LEAST_SUSPICION_M: Final = 3.0  #: Minimum difference of the two codes at which a range is suspected [m].
 
 
 class TwoFrequencyLimits(Settings):
@@ -77,12 +77,11 @@ class Combined(NotebookTable):
     """One pseudorange per satellite from two codes: T epochs by K channels; NaN where only the first code is used."""
 
     code_m: Floats  #: Combined code, shape (T, K).
-    variance_m2: Floats  #: Difference of variance between the combined and the first code, shape (T, K).
+    variance_m2: Floats  #: Variance of the combined code minus variance of the first code, shape (T, K).
     share: Floats  #: Weight of the second code; the first code has 1 - `share`; shape (T, K).
-    #: Ionospheric delay on the first frequency beyond the model, and its sigma; shape (T, K).
-    ionosphere_m: Floats
-    ionosphere_sigma_m: Floats
-    difference_m: Floats  #: Second code less first code, less the prediction; shape (T, K).
+    ionosphere_m: Floats  #: Ionospheric delay on the first frequency minus the model's delay, shape (T, K).
+    ionosphere_sigma_m: Floats  #: Standard deviation of `ionosphere_m`, shape (T, K).
+    difference_m: Floats  #: Second code minus first code, minus the predicted difference; shape (T, K).
     suspected: Masks  #: Ranges whose `difference_m` exceeds the limit, shape (T, K).
 
 
@@ -163,7 +162,7 @@ def combine_codes(
 def ionosphere_free(
     code_m: Floats, noise_m: Floats, second: SecondCodes, delays_m: tuple[Floats, ...], found: Combined
 ) -> Combined:
-    """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
+    """Return the ionosphere-free combination of two codes; the test of their difference is that of `combine_codes`.
 
     The combination is ``P = (ratio P1 - P2) / (ratio - 1)``; its noise is not smoothed over epochs. `delays_m` are the
     group delays contained in the corrections of the first and the second code, shapes (T, K); they are added back.

@@ -87,7 +87,7 @@ def make_processor(
     precise orbits, or there is no SBAS message of the requested GEO satellite.
     """
     if config.sbas and navigation.precise is not None:
-        raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
+        raise SettingsError("SBAS corrects broadcast records, not precise orbits; use either --sbas or --sp3")
     features = {} if track is None else {name: TrackFeatures(track, path) for name, path in trajectories.items()}
     return EpochProcessor(
         config,

@@ -2,9 +2,9 @@
 
 The unknowns of the epochs (distance and clocks) are eliminated, so that the normal matrix has one row per phase arc.
 Integers are fixed where the probability of a wrong integer is small enough. The probability follows from Bayes' rule:
-the density of the float ambiguities at a vector of integers is compared with the density at all other vectors, and with
-non-integer phases (multipath, half cycles), which have the prior probability `PhaseLimits.no_integer_prior` and a
-uniform density.
+the density of the float ambiguities at one vector of integers is compared with the density at all other vectors, and
+with the uniform density of non-integer phases (multipath, half cycles), whose prior probability is
+`PhaseLimits.no_integer_prior`.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
 FREE_AMBIGUITY_M: Final = 1e4  #: Prior sigma of an ambiguity about its first value, a loose prior for conditioning [m].
-FORGET_S: Final = 600.0  #: An arc not observed for this long is restarted.
+FORGET_S: Final = 600.0  #: An arc that is not observed for this time is restarted [s].
 
 
 class PhaseLimits(Settings):
     """Limits of the float ambiguities."""
 
-    clocks: PhaseClocks = "own"  #: Clock of the phases: separate, or shared with the codes (P4).
+    clocks: PhaseClocks = "own"  #: Receiver clock of the phases, separate or shared with the codes (P4).
     #: [m/sqrt(s)] Random walk of an ambiguity, for changes of ionosphere, satellite orbit and clock, and for multipath
     #: in a phase relative to the other phases. Without a random walk, phases that drift by centimetres while satellites
-    #: move by hundredths of a radian bias the position by metres. With codes of 1 m at 1 Hz, 0.01 averages over about
-    #: 100 s. With 0, ambiguities are constant.
+    #: move by hundredths of a radian bias the position by metres. With a code noise of 1 m at 1 Hz, the value 0.01
+    #: averages over about 100 s. With the value 0, ambiguities are constant.
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
     #: Correlation time of code errors. Epochs closer together than this add no information on the ambiguities, so the
@@ -48,7 +48,7 @@ class PhaseLimits(Settings):
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
     #: Prior probability that phases are not whole cycles (multipath, half a cycle).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
-    #: Largest sigma from noise along the line; epochs with a larger sigma have no position.
+    #: Largest sigma along the line due to noise; epochs with a larger sigma have no position.
     largest_sigma_m: float = Field(default=1e3, gt=0)
 
 
@@ -71,7 +71,7 @@ class ArcAmbiguities:
     """Ambiguities of A arcs."""
 
     arc_id: Integers  #: Number of each arc (`number_arcs`), shape (A,).
-    #: Phase less range less clock, which contains whole cycles, phase wind-up and signal delays; shape (A,). With
+    #: Phase minus range minus clock, which contains whole cycles, phase wind-up and signal delays; shape (A,). With
     #: separate phase clocks, ambiguities are determined up to a common constant: the mean of the corrections to their
     #: first values is set to zero, and the covariance is relative to this mean.
     ambiguity_m: Floats
@@ -84,19 +84,15 @@ class PhasePositions(NotebookTable):
 
     #: Arc length within the trajectory; NaN without an initial position or with too large a sigma; shape (T,).
     arc_m: Floats
-    #: Standard deviation including the map error, and from noise alone; shape (T,).
-    sigma_m: Floats
-    noise_sigma_m: Floats
+    sigma_m: Floats  #: Standard deviation, including the map error; shape (T,).
+    noise_sigma_m: Floats  #: Standard deviation due to noise alone, shape (T,).
     clock_m: Floats  #: Receiver clock of each group; NaN without a position; shape (T, G).
-    #: Observed less computed; NaN where not used; shape (T, M).
-    code_residual_m: Floats
-    phase_residual_m: Floats
-    #: Ambiguity of the arc of each used phase, as estimated at the epoch, and its sigma; shape (T, M).
-    ambiguity_m: Floats
-    ambiguity_sigma_m: Floats
-    #: Number of used codes and of used phases, shape (T,).
-    n_codes: Integers
-    n_phases: Integers
+    code_residual_m: Floats  #: Observed minus computed code; NaN where not used; shape (T, M).
+    phase_residual_m: Floats  #: Observed minus computed phase; NaN where not used; shape (T, M).
+    ambiguity_m: Floats  #: Ambiguity of the arc of each used phase, as estimated at the epoch; shape (T, M).
+    ambiguity_sigma_m: Floats  #: Standard deviation of `ambiguity_m`, shape (T, M).
+    n_codes: Integers  #: Number of used codes, shape (T,).
+    n_phases: Integers  #: Number of used phases, shape (T,).
     n_fixed: Integers  #: Number of ambiguity differences fixed to whole cycles, shape (T,).
     #: Probability that a fixed difference is wrong, or, if none is fixed, that the best candidate is wrong; NaN where
     #: there are no differences; shape (T,).
@@ -129,9 +125,9 @@ def prepare_start(
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    With separate phase clocks, a constant common to all ambiguities is unobservable. This constant is determined by a
-    zero mean of the ambiguities for which `held`, shape (..., A), is 1 (else 0). This does not change differences of
-    ambiguities.
+    With separate phase clocks, a constant common to all ambiguities is unobservable. The constant is chosen so that the
+    mean of the ambiguities for which `held`, shape (..., A), is 1 (else 0) is zero. Differences of ambiguities do not
+    depend on the choice.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -151,7 +147,7 @@ def assemble_positions(
     fixes: tuple[Integers, Floats],
     limits: PhaseLimits,
 ) -> PhasePositions:
-    """Return the positions of a run, NaN where missing; `ambiguity` is value [m] and variance [m^2]."""
+    """Return the positions of a run, NaN where missing; `ambiguity` has values [m] and variances [m^2]."""
     (ambiguity_m, variance_m2), has = ambiguity, started & (own.noise_sigma_m <= limits.largest_sigma_m)
     code, phase = lin.code_weight > 0, lin.phase_weight > 0
     return PhasePositions(
@@ -172,8 +168,8 @@ def assemble_positions(
     )
 
 
-_VECTORS: Final = 12  #: Number of integer vectors compared.
-#: Fractions of the differences that are tried one after another, beginning with the strongest phases.
+_VECTORS: Final = 12  #: Number of candidate integer vectors that are compared.
+#: Fractions of the differences that are fixed together, tried in this order; the strongest phases are fixed first.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
@@ -236,7 +232,7 @@ def fix_integers(
 
 
 def _differences(strength: Floats, group: Integers) -> tuple[Indices, Indices]:
-    """Return arcs and their reference arcs for differencing, the strongest first."""
+    """Return pairs of an arc and the reference arc of its group, sorted by descending strength of the first arc."""
     first, second = [], []
     for each in np.unique(group[group >= 0]).tolist():
         own = np.flatnonzero(group == each)

@@ -3,10 +3,10 @@
 The change of the phase is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or,
 where Dopplers are missing, with the change of the code. The median over the channels is subtracted, because a step of
 the receiver clock is common to all channels. Codes refer to the time tags, so the true interval is the difference of
-the time tags less the step of the codes. Phases either step together with the codes, or continue without a step. In the
-second case they differ from the codes by whole milliseconds, which are added in `Slips.phase_m`.
+the time tags minus the step of the codes. Phases either step together with the codes, or continue without a step.
+Phases without the step differ from the codes by whole milliseconds, which are added in `Slips.phase_m`.
 
-The smoothed code is the phase plus the mean of code less phase over the arc so far. The ionosphere makes this mean
+The smoothed code is the phase plus the mean of code minus phase over the arc so far. The ionosphere makes this mean
 drift by twice the change of its delay. The window limits the effect: at 1 mm/s and with a window of 100 s, it is at
 most 0.2 m.
 """
@@ -28,9 +28,9 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
 
-#: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
+#: One millisecond as a distance [m]: the clock step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
-#: Smallest change common to all codes that is a step of the receiver clock [m], by which the interval is corrected.
+#: A larger change common to all codes is a step of the receiver clock, by which the interval is corrected [m].
 _CLOCK_STEP_M: Final = 1e4
 _COMMON: Final = 3  #: Fewest channels whose median represents the receiver clock.
 
@@ -60,12 +60,12 @@ class CycleSlipLimits(Settings):
 
     #: Longest interval without a new arc; station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Limit of the phase change less its Doppler prediction, constant and in proportion to the interval. On real
-    #: receivers at 1 Hz the median of the metric is 0.01 to 0.04 m.
+    #: Constant part of the limit of the phase change minus the change predicted from Dopplers. On real receivers at
+    #: 1 Hz the median of the metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
-    doppler_mps: float = Field(default=0.05, gt=0)
+    doppler_mps: float = Field(default=0.05, gt=0)  #: Part of this limit in proportion to the interval.
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
-    #: Limit of the change of code less phase, tested where Dopplers are absent or less precise.
+    #: Limit of the change of code minus phase, tested where Dopplers are absent or less precise.
     code_m: float = Field(default=10.0, gt=0)
 
 
@@ -75,12 +75,11 @@ class CycleSlipState:
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
-    #: Code, phase as received (without `step_ms`), and Doppler times wavelength; shape (M,).
-    code_m: Floats = field(default_factory=lambda: np.empty(0))
-    phase_m: Floats = field(default_factory=lambda: np.empty(0))
-    doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
+    code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Shape (M,).
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Phase as received, without `step_ms`; shape (M,).
+    doppler_mps: Floats = field(default_factory=lambda: np.empty(0))  #: Doppler times wavelength, shape (M,).
     half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
-    step_ms: int = 0  #: Clock steps so far that are in the codes but not in the phases, in whole milliseconds.
+    step_ms: int = 0  #: Sum of the clock steps so far that are in the codes but not in the phases [ms].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +91,8 @@ class Slips:
     #: Phase times wavelength, referred to the clock of the codes: steps of whole milliseconds that only the codes have
     #: are added. NaN where the phase is missing or its wavelength is unknown; shape (T, M).
     phase_m: Floats
-    #: Metrics of the Doppler test and of the code test; NaN where a test is not possible; shape (T, M).
-    doppler_metric_m: Floats
-    code_metric_m: Floats
+    doppler_metric_m: Floats  #: Metric of the Doppler test; NaN where the test is not possible; shape (T, M).
+    code_metric_m: Floats  #: Metric of the code test; NaN where the test is not possible; shape (T, M).
     doppler_limit_m: Floats  #: Limit of `doppler_metric_m`, shape (T,).
     #: Step of the receiver clock since the previous epoch, from the codes; 0 where none is detected; shape (T,).
     clock_step_m: Floats
@@ -137,7 +135,7 @@ def find_slips(
     -------
     Slips
     CycleSlipState
-        Division into chunks does not change the result.
+        State for the next chunk. The division into chunks does not change the result.
     """
     limits, state = limits or CycleSlipLimits(), state or CycleSlipState()
     channels = channel_keys(observations.satellite, observations.signal)
@@ -197,7 +195,7 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Compute the clock step of the codes [m], its part not in the phases [ms], and the metrics of both tests.
+    """Compute the clock step of the codes [m], the part of it that the phases lack [ms], and the metrics of both tests.
 
     `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
     that epoch, and `range_mps` is the range rate from the Dopplers.
@@ -232,8 +230,8 @@ class SmoothingLimits(Settings):
     #: Time constant. All codes of an arc have equal weight until the arc has this age; then the weight of older codes
     #: decays (DO-229D 2.1.4.1.5: 100 s, because of the drift of the ionospheric delay).
     window_s: float = Field(default=100.0, gt=0)
-    #: With "own", the mean change of code less phase over all channels is a clock, which is subtracted before and added
-    #: after averaging. Telephones require "own", because their codes jump together by tens of metres: in a town,
+    #: With "own", the mean change of code minus phase over all channels is a clock, which is subtracted before and
+    #: added after averaging. Telephones require "own", because their codes jump together by tens of metres: in a town,
     #: smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared" the error was 50 m.
     #: Results of other receivers were not worse with "own".
     clocks: Literal["own", "shared"] = "own"
@@ -245,15 +243,15 @@ class SmoothingState:
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
-    #: First code less phase of the current arc; NaN without an arc; shape (M,).
+    #: First value of code minus phase on the current arc; NaN without an arc; shape (M,).
     base_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Smoothed code less phase, less `base_m`; shape (M,).
+    #: Smoothed code minus phase, minus `base_m`; shape (M,).
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Number of codes of the current arc, shape (M,).
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    #: Last code less phase, for `clocks="own"`; shape (M,).
+    #: Last value of code minus phase, for `clocks="own"`; shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
-    clock_m: float = 0.0  #: Sum of the mean changes of code less phase so far, for `clocks="own"`.
+    clock_m: float = 0.0  #: Sum of the mean changes of code minus phase so far, for `clocks="own"`.
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
@@ -264,7 +262,7 @@ def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
 
 
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
-    """Return the mean change of code less phase over channels whose arc continues, shape (T,); 0 if there is none."""
+    """Return the mean change of code minus phase over channels whose arc continues, shape (T,); 0 without channels."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
     number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
@@ -284,8 +282,8 @@ def smooth_codes(
     """Return codes smoothed by the phase along unbroken arcs.
 
     The weight of the n-th code of an arc is the greater of 1/n and dt / window. Phases are of the order of 1e8 m, where
-    double precision resolves 1.5e-8 m. The recursion therefore uses code less phase, less its first value on the arc,
-    which is of the order of metres, so that rounding errors do not accumulate.
+    double precision resolves 1.5e-8 m. The recursion therefore uses the difference code minus phase, minus the first
+    difference on the arc. This is of the order of metres, so that rounding errors do not accumulate.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every additional
 satellite is a test with centimetre precision. Where the satellites are inconsistent, the channels with the largest
-residuals are rejected one by one until the remaining channels agree. The number of an arc, unique in a run, contains
-the letters of its channel and a count of arcs.
+residuals are rejected one by one until the remaining channels agree. The number of an arc is unique in a run, and
+contains the letters of the channel and a count of arcs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-COUNT_BITS: Final = 23  #: Low bits of an arc's number, which are its count; the higher bits are the channel's letters.
+#: Number of low bits of an arc number that are the count; the higher bits are the channel's letters.
+COUNT_BITS: Final = 23
 NO_ARC: Final = -1  #: Arc number where there is no phase.
 
 ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each channel.
@@ -40,7 +41,7 @@ def channel_code(satellite: str, signal: str) -> int:
 
 
 def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
-    """Return the satellite and signal of each channel, by which states refer to channels."""
+    """Return the satellite and signal of each channel, which identify channels in states."""
     return tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
 
 
@@ -94,14 +95,16 @@ def decode_channel(arc_id: Integers) -> Integers:
 class ContinuityLimits(Settings):
     """Limits of the test of phase changes."""
 
-    #: Standard deviation of a phase change, constant and in proportion to the interval (satellite clocks, delays).
-    phase_m: float = Field(default=0.012, gt=0)
+    phase_m: float = Field(default=0.012, gt=0)  #: Constant part of the standard deviation of a phase change.
+    #: Part of this standard deviation in proportion to the interval, due to satellite clocks and delays.
     drift_mps: float = Field(default=0.008, gt=0)
-    #: Standard deviation of the map error of the motion across and up, independent of its length (map points).
+    #: Standard deviation of the motion across and up due to errors of map points, for any distance moved.
     aside_m: float = Field(default=0.02, gt=0)
-    #: Standard deviation of the map error of the motion, as a fraction of the distance moved: a position error of 5 m
-    #: turns the line by 0.017 rad on a curve of 300 m radius, and by 0.0025 rad on a vertical curve of 2000 m.
+    #: Standard deviation of the motion across due to the line's direction, as a fraction of the distance moved. A
+    #: position error of 5 m turns the line by 0.017 rad on a curve of 300 m radius.
     across_share: float = Field(default=0.02, gt=0)
+    #: Standard deviation of the motion up, as a fraction of the distance moved. A position error of 5 m turns the line
+    #: by 0.0025 rad on a vertical curve of 2000 m.
     up_share: float = Field(default=0.003, gt=0)
     sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
     #: Largest number of channels rejected; if more would have to be rejected, all tested channels start new arcs.
@@ -116,7 +119,7 @@ class ContinuityState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channels: ChannelKeys = ()
     phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Corrected phase; NaN where not used; shape (M,).
-    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))  #: Shape (M, 3).
+    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))  #: Satellite positions, shape (M, 3).
     arc_m: float = float("nan")
 
 
@@ -127,9 +130,8 @@ class TrackJumps:
     jump: Masks  #: True where the phase change is inconsistent and a new arc begins, shape (T, M).
     metric_m: Floats  #: Residual of the phase change in the fit of the kept channels; NaN if not tested; shape (T, M).
     judged: Masks  #: True where the phase change is tested, shape (T, M).
-    #: Distance along the line since the previous epoch, from the phases, and its sigma; NaN where unknown; shape (T,).
-    moved_m: Floats
-    moved_sigma_m: Floats
+    moved_m: Floats  #: Distance along the line since the previous epoch, from phases; NaN where unknown; shape (T,).
+    moved_sigma_m: Floats  #: Standard deviation of `moved_m`; NaN where unknown; shape (T,).
 
 
 class TrackedPhases(NamedTuple):

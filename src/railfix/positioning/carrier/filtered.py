@@ -45,7 +45,7 @@ SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together, which limits 
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """Information of the epochs so far on A active arcs."""
+    """Information on A active arcs from the epochs so far."""
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -182,7 +182,7 @@ def _segment(
 def _ambiguities(
     matrix: Floats, right: Floats, arc_id: Integers, memory: Memory, *, held: bool
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
-    """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
+    """Return ambiguities of each epoch's channels minus their first values, shape (T, M, 3), and covariances (T, M, M).
 
     The ambiguities are computed from the normal equations of each epoch and all earlier epochs. The ambiguities of all
     arcs, and the memory after the last epoch, are also returned. With `held` the ambiguities have a zero mean

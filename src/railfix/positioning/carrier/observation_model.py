@@ -29,7 +29,7 @@ PhaseClocks = Literal["own", "shared"]
 
 PLACE: Final = 3  #: Number of own unknowns of an epoch before the clocks: along, across, up.
 _FREE_M: Final = 1e5  #: Prior sigma of an unknown, a loose prior for conditioning [m].
-_LEAST_TIE_M: Final = 1e-2  #: Least sigma of a tie between clocks [m].
+_LEAST_TIE_M: Final = 1e-2  #: Minimum sigma of an inter-system bias that ties two clocks [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,16 +37,17 @@ class IntegerChannels:
     """Channels whose ambiguities differ by whole cycles."""
 
     wavelength_m: Floats  #: Shape (M,).
-    group: Integers  #: Group of channels with the same clock and signal; -1 for no integer ambiguity; shape (M,).
+    group: Integers  #: Group of channels with the same clock and signal; -1 without integer ambiguities; shape (M,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phases:
     """Corrected phases of an antenna for its `Ranges`: T epochs by M channels."""
 
-    #: Phase times wavelength, corrected like the code (`corrected_phase_m`); any value where the weight is 0; (T, M).
+    #: Carrier phase [m], corrected like the code (`corrected_phase_m`); arbitrary where the weight is 0; shape (T, M).
     phase_m: Floats
-    #: 1/sigma^2, 0 for unused phases; `Ranges.sat_ecef_m` must be valid where it is positive; shape (T, M) [1/m^2].
+    #: 1/sigma^2, 0 for unused phases; `Ranges.sat_ecef_m` must be valid where the weight is positive; shape (T, M)
+    #: [1/m^2].
     weight: Floats
     #: Number of the arc, constant while the phase of one channel is unbroken, and unique in a run; shape (T, M).
     arc_id: Integers
@@ -59,7 +60,7 @@ class Phases:
 
 
 def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats, troposphere_m: Floats) -> Floats:
-    """Return the phase corrected to geometry, receiver clock and a constant, shape (T, M) [m].
+    """Return the phase corrected so that geometry, receiver clock and a constant remain, shape (T, M) [m].
 
     Parameters
     ----------
@@ -77,25 +78,21 @@ def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats
 class Linearised:
     """Linearised epochs, with P own unknowns ``x = [along, across, up, clocks]``."""
 
-    #: Design rows of codes and phases, shape (T, M, P).
-    code_design: Floats
-    phase_design: Floats
+    code_design: Floats  #: Design rows of the codes, shape (T, M, P).
+    phase_design: Floats  #: Design rows of the phases, shape (T, M, P).
     groups: int  #: Number of code clocks; a separate phase clock follows them.
-    #: Weights of codes and phases, shape (T, M) [1/m^2].
-    code_weight: Floats
-    phase_weight: Floats
-    #: Observed less computed, less `clock_m`; shape (T, M).
-    code_m: Floats
-    phase_m: Floats
-    #: Approximate clocks of the epoch, subtracted from codes and phases; shape (T,).
-    clock_m: Floats
-    phase_clock_m: Floats
+    code_weight: Floats  #: Weights of the codes, shape (T, M) [1/m^2].
+    phase_weight: Floats  #: Weights of the phases, shape (T, M) [1/m^2].
+    code_m: Floats  #: Observed minus computed code, minus `clock_m`; shape (T, M).
+    phase_m: Floats  #: Observed minus computed phase, minus `phase_clock_m`; shape (T, M).
+    clock_m: Floats  #: Approximate clock of the epoch, subtracted from the codes; shape (T,).
+    phase_clock_m: Floats  #: Approximate clock of the epoch, subtracted from the phases; shape (T,).
     known: Floats  #: Prior information on map errors and inter-system biases, shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of each epoch's own unknowns, shape (T, P, P).
     #: Right-hand side of each epoch's own unknowns; before `shift_phases` from the codes alone; shape (T, P).
     right: Floats
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
-    prior: Floats  #: Information of the map's errors, shape (2,) [1/m^2].
+    prior: Floats  #: Prior information on the map errors across and in height, shape (2,) [1/m^2].
 
 
 def linearise(
@@ -150,7 +147,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the values less the weighted mean of their epoch (0 where the weight is 0), and the mean, shape (T,)."""
+    """Return the values minus the weighted mean of their epoch (0 where the weight is 0), and the mean, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -213,13 +210,11 @@ class OwnUnknowns:
     """Solution for each epoch's own unknowns, given the ambiguities."""
 
     step_m: Floats  #: Distance along the line from the point of linearisation, shape (T,).
-    #: Standard deviation from noise alone, and including the map error; shape (T,).
-    noise_sigma_m: Floats
-    sigma_m: Floats
+    noise_sigma_m: Floats  #: Standard deviation due to noise alone, shape (T,).
+    sigma_m: Floats  #: Standard deviation, including the map error; shape (T,).
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
-    #: Observed less computed, 0 where the weight is 0; shape (T, M).
-    code_residual_m: Floats
-    phase_residual_m: Floats
+    code_residual_m: Floats  #: Observed minus computed code; 0 where the weight is 0; shape (T, M).
+    phase_residual_m: Floats  #: Observed minus computed phase; 0 where the weight is 0; shape (T, M).
 
 
 def own_unknowns(
