@@ -274,7 +274,7 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return the two-way ranges; NaN where they contradict the filter's position, or where it is unknown (P2 3.3).
+    """Return the two-way ranges; NaN where inconsistent with the filter's position, or without a position (P2 3.3).
 
     The gate rejects echoes and ranges to wrongly surveyed units. The position is predicted from the start of the block
     with constant speed; a possible acceleration widens the gate with the square of the elapsed time.

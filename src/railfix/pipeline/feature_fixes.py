@@ -76,7 +76,7 @@ class TrackFeatures:
     def locate(
         self, rates: RateSeries, facing: float, sigma_m: float, state: FeatureState, *, noise: tuple[float, float]
     ) -> tuple[tuple[PassedFeature, ...], FeatureState]:
-        """Return the accepted features that the train has passed, and the state (`feature_fixes`)."""
+        """Return the accepted features that the train has passed, and the new state (`feature_fixes`)."""
         fixes, after = feature_fixes(rates, self.line, facing, sigma_m, state, noise=noise)
         least = (SCALE_SIGMA * HALF_LENGTH_M) ** 2 + _FEATURE_SIGMA_M**2
         found = (

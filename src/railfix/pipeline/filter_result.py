@@ -26,7 +26,7 @@ from railfix.tracking.result import is_bounded
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Filter position at the last epoch, from which dead reckoning by the wheel restarts every few seconds."""
+    """Filter position at an epoch, from which dead reckoning by the wheel restarts every few seconds."""
 
     time: np.datetime64
     #: Arc length; NaN if the filter has no unique position.

@@ -37,7 +37,7 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Rejection reasons of ranges that contradict others, as a spoofer's ranges do.
+#: Rejection reasons of ranges that contradict other ranges, as the ranges of a spoofer do.
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )

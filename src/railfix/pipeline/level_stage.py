@@ -155,7 +155,7 @@ def protection_levels(
 ) -> ProtectionResult:
     """Return the protection levels of a chunk, from the linear model of the positions on the line.
 
-    The part of the map offset that exceeds the sigma of the map is a bias in the level; the hypothesis of a wrong map
+    The part of the measured map offset that exceeds one sigma is a bias in the level; the hypothesis of a wrong map
     covers an undetected offset. Small residuals do not reduce a level: `level_scale` limits the receiver's noise scale,
     shape (T,), and with an error model no range sigma is below the overbound. `sides` is the result of `late_sides`.
     """
@@ -171,9 +171,7 @@ def protection_levels(
 
 
 def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
-    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and the noise scale of the model, 1
-    (T,).
-    """
+    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and the model's noise scale, 1 (T,)."""
     weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
     found = fix.constrained
     model = linear_model(replace(ranges, weight=weight), antennas, found.arc_m, section=found.section)

@@ -26,7 +26,7 @@ class OffMapState:
     """State of the off-map test after a chunk."""
 
     off: bool = False  #: True if the train was off the map at the last epoch.
-    known: bool = False  #: True once a position has been tested; the first position decides alone.
+    known: bool = False  #: True once a position has been tested; the first position alone determines `off`.
     #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
     #: `off`.
     since: np.datetime64 = _NEVER

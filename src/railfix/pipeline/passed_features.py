@@ -11,7 +11,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-#: Below this speed the rates are not used [m/s].
+#: Lowest speed at which the rates are used [m/s].
 SLOWEST_MPS: Final = 1.0
 
 

@@ -415,7 +415,7 @@ class EpochProcessor:
 
 
 def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> None:
-    """Raise ValueError if an epoch is not after the preceding epoch of this chunk or of the state `before`."""
+    """Raise ValueError if an epoch is not after the preceding epoch in this chunk or in the state `before`."""
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")

@@ -60,7 +60,7 @@ def correct_ranges(
 ) -> tuple[CorrectedRanges, ApproximatePosition]:
     """Return corrected ranges of a chunk, and approximate antenna positions.
 
-    An error model gives minimum sigmas for the protection level; the weights follow ``config.noise``.
+    An error model provides minimum sigmas for the protection level; the weights are based on ``config.noise``.
     """
     satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
     near = approximate_position(

@@ -51,7 +51,7 @@ class Column(Generic[Source]):
     #: all rows; values of a column with `words` are indices of words.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
-    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words that the values stand for, by index.
+    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words to which integer values refer, by index.
 
     @property
     def unit(self) -> str:
@@ -119,12 +119,12 @@ def make_table(columns: Mapping[str, Column[Source]], source: Source, rows: int,
 
 
 def _get_screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
-    """Return the array of a column filled by a screen; None if the screen is off."""
+    """Return the values of a column that a screen fills; None if the screen is off."""
     return getattr(result.screens[column.verdict], column.field) if column.verdict in result.screens else None
 
 
 def _get_screened_channels(observed: Observed, column: ScreenColumn) -> Floats:
-    """Return the array of a column filled by an observation screen, on all channels."""
+    """Return the values of a column that an observation screen fills, on all channels."""
     return observed.on_all_channels(_get_screened(observed.result, column))
 
 
@@ -142,7 +142,7 @@ class Observed:
     tracked: AlongTrack | None = None
 
     def on_all_channels(self, values: Floats | None) -> Floats:
-        """Return values of the positioning channels on all channels: shape (T, M), NaN elsewhere."""
+        """Return values of the positioning channels, spread over all channels, shape (T, M); NaN elsewhere."""
         return self.result.on_all_channels(np.nan if values is None else values)
 
     def innovation(self, kind: Kind) -> Floats:
@@ -240,7 +240,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_separation",
-            "largest ratio, over all fault hypotheses, of the separation of the position to the threshold",
+            "largest ratio of the separation of a fault hypothesis to the threshold of the separation",
             "protection.level.separation",
         ),
         Column(
@@ -355,7 +355,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column("elevation_deg", "elevation of the satellite", "result.elevation_deg"),
         Column("azimuth_deg", "azimuth of the satellite, from north over east", "result.azimuth_deg"),
         Column("cn0_dbhz", "carrier-to-noise density", "result.cn0_dbhz"),
-        Column("sigma_m", "standard deviation of the pseudorange, as the weights assume", "result.sigma_m"),
+        Column("sigma_m", "standard deviation of the pseudorange assumed by the weights", "result.sigma_m"),
         Column(
             "corrected_code_m",
             "pseudorange corrected for satellite clock, group delay and atmosphere",

@@ -59,7 +59,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def columns(self) -> Indices:
-        """Channels that settings allow, in the order of `corrected`, shape (K,)."""
+        """Indices of the channels that the settings allow, in the order of `corrected`, shape (K,)."""
         return self.corrected.columns
 
     @property
@@ -93,7 +93,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         return np.asarray((seen & ~used).sum(axis=1), dtype=np.int64)
 
     def on_all_channels(self, values: Floats | float) -> Floats:
-        """Return values of the allowed channels, shape (T, K), on all channels: (T, M), NaN elsewhere."""
+        """Return values of the allowed channels, shape (T, K), spread over all channels, (T, M); NaN elsewhere."""
         full = np.full(self.corrected.observations.code_m.shape, np.nan)
         full[:, self.corrected.columns] = values
         return full

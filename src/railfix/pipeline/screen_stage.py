@@ -96,7 +96,7 @@ def screen_positions(
     screens: Sequence[tuple[Any, Any]],
     config: Config,
 ) -> tuple[Codes, dict[str, dict[str, Screened]]]:
-    """Return the statuses (T,) after the screens that compare two antennas' positions, and verdicts by antenna.
+    """Return the statuses (T,) after the screens that compare the positions of two antennas, and verdicts by antenna.
 
     A rejection sets the screen's status on both antennas.
     """

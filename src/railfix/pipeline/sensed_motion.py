@@ -73,13 +73,13 @@ class SensedMotion:
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
     #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an offset of
-    #: 0.01 m/s2 causes an error of 0.001. This and the next three are NaN unless the wheel rolls without slip and
-    #: faster than `SLOWEST_MPS`; shape (T,) each.
+    #: 0.01 m/s2 causes an error of 0.001. The gradient and the next three values are NaN unless the wheel rolls without
+    #: slip and faster than `SLOWEST_MPS`; shape (T,) each.
     gradient: Floats
     curvature_1pm: Floats  #: Curvature from the yaw rate, positive to the right toward rising arc length.
-    cant_m: (
-        Floats  #: Cant over the wheels' contact points, from roll, left rail higher positive; NaN without a vehicle.
-    )
+    #: Cant over the wheels' contact points, from the roll of the body, positive if the left rail is higher; NaN without
+    #: a vehicle.
+    cant_m: Floats
     under_m: Floats  #: Chainage of the body's middle.
 
 

@@ -24,7 +24,7 @@ from railfix.positioning.range_arrays import InterSystemBiases
 class ProtectionResult(NotebookTable):
     """Protection levels of T epochs."""
 
-    #: Levels on the channels of the ranges; NaN without a position, and with a fault that remains after RAIM.
+    #: Levels, with channels as in the ranges; NaN without a position, or if a fault remains after RAIM.
     level: ProtectionLevel
     status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
     kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
@@ -49,7 +49,7 @@ class Solution(NotebookTable):
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
     #: receiver's noise and the noise by the epoch's residuals, widened by Student's t where few ranges are redundant.
-    #: Also given where the position is dropped; shape (T,).
+    #: It is also given at epochs whose position is dropped; shape (T,).
     epoch_sigma_m: Floats
     #: Position along the antenna's trajectory, from codes or from code and phase; shape (T,).
     arc_m: Floats

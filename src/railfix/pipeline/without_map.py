@@ -28,7 +28,7 @@ from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_sat
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
-#: Range of ellipsoidal heights of receivers on land and in aircraft [m]; positions beyond it are wrong.
+#: Range of ellipsoidal heights of receivers on land and in aircraft [m]; positions outside this range are wrong.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Height range of the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)

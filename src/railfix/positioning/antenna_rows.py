@@ -1,7 +1,7 @@
 """Epochs of several antennas as rows of common arrays.
 
-Stages that depend neither on the line nor on earlier epochs process all rows in one call; the other stages are called
-for the rows of each antenna, and their results are joined.
+Stages that depend neither on the line nor on earlier epochs process all rows in one call. Other stages are called once
+for the rows of each antenna, and the results are joined.
 """
 
 from __future__ import annotations

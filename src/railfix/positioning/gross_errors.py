@@ -219,7 +219,7 @@ def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
     """Return residuals at positions (T, N, 3), minus the median residual of each clock, (T, N, M) [m]; NaN if unused.
 
     The median of an even number is the mean of the lower and the upper median, unless one of these has a clearly
-    smaller `_capped_cost`. The mean fits no range if half of the ranges has a gross error. If some residuals of a clock
+    smaller `_capped_cost`. The mean fits no range if half of the ranges have gross errors. If some residuals of a clock
     agree with the median of all residuals to `_CLOCKS_APART_M`, the median of this clock is the median of these
     residuals alone.
     """

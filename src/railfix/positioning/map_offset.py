@@ -29,7 +29,7 @@ _SUMS: Final = 9  #: Number of sums per window.
 
 
 class MapOffsetLimits(Settings):
-    """Limits of the test of the map."""
+    """Limits of the test of the map against 3-D positions."""
 
     #: Time constant of exponential forgetting. The default has six independent samples, and is short enough to detect
     #: local map errors.
@@ -99,7 +99,7 @@ class MapOffset(NotebookTable):
 
     @property
     def seen(self) -> tuple[Floats, Floats]:
-        """Offset (T, 2) [m] and its inverse covariance (T, 2, 2) [1/m^2]; 0 where there are too few samples."""
+        """Offset (T, 2) [m] and the inverse of its covariance (T, 2, 2) [1/m^2]; 0 with too few samples."""
         known = np.isfinite(self.across_m)[:, None]
         offset = np.where(known, np.array([self.across_m, self.up_m]).T, 0.0)
         return offset, np.where(known[..., None], _inverse_2x2(self.covariance_m2), 0.0)

@@ -66,7 +66,7 @@ def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) 
 class ConstrainedLimits(Settings):
     """Limits of the iteration along the line."""
 
-    #: The iteration ends at a shorter step inside a section, with an error of 0.03 mm (`railfix.kernels.ranges`).
+    #: Step length below which the iteration ends inside a section; the error is 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
     max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including steps to another section.
 
@@ -179,7 +179,7 @@ class SectionArrays(NamedTuple):
 class SinglePointLimits(Settings):
     """Limits of the iteration of 3-D positions, and of their validation (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: The iteration ends at a shorter step, with an error of 0.01 mm.
+    tolerance_m: float = Field(default=1.0, gt=0)  #: Step length below which the iteration ends; the error is 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
     #: False-alarm probability of the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)

@@ -113,7 +113,7 @@ class RobustClock:
     """Clocks of T epochs, G groups, K channels."""
 
     clock_m: Floats  #: NaN with fewer than `least_ranges` ranges, shape (T, G).
-    share: Floats  #: Weight of each channel in its clock estimate; 0 for channels not used; shape (T, K).
+    share: Floats  #: Weight of each channel in the clock estimate of its group; 0 for unused channels; shape (T, K).
 
 
 def robust_clock(

@@ -5,7 +5,7 @@ these differences equals the sum for the residuals with the clock of each conste
 returns the point with the least ``q`` in a time that hardly depends on the length of the line. Where a 3-D position
 exists, ``q`` increases from this position as a quadratic form, so only the points inside a ball are evaluated.
 Otherwise the search is coarse to fine. It relies on a bound: between two points, the root of ``q`` changes by at most
-their distance times the root of the summed weights. Both searches are exact.
+the distance times the root of the summed weights. Both searches are exact.
 """
 
 from __future__ import annotations

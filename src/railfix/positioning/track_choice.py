@@ -38,7 +38,7 @@ _LARGEST_MISFIT: Final = 4.0
 #: Length of track before and behind the code position over which the likelihood is integrated [m].
 _REACH_M: Final = 40.0
 _LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are set to the errors at this elevation.
-#: Residual atmospheric error of the difference of phases at two positions, as a fraction of their distance.
+#: Residual atmospheric error of the phase difference of two receivers, as a fraction of their distance.
 _PHASE_SHARE: Final = 1e-6
 #: Phases are evaluated for hypotheses whose log likelihood from the codes is at most this much below the largest.
 _UNLIKELY: Final = 25.0

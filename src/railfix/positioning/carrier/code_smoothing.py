@@ -63,7 +63,8 @@ class CycleSlipLimits(Settings):
     #: Constant part of the limit of the phase change minus the change predicted from Dopplers. On real receivers at
     #: 1 Hz the median of the metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
-    doppler_mps: float = Field(default=0.05, gt=0)  #: Part of this limit in proportion to the interval.
+    #: Part of the limit of the phase change in proportion to the interval.
+    doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
     #: Limit of the change of code minus phase, tested where Dopplers are absent or less precise.
     code_m: float = Field(default=10.0, gt=0)
@@ -75,7 +76,7 @@ class CycleSlipState:
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
-    code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Shape (M,).
+    code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code, shape (M,).
     phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Phase as received, without `step_ms`; shape (M,).
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))  #: Doppler times wavelength, shape (M,).
     half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).

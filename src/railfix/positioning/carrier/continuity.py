@@ -30,7 +30,7 @@ ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each chann
 
 @dataclass(frozen=True, kw_only=True)
 class ArcState:
-    """Number of arcs so far, by channel code."""
+    """Number of arcs so far, by channel code (`channel_code`)."""
 
     count: Mapping[int, int] = field(default_factory=dict)
 
@@ -96,7 +96,7 @@ class ContinuityLimits(Settings):
     """Limits of the test of phase changes."""
 
     phase_m: float = Field(default=0.012, gt=0)  #: Constant part of the standard deviation of a phase change.
-    #: Part of this standard deviation in proportion to the interval, due to satellite clocks and delays.
+    #: Part of the standard deviation of a phase change in proportion to the interval (satellite clocks, delays).
     drift_mps: float = Field(default=0.008, gt=0)
     #: Standard deviation of the motion across and up due to errors of map points, for any distance moved.
     aside_m: float = Field(default=0.02, gt=0)
