@@ -189,8 +189,8 @@ class Config(ScreenSettings):
     araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
     #: Largest protection level of an available position. P4 takes a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
-    #: Chainage intervals in which local faults cannot be bounded and no level is given (``railfix error-model`` prints
-    #: the intervals of its runs).
+    #: Chainage intervals in which local faults cannot be bounded and no level is given. ``railfix error-model`` prints
+    #: the intervals that it finds.
     no_level_m: tuple[tuple[float, float], ...] = ()
     #: Whether the protection level of P4 is computed, too: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
@@ -201,11 +201,10 @@ class Config(ScreenSettings):
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
-    #: Limits of the stages of the carrier phase.
-    slips: CycleSlipLimits = CycleSlipLimits()
-    smoothing: SmoothingLimits = SmoothingLimits()
-    continuity: ContinuityLimits = ContinuityLimits()
-    phase: PhaseLimits = PhaseLimits()
+    slips: CycleSlipLimits = CycleSlipLimits()  #: Limits of the cycle-slip detection.
+    smoothing: SmoothingLimits = SmoothingLimits()  #: Limits of the smoothing of codes by the carrier phase.
+    continuity: ContinuityLimits = ContinuityLimits()  #: Limits of the test of phase changes along the line.
+    phase: PhaseLimits = PhaseLimits()  #: Limits of the float and integer ambiguities.
     #: Filter along the track, which combines codes, Dopplers, carrier-phase changes and sensors of this and earlier
     #: epochs. `railfix run` and `railfix demo` switch it on.
     filter: Literal["track", "off"] = "track"
@@ -214,11 +213,10 @@ class Config(ScreenSettings):
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()  #: Process and measurement noise of the filter.
     sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and the tachometer's wheel.
-    #: Limits of the stages of single-epoch positions.
-    clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
-    single_point: SinglePointLimits = SinglePointLimits()
-    section: SectionLimits = SectionLimits()
-    constrained: ConstrainedLimits = ConstrainedLimits()
+    clock_offsets: ClockOffsetLimits = ClockOffsetLimits()  #: Limits of the inter-system biases.
+    single_point: SinglePointLimits = SinglePointLimits()  #: Limits of the 3-D positions of single epochs.
+    section: SectionLimits = SectionLimits()  #: Limits of ambiguous sections.
+    constrained: ConstrainedLimits = ConstrainedLimits()  #: Limits of the iteration along the line.
 
     @model_validator(mode="before")
     @classmethod

@@ -35,7 +35,7 @@ class CheckedPositions(NamedTuple):
     """Positions after the exclusion of faults, T epochs."""
 
     fix: LineFix
-    model: LinearModel  #: Linear model of the positions.
+    model: LinearModel  #: Linear model at the positions on the line.
     raim: RaimResult
     scale: Floats  #: Noise scale of the receiver, shape (T,).
     off_map: Masks  #: Epochs with ranges inconsistent with the map, shape (T,).

@@ -147,7 +147,6 @@ class SmoothedTrack(NotebookTable):
     """Positions of T epochs, each from all measurements before and after it."""
 
     time: Datetimes  #: Time tags, shape (T,).
-    #: Arc length and its standard deviation, shape (T,).
-    arc_m: Floats
-    sigma_m: Floats
+    arc_m: Floats  #: Arc length, shape (T,).
+    sigma_m: Floats  #: Standard deviation of the arc length, shape (T,).
     speed_mps: Floats  #: Speed along the line, shape (T,).

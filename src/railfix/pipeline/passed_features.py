@@ -50,9 +50,8 @@ class FeatureState:
     angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch at the last tick, from an arbitrary origin [rad].
     #: Whole metres passed without a break, in the order of travel; shape (M,).
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    #: Heading and pitch at each metre, shape (M,).
-    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
-    pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
+    heading_rad: Floats = field(default_factory=lambda: np.empty(0))  #: Heading at each metre, shape (M,).
+    pitch_rad: Floats = field(default_factory=lambda: np.empty(0))  #: Pitch at each metre, shape (M,).
     #: Position of the last accepted feature, its standard deviation, and the wheel distance at the feature [m].
     last: tuple[float, float, float] | None = None
     done_m: float = float("nan")  #: Position up to which features have been compared; NaN before the first.

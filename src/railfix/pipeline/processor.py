@@ -244,7 +244,8 @@ class EpochProcessor:
         ValueError
             The epochs of an antenna are not in ascending order, or do not begin after the end of `state`.
         SettingsError
-            A condition of the class applies, an antenna has no trajectory, or no navigation records were given.
+            One of the conditions of the class applies, an antenna has no trajectory, or there are no navigation
+            records.
         """
         if navigation is None and state is None and not self._navigation_given:
             raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")

@@ -146,7 +146,7 @@ def receive(
     navigation: Navigation | None = None,
     messages: Any = None,
 ) -> Received:
-    """Return the received data after new navigation records and messages; `before` if neither is given.
+    """Return the received data after new navigation records and messages; return `before` without new data.
 
     `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped, and
     so are repeated and expired records, except for a satellite's newest record. Newer coefficients and precise

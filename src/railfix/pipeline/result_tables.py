@@ -331,7 +331,7 @@ def train_table(result: Result) -> pl.DataFrame:
 
 
 def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
-    """Return rows of `train_table` with `SMOOTHED_COLUMNS`, given by antenna in the same order."""
+    """Return rows of `train_table` with `SMOOTHED_COLUMNS` added; `smoothed` has them by antenna, in the same order."""
     antenna = table["antenna"].to_numpy()
     values = {name: np.full(len(table), np.nan) for name in SMOOTHED_COLUMNS}
     for name, rows in smoothed.items():

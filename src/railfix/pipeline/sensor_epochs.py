@@ -68,16 +68,16 @@ class SensorLimits(Settings):
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     #: Detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
-    #: Position of the vehicle's ranging unit: ahead of the vehicle's middle, or of the antenna without a vehicle file;
-    #: to the right of the antenna's path; and above the antenna.
+    #: Distance of the ranging unit ahead of the vehicle's middle, or ahead of the antenna if there is no vehicle file.
     range_ahead_m: float = 0.0
-    range_right_m: float = 0.0
-    range_above_m: float = 0.0
+    range_right_m: float = 0.0  #: Distance of the vehicle's ranging unit to the right of the antenna's path.
+    range_above_m: float = 0.0  #: Height of the vehicle's ranging unit above the antenna.
 
     balise: BaliseLimits = Field(default_factory=BaliseLimits)
     #: After an outage, codes are used again when three consecutive positions are within this number of sigmas of the
-    #: dead-reckoned position, or after this time.
+    #: dead-reckoned position.
     return_sigmas: float = Field(default=4.0, gt=0)
+    #: Longest time for which codes are withheld after an outage.
     return_s: float = Field(default=60.0, ge=0)
     #: Standard deviation of a distance between two epochs due to creep of a braked or driven wheel, in addition to the
     #: pulse quantisation.

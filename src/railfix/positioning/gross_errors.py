@@ -89,7 +89,8 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     """Find the raw codes with errors above `GROSS_M`, shape (T, M), where the other codes agree on a 3-D position.
 
     At least `_LEFT_IN_SPACE` redundant ranges must remain and agree. With fewer redundant ranges, a single range is
-    rejected if the other ranges agree, and if ranges do not agree after the exclusion of any other single range.
+    rejected if the other ranges agree without it, and if the exclusion of any other single range does not lead to
+    agreement.
     """
     place = least_absolute(ranges, start_ecef_m)
     residual = residuals_at(ranges, place)
