@@ -81,7 +81,7 @@ class InterferenceLimits(Settings):
     least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test over all satellites.
     #: Minimum fall of C/N0 below the recent peak, as the median of all satellites.
     fall_db: float = Field(default=5.0, gt=0)
-    #: Largest standard deviation of the falls over the satellites. A jammer raises the noise of all channels equally,
+    #: Largest standard deviation of the falls over the satellites. A jammer raises the noise of all channels equally;
     #: walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
@@ -89,7 +89,8 @@ class InterferenceLimits(Settings):
     #: Minimum fall of the front-end gain, as a fraction of the recent peak. While a receiver starts without
     #: interference, the fall reaches 14 %.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
-    #: Largest standard deviation of C/N0 over the satellites at which C/N0 counts as equal; 1.2 dB or more in open sky.
+    #: Standard deviation of C/N0 over the satellites up to which C/N0 counts as equal. In open sky, this standard
+    #: deviation is 1.2 dB or more.
     equal_db: float = Field(default=0.8, gt=0)
     #: Minimum step of the codes relative to the Dopplers, minus whole milliseconds. Phone clocks step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
@@ -220,7 +221,7 @@ class PowerState:
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
     #: Peak of C/N0 plus the decay since the GPS epoch, shape (K,); -inf before the first observation.
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Time since the GPS epoch at which the current tracking of each channel began, shape (K,); NaN before the first.
+    #: Time since the GPS epoch at which the current tracking of each channel began, shape (K,); NaN if never tracked.
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     #: Time since the GPS epoch at which each channel was last observed, shape (K,); NaN before the first observation.
     last_s: Floats = field(default_factory=lambda: np.zeros(0))

@@ -16,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Standard deviation added to positions for satellite and atmospheric errors that change over minutes [m].
+#: Standard deviation added to that of positions, for satellite and atmospheric errors that change over minutes [m].
 _LEAST_M: Final = 1.0
 #: Largest speed at which a tachometer may have no output [m/s].
 _SLOW_MPS: Final = 0.5
