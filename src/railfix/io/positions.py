@@ -100,8 +100,8 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
     )
 
 
-#: Rows are sorted by time if all have times and none is out of order by more than this [s]; otherwise they stay in the
-#: file's order.
+#: Rows are sorted by time if all rows have times and no row is out of order by more than this [s]. Otherwise the rows
+#: stay in the order of the file.
 _SORTED_S: Final = 60.0
 
 
@@ -137,8 +137,8 @@ def read_positions(
     Returns
     -------
     PositionLog
-        All rows and columns of the file. If times go back, there is a note, and the rows are sorted by time if they all
-        have times and go back by at most one minute.
+        All rows and columns of the file. If times go back, a note states this. The rows are then sorted by time if
+        every row has a time and no time goes back by more than one minute.
 
     Raises
     ------

@@ -56,8 +56,9 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return the path of the QGIS style to write for a file; None if the format has no style or the style file already
-    exists.
+    """Return the path of the QGIS style to write for a file.
+
+    Return None if the format has no style or the style file already exists.
     """
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
@@ -66,8 +67,9 @@ def style_file(path: Path) -> Path | None:
 
 
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates in the format of the file ending, and the QGIS style; return the number of rows
-    written.
+    """Write the rows with coordinates and the QGIS style; return the number of rows written.
+
+    The ending of the file name determines the format.
 
     Raise NoPositionError if no row has coordinates.
     """

@@ -42,7 +42,7 @@ from railfix.io.receiver.nav_messages import (
 )
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
-#: Constellation of RTCM ephemeris messages.
+#: Constellation letter by number of an RTCM ephemeris message.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
 _STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which strings 1 to 4 are sent [s].
 _EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch that gives the string its time [s].
@@ -101,8 +101,9 @@ def assemble_records(
 def assemble_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) without repetitions, and the state after
-    them.
+    """Return the ephemerides of RTCM 3 messages without repetitions, and the state after them.
+
+    The fields of the messages are from `rtcm.ephemeris_fields`.
 
     `time` is the time of reception of each message, shape (N,).
     """

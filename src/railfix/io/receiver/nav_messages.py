@@ -32,7 +32,7 @@ def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
 
 
 def _with_head(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
-    """Return layouts by kind, each extended by the fields `head`, which all kinds have."""
+    """Return layouts by kind of message, each extended by the fields `head`, which all kinds of message have."""
     return {kind: head | fields for kind, fields in kinds.items()}
 
 
@@ -178,7 +178,7 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "tow_s": (16, 18.0, "u"),
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
-BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 known to begin with the health.
+BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health status.
 #: Subframe, first bit and end of the data bits in each of the three pages into which a B-CNAV1 frame is divided. In a
 #: page, these bits follow PRN, page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
@@ -190,9 +190,10 @@ BCNAV1: Final = _with_head(BCNAV1_HEAD, {
               toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
     2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
 })  # fmt: skip
-#: Reference semi-major axes of B-CNAV1 and B-CNAV2 [m] for geosynchronous (kinds 1 and 2) and medium (3) Earth orbits.
+#: Reference semi-major axes of B-CNAV1 and B-CNAV2 [m] by kind of orbit: geosynchronous (1, 2) and medium Earth orbits
+#: (3).
 BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
-CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
+CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Number of bits before the CRC: CNAV, F/NAV, B-CNAV2.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **_ORBIT,
     **_flags(number=6, tow_s=20, subframe=3, health=1, aodc=5, aode=5, accuracy=4, week=13, toe_high=2, toe_low=15),
@@ -205,7 +206,7 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **dict.fromkeys(("cuc", "cus", "cic", "cis"), (18, 2.0**-31, "s")),
     **dict.fromkeys(("crc", "crs"), (18, 2.0**-6, "s")),
 }
-#: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
+#: Fields of all BeiDou D1 and D2 subframes (10 words of 30 bits, parity included): seconds of week, subframe number.
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
 D1: Final = _with_head(BDS_HEAD, {
     1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
@@ -322,14 +323,14 @@ E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
 E5A_SOURCE: Final = 1 << 1 | 1 << 8
 _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)
-_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
-#: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
+_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: UBX numbers of signals with CNAV (L2C, L5).
+#: UBX numbers of BeiDou signals with D1 or D2, with B-CNAV1 (B1C) and with B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
 #: Offsets added to the numbers of F/NAV pages, CNAV messages and B-CNAV1 pages, so that the page numbers of a satellite
 #: are unique.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
-Pages = Iterator[tuple[int, int, Values]]  #: Row, page number of the satellite, and fields of each page.
+Pages = Iterator[tuple[int, int, Values]]  #: Row in `Subframes`, page number and fields of each page.
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:

@@ -22,7 +22,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_co
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 #: Time system of a file without TIME OF FIRST OBS, by constellation letter of the file.
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-ALL: Final = ""  #: Key of the types of a RINEX 2 file, which apply to all constellations.
+ALL: Final = ""  #: Key of the observation types of a RINEX 2 file, which apply to all constellations.
 #: Longest accepted header [bytes].
 _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
@@ -32,12 +32,12 @@ _OTHER_NAMES: Final = {"GPST": "GPS", "BDS": "BDT", "GLONASS": "GLO", "GALILEO":
 
 @dataclass(frozen=True, kw_only=True)
 class RinexHeader:
-    """Contents of the header needed to read the lines after it."""
+    """Contents of a header that are needed to read the lines after the header."""
 
     version: float
     system: str  #: Constellation letter of the file, "M" when mixed.
     time_system: str = "GPS"
-    #: Declared types by constellation letter; RINEX 2 has one entry, `ALL`.
+    #: Declared observation types by constellation letter; RINEX 2 has one entry, `ALL`.
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     #: SYS / SCALE FACTOR by constellation and type.
     scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
