@@ -58,7 +58,7 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 def style_file(path: Path) -> Path | None:
     """Return the path of the QGIS style to write for a file.
 
-    Return None if the format has no style or the style file already exists.
+    Return None if the format has no style or the file exists with the same content.
     """
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
@@ -69,9 +69,7 @@ def style_file(path: Path) -> Path | None:
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
     """Write the rows with coordinates and the QGIS style; return the number of rows written.
 
-    The ending of the file name determines the format.
-
-    Raise NoPositionError if no row has coordinates.
+    The ending of the file name determines the format. Raise NoPositionError if no row has coordinates.
     """
     points = _points(rows)
     if points.is_empty():

@@ -103,9 +103,7 @@ def assemble_rtcm(
 ) -> tuple[Assembled, Unfinished]:
     """Return the ephemerides of RTCM 3 messages without repetitions, and the state after them.
 
-    The fields of the messages are from `rtcm.ephemeris_fields`.
-
-    `time` is the time of reception of each message, shape (N,).
+    `messages` is from `rtcm.ephemeris_fields`, and `time` is the time of reception of each message, shape (N,).
     """
     builder = _EphemerisBuilder(state)
     for (_, kind, values), at in zip(messages, time, strict=True):
