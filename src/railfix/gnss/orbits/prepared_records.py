@@ -30,7 +30,7 @@ from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 #: broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: A transmission time is wrong if it is earlier than the start of the record's validity by more than this [s].
+#: A transmission time is wrong if it is outside the validity of the record by more than this [s].
 _EARLY_S: Final = 3600.0
 #: Time span that a lookup key can hold [ms]: 34 years, so that records of another year are kept apart.
 _SPAN: Final = np.int64(2**40)
