@@ -13,7 +13,7 @@ from railfix.core.nearest_times import nearest_rows
 from railfix.motion.samples import RadarSpeeds
 
 _WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].
-_LEAST_SPEEDS: Final = 10  #: Minimum number of pairs of speeds in a window.
+_LEAST_SPEEDS: Final = 10  #: Minimum number of speeds in a window that is used.
 #: Largest time between a radar speed and the satellite-derived speed with which it is compared [ns].
 _NEAR_NS: Final = 150_000_000
 _MOVING_MPS: Final = 3.0  #: Lowest speed of the train at which speeds are compared [m/s].

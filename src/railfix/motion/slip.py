@@ -8,7 +8,7 @@ During a slip, this sine exceeds the gradient of any line. There are two rules:
 * ``"map"`` compares the pitch with the gradient of the line at the present position, and has a latch: a slip ends only
   when the wheel has returned to the inertial speed and the pitch agrees, or when wheel and train are at rest.
 
-During a slip, speed and distance are integrated from the accelerometer less the components of pitch and offset, from
+During a slip, speed and distance are integrated from the accelerometer minus the components of pitch and offset, from
 `LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. Without a gyro, the pitch of the line
 is used where the position is known. With a gyro, the pitch is the integral of the pitch rate, with a slow correction to
 the line or, where the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
@@ -33,14 +33,14 @@ from railfix.core.settings import Settings
 class MotionState(IntEnum):
     """State of motion, which determines the source of the speed."""
 
-    INIT = 0  #: Not yet initialised; no speed.
-    STANDING = 1  #: At rest: no pulse for a second, and the inertial speed is small.
-    LOW_SPEED = 2  #: The train moves too slowly for the tachometer; inertial speed.
-    NORMAL = 3  #: The wheel rolls; speed of the wheel.
-    INERTIAL_SPIN = 4  #: The wheel is faster than the train; inertial speed.
-    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; inertial speed.
-    ROLLING = 6  #: The train rolls away from rest, too slowly for the tachometer; inertial speed.
-    EXPIRED = 7  #: The inertial speed is too old or implausible; no speed.
+    INIT = 0  #: Not yet initialised; there is no speed.
+    STANDING = 1  #: At rest: there was no pulse for a second, and the inertial speed is small.
+    LOW_SPEED = 2  #: The train moves too slowly for the tachometer; the speed is inertial.
+    NORMAL = 3  #: The wheel rolls; the speed is that of the wheel.
+    INERTIAL_SPIN = 4  #: The wheel is faster than the train; the speed is inertial.
+    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; the speed is inertial.
+    ROLLING = 6  #: The train rolls away from rest, too slowly for the tachometer; the speed is inertial.
+    EXPIRED = 7  #: The inertial speed is too old or implausible; there is no speed.
 
 
 #: Limit of the difference between the pitch sines of vehicle and line; it equals 0.15 m/s2 between wheel and train.
@@ -266,8 +266,8 @@ class _Automaton:
         """Update the reference pitch and the gyro bias.
 
         Without a gyro, the pitch of the line is used. With a gyro, the pitch is the integrated rate, corrected slowly
-        to the line, or to the pitch from wheel and accelerometer if the line is unknown. At rest, the gyro bias is the
-        mean rate over `bias_s`.
+        to the pitch of the line, or to the pitch from wheel and accelerometer if the line is unknown. At rest, the gyro
+        bias is the mean rate over `bias_s`.
         """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel

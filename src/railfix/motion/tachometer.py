@@ -122,8 +122,8 @@ def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerL
 def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     """Return masks of the pulses that follow a lost pulse, and of the pulses that are doubled, shape (P,) each.
 
-    A pulse is lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are missing. A
-    pulse is doubled where two successive intervals together equal a neighbouring interval.
+    A pulse counts as lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are
+    missing. It counts as doubled where two successive intervals together equal a neighbouring interval.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
