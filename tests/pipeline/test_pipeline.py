@@ -251,7 +251,7 @@ def test_epochs_out_of_order_are_refused(step: int) -> None:
 def test_a_chunk_before_the_last_one_and_a_processor_without_navigation_are_named():
     one, parts = processor(), {name: whole[:20] for name, whole in demo_observations().items()}
     _, state = one.process({name: part[10:] for name, part in parts.items()})
-    with pytest.raises(ValueError, match=r"front: the chunk begins at .*, not after .*, the last epoch of the given state"):
+    with pytest.raises(ValueError, match=r"front: the chunk begins at .*, not after .*, the last epoch of"):
         one.process({name: part[:10] for name, part in parts.items()}, state)
     with pytest.raises(SettingsError, match="no navigation records: EpochProcessor"):
         EpochProcessor(one.config, one.trajectories).process(parts)

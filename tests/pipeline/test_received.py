@@ -121,7 +121,7 @@ def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordi
         EpochProcessor(Config(filter="off"), line, navigation=navigation).process({"front": log[:1]}, messages=messages)
     with pytest.raises(SettingsError, match=r"SBAS is on in the settings .* were not given; give both"):
         EpochProcessor(config, line, navigation=navigation)
-    with pytest.raises(SettingsError, match="sbas_band = L1, but the corrections are of SBAS on L5"):
+    with pytest.raises(SettingsError, match="sbas_band = L1, but the corrections are for SBAS on L5"):
         EpochProcessor(config, line, navigation=navigation, corrections=SbasState(prn=137, band="L5"))
 
 

@@ -53,8 +53,8 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
         for value in (None, 3)
     },
     "no file": (lambda _: railfix.read_track([]), "no file was given"),
-    "no trajectory": (lambda m: railfix.EpochProcessor(m["config"], {}), "one for each antenna, at least one"),
-    "path alone": (lambda m: railfix.EpochProcessor(m["config"], m["path"]), "one for each antenna, at least one"),
+    "no trajectory": (lambda m: railfix.EpochProcessor(m["config"], {}), "one for each antenna, and at least one"),
+    "path alone": (lambda m: railfix.EpochProcessor(m["config"], m["path"]), "one for each antenna, and at least one"),
     "another antenna": (lambda m: railfix.EpochProcessor(m["config"], {"middle": m["path"]}), "front and rear"),
     "a track": (lambda m: railfix.EpochProcessor(m["config"], {"front": m["track"]}), "; antenna_trajectory returns"),
     "a dictionary": (lambda m: railfix.EpochProcessor({}, {"front": m["path"]}), "config: expected Config, got dict"),
@@ -72,8 +72,8 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
         lambda m: railfix.EpochProcessor(m["config"], {"front": m["path"]}).process({"front": m["log"]}),
         r"no navigation records: EpochProcessor\(\.\.\., navigation=read_navigation\(file\)\)$",
     ),
-    "no log": (lambda m: m["processor"].process({}), "one log for each antenna, at least one"),
-    "log alone": (lambda m: m["processor"].process(m["log"]), "one log for each antenna, at least one"),
+    "no log": (lambda m: m["processor"].process({}), "one log for each antenna, and at least one"),
+    "log alone": (lambda m: m["processor"].process(m["log"]), "one log for each antenna, and at least one"),
     "path of a log": (lambda m: m["processor"].process({"front": "a.obs"}), "; read_observations returns one"),
     "log of another antenna": (lambda m: m["processor"].process({"rear": m["log"]}), "no trajectory for antenna rear"),
     "another state": (lambda m: m["processor"].process({"front": m["log"]}, m["result"]), "state: expected State"),
@@ -147,10 +147,8 @@ def test_what_the_command_line_notes_is_a_warning_in_python_once(made: dict[str,
     (ionosphere,) = warned(lambda: run(navigation=no_ionosphere))
     assert ionosphere.startswith("ionosphere: klobuchar requested")
     late = replace(made["log"], time=made["log"].time + np.timedelta64(3, "D"))
-    assert (
-        "front: no epoch has a position: no navigation record is valid at the time of the log; are the records of another day?"
-        in warned(lambda: run(log=late))
-    )
+    cause = "no navigation record is valid at the time of the log; are the records of another day?"
+    assert f"front: no epoch has a position: {cause}" in warned(lambda: run(log=late))
     moved = made["track"].latitude_deg + 0.002
     elsewhere = railfix.Track.from_geodetic(moved, made["track"].longitude_deg, made["track"].height_m)
     path = railfix.antenna_trajectory(elsewhere, made["vehicle"])

@@ -147,7 +147,7 @@ def test_a_screen_may_be_given_to_the_processor() -> None:
     assert found.screens["every_third"].reject[0].any()
     taken = EveryThird()
     type(taken).name = "raim"
-    with pytest.raises(ValueError, match="there is a screen raim already"):
+    with pytest.raises(ValueError, match="a screen named raim exists already"):
         EpochProcessor(Config(), trajectories, navigation=clean_navigation(), screens=(taken,))
 
 
