@@ -21,7 +21,7 @@ from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import SettingsError
 from railfix.core.files import FilePath
 
-#: EPSG codes of the three-dimensional geographic CRS of each ITRF realisation.
+#: EPSG code of the three-dimensional geographic CRS of each ITRF realisation.
 _ITRF: Final = {
     "ITRF88": "EPSG:7900", "ITRF89": "EPSG:7901", "ITRF90": "EPSG:7902", "ITRF91": "EPSG:7903", "ITRF92": "EPSG:7904",
     "ITRF93": "EPSG:7905", "ITRF94": "EPSG:7906", "ITRF96": "EPSG:7907", "ITRF97": "EPSG:7908",
@@ -41,7 +41,7 @@ _ALIGNED: Final = {
     "ITRF2014": "IGS14, IGb14, WGS 84 (G2139), ATRF2014, SIRGAS-CON SIR17P01",
     "ITRF2020": "IGS20, WGS 84 (G2296)",
 }
-#: EPSG codes of ITRF realisations by the names of frames that agree with them.
+#: EPSG code of an ITRF realisation, by the name of the realisation or of a frame aligned with it.
 REALISATIONS: Final = _ITRF | {name: _ITRF[itrf] for itrf, names in _ALIGNED.items() for name in names.split(", ")}
 
 
@@ -54,8 +54,9 @@ class HeldFrame:
     plate: str  #: Plate of the ITRF2020 plate motion model on which most of the country lies.
     #: Smallest and largest motion of the country relative to the plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: Clause on other neglected motions, for the note.
-    #: Second plate, and two points (latitude, longitude) of its border; the second plate is on the right of the border.
+    but: str = ""  #: Clause for the note to the user, on other motions that are neglected.
+    #: Second plate of the country, and two points (latitude, longitude) on the border between both plates. Seen from
+    #: the first point to the second, the second plate is on the right.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
 
     @property
@@ -79,7 +80,7 @@ class HeldFrame:
 
 
 _ANDES: Final = "as are earthquakes, metres in Chile since 2010"
-#: National frames that are a realisation of the ITRF fixed at an epoch, where PROJ has no motion for them.
+#: National frames that are a realisation of the ITRF fixed at an epoch, and whose motion PROJ does not model.
 HELD: Final = {
     "JGD2011": HeldFrame(
         "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "as is the epoch 1997.0 of western Japan (--map-epoch 1997)"
@@ -135,7 +136,7 @@ HELD: Final = {
     "Mexico ITRF2008": HeldFrame("ITRF2008", 2010.0, "NOAM", (0.0, 50.0)),
     "RGSPM06": HeldFrame("ITRF2000", 2006.0, "NOAM"),
 }
-#: Frames that are treated as another frame, with the EPSG code of that frame and a clause on the agreement.
+#: Frames that are treated as another frame, with the EPSG code of the other frame and a clause on the agreement.
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
@@ -152,17 +153,18 @@ SAME: Final = {
 TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later realisations.
 #: Frame in which positions are computed: the three-dimensional geographic CRS of ITRF2020.
 WORKING_FRAME: Final = "EPSG:9989"
-#: EPSG codes of the three-dimensional CRS of frames that are usual for maps of a region. Of the frames whose areas
-#: contain a point, the first is the most likely.
+#: EPSG codes of the three-dimensional CRS of frames in which the maps of a region usually are. If the areas of several
+#: frames contain a point, the first of these frames is the most likely one.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
     "NZGD2000": "EPSG:4959", "SIRGAS 2000": "EPSG:4989", "Hartebeesthoek94": "EPSG:4941",
 }  # fmt: skip
-MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
+MARGIN_DEG: Final = 0.5  #: Margin that is added around the area of use of a CRS [deg].
 #: Largest accepted deviation of the scale of a grid from 1 along a line; national grids deviate by up to 0.005.
 LARGEST_SCALE: Final = 0.01
-MODERN_M: Final = 0.5  #: Worst accuracy of a PROJ transformation between modern frames [m]; older datums are worse.
+#: Worst accuracy of a PROJ transformation between modern frames [m]. Transformations of older datums are less accurate.
+MODERN_M: Final = 0.5
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
 #: Worst accuracy of an operation that is used [m]; 999 in the EPSG dataset means unknown.
@@ -176,8 +178,8 @@ Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 def kind_of_frame(crs: str) -> Kind:
     """Return the kind of a CRS by its relation to the ITRF; raise SettingsError if the CRS is unknown.
 
-    "wgs84" is WGS 84 without a realisation, "moves with its plate" a frame fixed to a plate, "dynamic" an ITRF
-    realisation, and "older datum" a datum without a transformation to ITRF2020 of at most `MODERN_M`.
+    "wgs84" is WGS 84 without a realisation, "moves with its plate" a frame fixed to a plate, and "dynamic" an ITRF
+    realisation. "older datum" is a datum without a transformation to ITRF2020 that is accurate to `MODERN_M`.
     """
     geodetic = get_geodetic_frame(crs)
     name = geodetic.name
@@ -192,12 +194,15 @@ def kind_of_frame(crs: str) -> Kind:
 
 @lru_cache(maxsize=64)
 def _system(crs: str) -> CRS:
-    """Return the CRS of a name, cached because PROJ takes a millisecond; raise CRSError if the name is unknown."""
+    """Return the CRS with a name; raise CRSError if the name is unknown.
+
+    CRS are cached, because PROJ takes a millisecond to create one.
+    """
     return CRS.from_user_input(crs)
 
 
 def find_crs(crs: str, *, path: FilePath = "") -> CRS:
-    """Return the CRS of a name; raise SettingsError, which names the file `path`, if the name is unknown to PROJ."""
+    """Return the CRS with a name; raise SettingsError, with the file `path`, if PROJ does not know the name."""
     try:
         return _system(crs)
     except CRSError:
@@ -208,10 +213,10 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 
 
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
-    """Return the CRS of a file, which the user gives or the file names; None if it is unknown.
+    """Return the CRS of a file, from the user (`given`) or from the file (`named`); None if neither states a CRS.
 
-    If both name the same CRS, a given compound CRS is returned, because it has a height datum. Raise SettingsError if
-    the two CRS contradict each other, or a CRS is unknown.
+    If both state the same CRS, and the user's is a compound CRS, that one is returned, because it has a height datum.
+    Raise SettingsError if the two CRS contradict each other, or a CRS is unknown.
     """
     if given is None or named is None:
         used = given or named
@@ -249,7 +254,7 @@ def get_vertical_datum(crs: str | None) -> CRS | None:
 
 @lru_cache(maxsize=64)
 def get_geodetic_frame(crs: str) -> CRS:
-    """Return the geodetic CRS on which a CRS is based; raise SettingsError if it has none."""
+    """Return the geodetic CRS on which a CRS is based; raise SettingsError if there is none."""
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
@@ -262,7 +267,7 @@ def get_geodetic_frame(crs: str) -> CRS:
 def find_operation(crs: str) -> Transformer | None:
     """Return PROJ's best transformation from the frame of a CRS to the working frame.
 
-    The result is None if PROJ has no transformation with an accuracy of `MODERN_M` or better.
+    The result is None if no transformation is accurate to `MODERN_M`.
     """
     source = get_geodetic_frame(crs)
     sources = [source] if source.name not in SAME else [source, CRS.from_user_input(SAME[source.name][0])]
@@ -275,7 +280,7 @@ def find_operation(crs: str) -> Transformer | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operations:
-    """PROJ's operations between two CRS within a box."""
+    """PROJ's operations between two CRS that are valid within a box."""
 
     usable: tuple[Transformer, ...]  #: Usable operations, best first.
     lacking: tuple[Any, ...] = ()  #: Operations whose grids are not installed.
@@ -283,7 +288,8 @@ class Operations:
     def describe_lacking(self, crs: str | None = None) -> str:
         """Return a clause on the best operation whose grid is not installed, and how to get the grid; "" if none.
 
-        Operations whose grids can be downloaded by projsync precede others; then accuracy decides.
+        An operation whose grids can be downloaded by projsync is preferred. Among equal operations, the most accurate
+        is the best.
         """
         if not self.lacking:
             return ""
@@ -322,7 +328,7 @@ def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operati
     """
     area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # missing grids are in the result
+        warnings.simplefilter("ignore", UserWarning)  # the result lists missing grids
         try:
             group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
         except (ProjError, IndexError):  # IndexError: pyproj cannot construct an operation known at a single epoch
@@ -341,12 +347,12 @@ def rank_operation(operation: Transformer) -> tuple[bool, float]:
 
 
 def known_accuracy_m(accuracy_m: float) -> float:
-    """Return an accuracy stated by PROJ [m]; infinity where it is unknown (negative)."""
+    """Return an accuracy stated by PROJ [m]; infinity for a negative accuracy, which means unknown."""
     return accuracy_m if accuracy_m >= 0.0 else np.inf
 
 
 def contains(area: Any, box: Box) -> bool:
-    """Return whether an area of use contains a box; True if there is no area."""
+    """Return whether an area of use contains a box; True if the area is None."""
     if area is None:
         return True
     south, north, west, east = box
@@ -355,7 +361,9 @@ def contains(area: Any, box: Box) -> bool:
 
 
 def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:
-    """Return a mask of the points within a margin of the area of use of a CRS; all True for a CRS without an area."""
+    """Return a mask of the points in the area of use of a CRS, extended by a margin; all True for a CRS without an
+    area.
+    """
     area = crs.area_of_use
     if area is None:
         return np.ones(len(latitude_deg), dtype=bool)
@@ -363,7 +371,7 @@ def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_
 
 
 def _in_bounds(bounds: Box, latitude_deg: Floats, longitude_deg: Floats, margin_deg: float) -> Masks:
-    """Return a mask of the points within a margin of bounds, which may cross the date line."""
+    """Return a mask of the points inside bounds extended by a margin; the bounds may cross the date line."""
     south, north, west, east = bounds
     inside = (latitude_deg >= south - margin_deg) & (latitude_deg <= north + margin_deg)
     width = (east - west) % 360.0 if east - west < 360.0 else 360.0

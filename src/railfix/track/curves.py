@@ -1,10 +1,10 @@
-"""Curve of a centreline between its points, which follows arcs and clothoids in plan, and parabolas in height.
+"""Curve of a centreline between the points of a track; it follows arcs and clothoids in plan, and parabolas in height.
 
-Between two points, the curve is a cubic over their chord, defined by the directions at both ends. For a curvature that
-is linear between points, each chord implies a direction at its ends; the direction at a point is the mean from both
-adjacent chords. The curvature at a point is from the map's radius, or from the circle through the point and its
-neighbours. The curve passes through every point, and follows arcs, clothoids and parabolas within millimetres.
-Chainages are measured along the chords.
+Between two points, the curve is a cubic over their chord, defined by the directions at both ends. The curvature is
+assumed to be linear between points, so that each chord implies a direction at each of its ends. The direction at a
+point is the mean of the directions implied by both adjacent chords. The curvature at a point is taken from the map's
+radius, or from the circle through the point and its neighbours. The curve passes through every point, and follows arcs,
+clothoids and parabolas within millimetres. Chainages are measured along the chords.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest difference between the middle ordinates of a chord that follow from the map's radius and from neighbouring
-#: points [m]. With a larger difference, the radius is not used, because it belongs to another point or has the wrong
-#: sign.
+#: Largest difference between the middle ordinate of a chord from the map's radius and the middle ordinate from
+#: neighbouring points [m]. With a larger difference, the radius is not used: it belongs to another point, or has the
+#: wrong sign.
 _AGREES_M: Final = 0.03
-_CORNER_RAD: Final = 0.25  #: Smallest change of direction that is a corner, which the curve does not round [rad].
-#: Minimum distance of a ramp's end from either point, as a fraction of the distance between the points, and minimum
-#: difference of the two lines over this distance.
+_CORNER_RAD: Final = 0.25  #: Change of direction above which a point is a corner, which the curve does not round [rad].
+#: Minimum distance of a ramp's end from either point, as a fraction of the distance between both points.
 _BREAK_SHARE: Final = 1e-3
+#: Minimum difference between the lines before and after a ramp's end, over the distance between both points.
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `curved_line` [m].
 
@@ -38,9 +38,10 @@ class CentreCurve:
 
     chainage_m: Floats  #: Chainages of the points, shape (V,).
     points_m: Floats  #: ECEF coordinates of the points, shape (V, 3).
-    #: Directions at start and end of each segment relative to its chord, to the right and upward, (V - 1, 2) [rad].
+    #: Directions of the curve relative to the chord at start and end of each segment, positive to the right, (V - 1, 2)
+    #: [rad].
     to_right: Floats
-    to_top: Floats
+    to_top: Floats  #: The same directions upward, shape (V - 1, 2) [rad].
 
     @cached_property
     def length_m(self) -> Floats:
@@ -49,14 +50,16 @@ class CentreCurve:
 
     @cached_property
     def _axes(self) -> Floats:
-        """Unit vectors along, to the right and upward of each chord, shape (V - 1, 3, 3)."""
+        """Unit vectors of each chord: along the chord, to the right, and upward, shape (V - 1, 3, 3)."""
         along = np.diff(self.points_m, axis=0) / self.length_m[:, None]
         right = np.cross(along, axes_at((self.points_m[1:] + self.points_m[:-1]) / 2.0)[:, 2])
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         return np.stack([along, right, np.cross(right, along)], axis=1)
 
     def at(self, chainage_m: Floats) -> Floats:
-        """Return points of the curve, shape (n, 3) ECEF [m]; beyond the ends, the outermost chords are extended."""
+        """Return points of the curve at chainages, shape (n, 3) ECEF [m]; beyond the ends, the outermost chords are
+        extended.
+        """
         last = len(self.length_m) - 1
         segment = np.clip(np.searchsorted(self.chainage_m, chainage_m, side="right") - 1, 0, last)
         along = chainage_m - self.chainage_m[segment]
@@ -64,7 +67,7 @@ class CentreCurve:
         return np.asarray(self.points_m[segment] + np.einsum("ni,nij->nj", parts, self._axes[segment]))
 
     def _offset(self, slopes: Floats, segment: Indices, along_m: Floats) -> Floats:
-        """Return the distance of the curve from its chord, given the directions at both ends [m]."""
+        """Return the distance of the curve from the chord [m], given the directions at both ends of the segments."""
         share = np.clip(along_m / self.length_m[segment], 0.0, 1.0)
         first, last = slopes[segment].T
         return np.asarray(self.length_m[segment] * share * (1.0 - share) * (first * (1.0 - share) - last * share))
@@ -74,8 +77,8 @@ class CentreCurve:
 
         The chainages of all points are included.
         """
-        # A cubic deviates from its chord by an eighth of the length times the change of direction, and by more if its
-        # slopes differ in size.
+        # A cubic deviates from its chord by an eighth of the length times the change of direction. It deviates by more
+        # if the slopes at both ends differ in size.
         turn = np.abs(self.to_right).sum(axis=1) + np.abs(self.to_top).sum(axis=1)
         pieces = np.maximum(np.ceil(np.sqrt(self.length_m * turn / (6.0 * within_m))), 1.0).astype(np.int64)
         start, piece = places_in_groups(pieces)
@@ -83,7 +86,7 @@ class CentreCurve:
 
 
 def centre_curve(track: Track) -> CentreCurve:
-    """Compute the curve through the points of a track, which must not have duplicate points."""
+    """Compute the curve through the points of a track without duplicate points."""
     step = np.diff(track.ecef_m, axis=0)
     axes = axes_at(track.ecef_m)
     before, after = (np.einsum("vij,vj->vi", axes[1:-1], part) for part in (step[:-1], step[1:]))
@@ -105,12 +108,12 @@ def centre_curve(track: Track) -> CentreCurve:
 
 
 def _to_ends(inner: Floats) -> Floats:
-    """Return values of the inner points, with the first and last value repeated for the end points, shape (V,)."""
+    """Return the values of the inner points, with the first and the last value repeated for the ends, shape (V,)."""
     return np.concatenate([inner[:1], inner, inner[-1:]]) if len(inner) else np.zeros(2)
 
 
 def _with_radii(track: Track, of_points: Floats) -> Floats:
-    """Return the curvature at each point, from the map if consistent with the points, otherwise from the points."""
+    """Return the curvature at each point, from the map where it agrees with the points, otherwise from the points."""
     with np.errstate(divide="ignore"):
         of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
     around = np.stack([np.roll(of_points, 1), of_points, np.roll(of_points, -1)])
@@ -122,10 +125,10 @@ def _with_radii(track: Track, of_points: Floats) -> Floats:
 
 
 def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -> Floats:
-    """Compute the directions at both ends of each segment relative to its chord, shape (V - 1, 2) [rad].
+    """Compute the directions of the curve relative to the chord at both ends of each segment, shape (V - 1, 2) [rad].
 
-    `curvature` (V,) is linear between points. At an inner point, where the chords turn by `turn` (V - 2,), the
-    directions of both segments are made equal, except at a corner.
+    `curvature` (V,) is linear between points. `turn` (V - 2,) is the change of direction of the chords at inner points.
+    At an inner point that is not a corner, both segments have the same direction.
     """
     first, last = curvature[:-1], curvature[1:]
     start, end = -length_m * (2.0 * first + last) / 6.0, length_m * (first + 2.0 * last) / 6.0
@@ -137,10 +140,10 @@ def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -
 
 
 def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return a piecewise linear function with additional points at the ends of ramps that lie between its points.
+    """Return a piecewise linear function with additional points at those ends of ramps that lie between points.
 
-    A ramp ends between two points if the line through the two points before and the line through the two points after
-    intersect there. Chainages `place_m` and `values` have shape (V,).
+    A ramp ends between two points if the line through the two points before the end and the line through the two points
+    after it intersect there. Chainages `place_m` and `values` have shape (V,).
     """
     if len(place_m) < 4:
         return place_m, values
@@ -160,7 +163,7 @@ def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
 def curved_line(track: Track) -> Trajectory:
     """Compute the centreline of a track as a trajectory whose chords are within 2 mm of the curve.
 
-    Unknown cant is replaced by 0, unless the cant of all points is unknown.
+    Unknown cant is replaced by 0, unless the cant of every point is unknown.
     """
     curve = centre_curve(track)
     chainage = curve.chords_m(_CHORD_M)

@@ -25,7 +25,8 @@ from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 from railfix.track.transitions import OrdinateElement
 
-#: Fraction of the change of curvature or cant at a fraction t of the length, and its integral from 0 to t (IFC 4.3.2).
+#: For each law, the fraction of the change of curvature or cant that is reached at the fraction t of the length, and
+#: the integral of this function from 0 to t (IFC 4.3.2).
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     "linear": (lambda t: t, lambda t: t**2 / 2.0),
     "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
@@ -44,29 +45,30 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
     ),
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_PIECE_RAD: Final = 0.5  #: Largest turn within one quadrature interval, for which 12 nodes are exact to rounding [rad].
-_CHORD_M: Final = 0.01  #: Largest distance of chords between an alignment's points from its arcs [m].
+#: Largest turn within one quadrature interval [rad]; up to this turn, 12 nodes are exact to rounding.
+_PIECE_RAD: Final = 0.5
+_CHORD_M: Final = 0.01  #: Largest distance between the chords of an alignment's points and the alignment [m].
 _LONGEST_M: Final = 25.0  #: Largest spacing of an alignment's points [m].
-_CLOTHOID_POINTS: Final = 2001  #: Number of points of a profile clothoid, which is linear between them within 1 um.
-_JOINT_M: Final = 0.01  #: Largest distance between the end of an element and the start of the next without a note [m].
+#: Number of points on a profile clothoid; linear interpolation between the points is accurate to 1 um.
+_CLOTHOID_POINTS: Final = 2001
+#: Distance between the end of an element and the start of the next element above which a note is given [m].
+_JOINT_M: Final = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanElement:
-    """Element in plan, whose curvature follows a law over its length."""
+    """Element in plan with a curvature that follows a law over the length of the element."""
 
-    #: Easting and northing of the first point.
-    x_m: float
-    y_m: float
+    x_m: float  #: Easting of the first point.
+    y_m: float  #: Northing of the first point.
     direction_rad: float  #: Direction at the first point, counter-clockwise from the x axis.
-    #: Curvature at the first and the last point, positive to the left [1/m].
-    first: float
-    last: float
+    first: float  #: Curvature at the first point, positive to the left [1/m].
+    last: float  #: Curvature at the last point, positive to the left [1/m].
 
     length_m: float
     law: str = "linear"  #: Law of the curvature, a key of `LAWS`.
     #: For a Viennese bend, height of the centre of gravity times the change of the cant angle, positive where the right
-    #: rail rises; 0 otherwise. The law then describes the path of the centre of gravity.
+    #: rail rises; the law then describes the path of the centre of gravity. For other laws 0.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -85,7 +87,8 @@ class PlanElement:
     def place_at(self, way_m: Floats) -> Floats:
         """Return the easting and northing, shape (n, 2) [m], at distances from the first point [m]."""
         turn = max(abs(self.first), abs(self.last)) * self.length_m
-        pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even, as Helmert's law has a knot in the middle
+        # even number, because Helmert's law has a knot in the middle
+        pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))
         knots = np.linspace(0.0, self.length_m, pieces + 1)
         whole = np.concatenate([np.zeros((1, 2)), np.cumsum(self._integral(knots[:-1], knots[1:]), axis=0)])
         piece = np.clip(np.searchsorted(knots, way_m, side="right") - 1, 0, pieces - 1)
@@ -97,27 +100,28 @@ class PlanElement:
         return np.stack([(half * _WEIGHTS * part(direction)).sum(axis=1) for part in (np.cos, np.sin)], axis=-1)
 
 
-#: Element in plan, defined by a law of the curvature over its length, or by ordinates over the tangent.
+#: Element in plan, defined by a law of the curvature, or by ordinates over the tangent.
 Plan = PlanElement | OrdinateElement
 
 
 @dataclass(frozen=True)
 class Stations:
-    """Stations (kilometrage) of an alignment with jumps."""
+    """Stations (kilometrage) of an alignment, which may jump at station equations."""
 
-    #: Distance in plan of the start and of each jump, in rising order, and the stations just before and after it [m].
+    #: A row for the start and for each jump, in rising order [m]: distance in plan from the start of the alignment,
+    #: station just before this point, and station just after it.
     rows: tuple[tuple[float, float, float], ...]
     last_sign: float = 1.0  #: 1 if the stations rise after the last row, -1 if they fall.
-    jump_m: float = 0.05  #: Half length of the interval between points in which the kilometrage jumps.
+    jump_m: float = 0.05  #: Half length of the interval within which the kilometrage jumps.
 
     @property
     def places_m(self) -> Floats:
-        """Distances in plan of the points on both sides of each jump [m]."""
+        """Distances in plan from the start, for the points on both sides of each jump [m]."""
         place = np.array([row[0] for row in self.rows[1:]])
         return np.concatenate([place - self.jump_m, place + self.jump_m])
 
     def at(self, place_m: Floats) -> Floats:
-        """Return the stations at distances in plan, shape (n,) [m]."""
+        """Return the stations at distances in plan from the start, shape (n,) [m]."""
         place, _, ahead = np.array(self.rows).T
         row = np.clip(np.searchsorted(place, place_m, side="right") - 1, 0, len(place) - 1)
         signs = [*(np.sign(b[1] - a[2]) or 1.0 for a, b in pairwise(self.rows)), self.last_sign]
@@ -128,13 +132,11 @@ class Stations:
 class ProfileElement:
     """Element of the profile: constant gradient, circular arc, parabola or clothoid."""
 
-    #: Start and length of the element, measured in plan along the alignment.
-    start_m: float
-    length_m: float
-    height_m: float  #: Height at the start.
-    #: Gradient at start and end [m/m].
-    first: float
-    last: float
+    start_m: float  #: Distance in plan from the start of the alignment to the start of the element.
+    length_m: float  #: Length of the element in plan.
+    height_m: float  #: Height at the start of the element.
+    first: float  #: Gradient at the start of the element [m/m].
+    last: float  #: Gradient at the end of the element [m/m].
     #: Shape: "circle", "clothoid" or "parabola"; a constant gradient is a parabola with equal gradients at both ends.
     arc: str = "parabola"
     bend: float = 0.0  #: Curvature of a clothoid at the start, positive in a sag [1/m].
@@ -165,13 +167,14 @@ class ProfileElement:
 
     @cached_property
     def _clothoid(self) -> tuple[Floats, Floats, Floats]:
-        """Distances in plan, heights above the start, and gradients at points of a clothoid.
+        """Return points of a clothoid: distances in plan and heights, both from its start, and gradients.
 
         The slope angle is a quadratic function of the length along the curve.
         """
         start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
         length = self.length_m
-        for _ in range(20):  # iterate the length along the curve until its projection is the length in plan
+        # iterate the length along the curve until the projection of the curve is as long as the length in plan
+        for _ in range(20):
             way = np.linspace(0.0, length, _CLOTHOID_POINTS)
             angle = start + self.bend * way + (turn - self.bend * length) * (way / length) ** 2
             place, height = (
@@ -183,14 +186,12 @@ class ProfileElement:
 
 @dataclass(frozen=True, kw_only=True)
 class CantElement:
-    """Element of the cant, in which the heights of both rails follow a law."""
+    """Element of the cant; the heights of both rails follow a law over the length of the element."""
 
-    #: Start and length of the element, measured in plan along the alignment.
-    start_m: float
-    length_m: float
-    #: Heights of the left and the right rail above the profile, at start and end.
-    left_m: tuple[float, float]
-    right_m: tuple[float, float]
+    start_m: float  #: Distance in plan from the start of the alignment to the start of the element.
+    length_m: float  #: Length of the element in plan.
+    left_m: tuple[float, float]  #: Heights of the left rail above the profile, at start and end of the element.
+    right_m: tuple[float, float]  #: Heights of the right rail above the profile, at start and end of the element.
     law: str = "linear"  #: Law of the heights, a key of `LAWS`.
 
     def rails_at(self, place_m: Floats) -> tuple[Floats, Floats]:
@@ -212,7 +213,7 @@ class AlignmentPoints:
     xy_m: Floats  #: Easting and northing, shape (n, 2).
     height_m: Floats  #: Height of the middle between the rail tops, shape (n,); NaN without a profile.
     curvature: Floats  #: Curvature, positive to the left, shape (n,) [1/m].
-    cant_m: Floats  #: Height of the right above the left rail, shape (n,); NaN without cant.
+    cant_m: Floats  #: Height of the right rail above the left rail, shape (n,); NaN without cant.
     gradient: Floats  #: Gradient of the profile [m/m], shape (n,); NaN without a profile.
 
 
@@ -221,7 +222,8 @@ def alignment_at(
 ) -> AlignmentPoints:
     """Compute the points of an alignment at distances in plan, shape (n,) [m].
 
-    Each position is computed from the first point of its element, so that open joints do not add up.
+    Each position is computed from the first point of the element, so that the errors of joints that do not meet do not
+    add up.
     """
     starts = plan_starts(plan)
     xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
@@ -243,14 +245,16 @@ def alignment_at(
 
 
 def plan_starts(plan: Sequence[Plan]) -> Floats:
-    """Return the distance in plan from the start of the alignment to each element, shape (elements,) [m]."""
+    """Return the distance in plan from the alignment's start to the start of each element, shape (elements,) [m]."""
     return np.cumsum([0.0, *(element.length_m for element in plan)])[:-1]
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return the mask of the distances within an element, and its index, for each element that contains a distance.
+    """Return, for each element that contains some of the distances, the mask of these distances and the element's
+    index.
 
-    A distance belongs to the last element that begins before it, or to the first element.
+    A distance belongs to the last element that starts before it. A distance before all elements belongs to the first
+    one.
     """
     if not len(starts):
         return []
@@ -264,7 +268,9 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Compute points of an alignment whose chords are within 1 cm of its arcs, and notes on open joints.
+    """Compute points of an alignment, and a note on joints that do not meet.
+
+    The chords between the points are within 1 cm of the alignment.
 
     `at_m` are distances in plan of additional points [m].
     """
@@ -288,17 +294,18 @@ def alignment_points(
     return alignment_at(place, plan, profile, cant), notes
 
 
-_PROFILE_BEYOND_M: Final = 50.0  #: Largest length of an alignment beyond its profile, which is extended there [m].
+#: Largest length of an alignment beyond the ends of its profile, where the gradient is continued [m].
+_PROFILE_BEYOND_M: Final = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Design:
-    """Elements of one alignment in the order of the line, and its stations."""
+    """Elements of one alignment in the order of the line, and the stations of the alignment."""
 
     plan: Sequence[Plan]
     profile: Sequence[ProfileElement] = ()
     cant: Sequence[CantElement] = ()
-    stations: Stations | None = None  #: Stations; None if the file states none.
+    stations: Stations | None = None  #: Stations; None if the file states no stations.
 
 
 def segment_of_design(
@@ -310,7 +317,7 @@ def segment_of_design(
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
-    """Create a segment of points on one alignment.
+    """Create a segment from the elements of one alignment.
 
     `grid` is the transformation from the file's coordinates to the grid: easting, northing and height of the origin
     [m], cosine and sine of the rotation, and scale. Raise InputFileError or SettingsError if plan, profile or CRS are
@@ -335,7 +342,7 @@ def segment_of_design(
     xy /= unit
     curvature = points.curvature
     if grid is None and is_within(crs, xy[:, ::-1]) and not is_within(crs, xy):
-        # exchanging easting and northing mirrors the plane, so that curves to the left become curves to the right
+        # to exchange easting and northing mirrors the plane, so that left curves become right curves
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
     source, heights = f"{path} ({name})", None
@@ -365,10 +372,9 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Check that a profile covers the plan, except at most `_PROFILE_BEYOND_M`, and return a note on any uncovered
-    length.
+    """Check that a profile covers the plan, and return a note on uncovered length.
 
-    Raise InputFileError if more is uncovered.
+    Raise InputFileError if more than `_PROFILE_BEYOND_M` is uncovered.
     """
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)

@@ -1,9 +1,9 @@
 """Reference frames of track maps, and transformation of maps to the frame of the satellites.
 
 Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation within centimetres. Maps are in a plate-fixed
-frame, or in an ITRF realisation at the epoch of their survey. PROJ transforms coordinates with their epoch. Where PROJ
-has no transformation, the ITRF2020 plate motion model (Altamimi et al. 2023, doi:10.1029/2023GL106373) is used, and a
-note reports this.
+frame, or in an ITRF realisation at the epoch of the survey. PROJ transforms coordinates given at an epoch. Where PROJ
+has no transformation, the ITRF2020 plate motion model (Altamimi et al. 2023, doi:10.1029/2023GL106373) is used, with a
+note.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class FrameShift:
     """Description of the transformation of a map to the frame of the satellites."""
 
     frame: str  #: Name of the map's frame.
-    used: str  #: Frame and epoch of the positions.
+    used: str  #: Frame and epoch of the transformed map, and of the positions computed with it.
     method: str  #: Description of the transformation.
     #: Shift at the middle point of the line.
     east_m: float = 0.0
@@ -63,7 +63,7 @@ class FrameShift:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Transformation as plain values for JSON."""
+        """Description of the transformation as plain values for JSON."""
         return {
             "frame": self.frame,
             "used": self.used,
@@ -73,7 +73,7 @@ class FrameShift:
 
 
 def decimal_year(time: np.datetime64 | Datetimes) -> float:
-    """Return the time as a decimal year, in which the epochs of frames are stated."""
+    """Return a time as a decimal year, the unit in which epochs of frames are stated."""
     year = np.asarray(time, dtype="datetime64[Y]")
     start, end = year.astype("datetime64[s]"), (year + np.timedelta64(1, "Y")).astype("datetime64[s]")
     part = (np.asarray(time, dtype="datetime64[s]") - start) / (end - start)
@@ -85,9 +85,9 @@ class MapMotion(TypedDict, total=False):
 
     epoch: float | None  #: Epoch of the map's coordinates, for a frame that is an ITRF realisation [year].
     plate: str | None  #: Plate, one of `PLATES`, with which ITRF coordinates move from `epoch` to the time of the log.
-    #: Parameter file of the semi-dynamic correction of Japan (``SemiDynaEXE`` format), which transforms JGD2011 to the
-    #: epoch of the file with crustal deformation. `epoch` is then the epoch of the file, after which the plate motion
-    #: is used.
+    #: Parameter file of the semi-dynamic correction of Japan (``SemiDynaEXE`` format). It transforms JGD2011 to the
+    #: epoch of the file, with crustal deformation. `epoch` then states the epoch of the file; after this epoch, the
+    #: plate motion is used.
     parameters: FilePath | None
 
 
@@ -111,14 +111,14 @@ def points_at(
     ----------
     ecef_m : ndarray, shape (n, 3) [m]
     crs : str
-        CRS of the map; `named` is False if it is assumed because the map names no frame.
+        CRS of the map. `named` is False if the map names no frame, so that the CRS is an assumption.
     time : datetime64
         Time of the log.
 
     Returns
     -------
     tuple
-        Transformed points, shape (n, 3) [m], and the shift at the middle point.
+        Transformed points, shape (n, 3) [m], and a description with the shift at the middle point.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def points_at(
 
 
 def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
-    """Return points transformed by an operation of PROJ at an epoch, shape (n, 3) [m]."""
+    """Return points transformed by a PROJ operation at an epoch [year], shape (n, 3) [m]."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
     return ecef_from_geodetic(np.asarray(lat), np.asarray(lon), np.asarray(up))
@@ -169,7 +169,8 @@ def in_map_frame(
 ) -> tuple[Floats, FrameShift]:
     """Transform positions, shape (n, 3) [m], from the frame of the satellites to the frame of a map.
 
-    The shift of `points_at` is subtracted. Unknown positions stay NaN. Raise MismatchError if all positions are NaN.
+    The shift computed by `points_at` is subtracted. Unknown positions (NaN) stay NaN. Raise MismatchError if all
+    positions are NaN.
     """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
@@ -206,7 +207,9 @@ def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
 def _from_held(
     ecef_m: Floats, name: str, held: HeldFrame, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return coordinates of a frame fixed at an ITRF epoch, moved to `year` with the plate at the middle point."""
+    """Return coordinates of a frame fixed at an ITRF epoch, moved to `year` with the plate on which the middle point
+    lies.
+    """
     since = epoch or held.epoch
     latitude, longitude, _ = geodetic_from_ecef(ecef_m[len(ecef_m) // 2])
     plate = plate or held.plate_at(float(latitude), float(longitude))
@@ -233,10 +236,11 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Transform JGD2011 by a semi-dynamic correction, and from its epoch on by plate motion.
+    """Transform JGD2011 coordinates by a semi-dynamic correction, and from the epoch of the correction on by plate
+    motion.
 
-    The correction is computed once per cell of a thousandth of a degree. Raise InputFileError if the file is not valid
-    or does not cover the map.
+    The correction is computed once in each cell of 0.001 deg. Raise InputFileError if the file is not valid or does not
+    cover the map.
     """
     with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans
@@ -267,7 +271,7 @@ def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """Return a note on the possible error at a point of a map that names no reference frame."""
+    """Return a note on the error at a point if a map without a named reference frame is not in WGS 84."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():

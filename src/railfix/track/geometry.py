@@ -10,7 +10,9 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.geodesy import enu_axes
 from railfix.track.track import Track
 
-_BEND_WINDOW_M = 40.0  #: Length over which the curvature of the points is compared with the radius of the map [m].
+#: Length over which the curvature from the points and the curvature from the map's radius are averaged for comparison
+#: [m].
+_BEND_WINDOW_M = 40.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,14 +23,16 @@ class Geometry:
     #: Horizontal turn at each point, positive to the right; NaN at the ends and at duplicates; shape (V,).
     turn_deg: Floats
     reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is NaN; shape (V,).
-    #: Distance from chord to arc at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; shape
-    #: (V - 1,). R is from the map if both ends have a radius, otherwise from circles through neighbouring points.
+    #: Distance from chord to arc at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; shape (V -
+    #: 1,). The radius R is from the map if the map has it at both ends, otherwise from circles through neighbouring
+    #: points.
     mid_chord_m: Floats
     gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
-    height_spike_m: Floats  #: Height above the straight line between both neighbours; NaN at the ends; shape (V,).
-    #: Mean curvatures over 40 m from `Track.radius_m` (NaN where unknown) and from the points, positive to the right;
-    #: shape (V,) [1/m].
+    #: Height of a point above the straight line between both neighbours; NaN at the ends; shape (V,).
+    height_spike_m: Floats
+    #: Mean curvature over 40 m from `Track.radius_m`, positive to the right; NaN where unknown; shape (V,) [1/m].
     map_curvature: Floats
+    #: Mean curvature over 40 m from the points, positive to the right; shape (V,) [1/m].
     point_curvature: Floats
 
 
@@ -40,7 +44,7 @@ def compute_geometry(track: Track) -> Geometry:
         kept = np.array([0, len(track) - 1])
     plan, climb = _plan_steps(track, kept)
     length = np.hypot(plan[:, 0], plan[:, 1])
-    length = np.where(length > 0.0, length, np.nan)  # a point straight above another
+    length = np.where(length > 0.0, length, np.nan)  # NaN for a point straight above the previous point
     turn, reach = _turns(plan)
     height = track.height_m[kept]
     share = length[:-1] / (length[:-1] + length[1:])
@@ -109,7 +113,7 @@ def _circle_curvature(plan: Floats) -> Floats:
 
 
 def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
-    """Compute the means of a piecewise linear function from `low` to `high`; NaN if a value there is unknown."""
+    """Compute the means of a piecewise linear function from `low` to `high`; NaN if a part of it is unknown."""
     unknown = np.isnan(values)
 
     def between(part: Floats) -> Floats:
@@ -121,7 +125,7 @@ def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floa
 
 
 def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
-    """Compute the curvature from the change of heading over a window, to average the noise of points, (V,) [1/m]."""
+    """Compute the curvature from the change of heading over a window, which averages noise, shape (V,) [1/m]."""
     along = track.chainage_m
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     middle = (along[kept][1:] + along[kept][:-1]) / 2.0
@@ -133,9 +137,9 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 
 def mean_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
-    """Compute the mean gradients over a window from `gradient_permille` and from the heights, shape (V,) each.
+    """Compute mean gradients over a window, from the map's gradients and from the heights, shape (V,) each.
 
-    Gradients are in permille, and NaN where unknown or where the line covers less than half of the window.
+    The gradients are in permille. They are NaN where unknown, and where the line covers less than half of the window.
     """
     different = np.concatenate([[True], np.diff(track.chainage_m) > 0.0])
     along, height = track.chainage_m[different], track.height_m[different]
