@@ -1,7 +1,7 @@
-"""Transformation of map coordinates to latitude and longitude in a modern frame, with its accuracy.
+"""Transformation of map coordinates to latitude and longitude in a modern frame, with the accuracy.
 
-Of the operations of PROJ (https://proj.org), only operations are used whose area of use contains the map and whose
-grids are installed. Ballpark operations, which do not change the datum, are not used.
+An operation of PROJ (https://proj.org) is used only if its area of use contains the map and its grids are installed.
+Ballpark operations, which do not change the datum, are not used.
 """
 
 from __future__ import annotations
@@ -37,14 +37,16 @@ from railfix.track.crs import (
     rank_operation,
 )
 
-#: Projections of web and world maps, whose scale differs from 1 so much that it cannot be checked.
+#: Projections of web and world maps; their scale differs so much from 1 that it is not checked.
 _UNEVEN: Final = (
     "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
 )  # fmt: skip
-_CELL_DEG: Final = 0.25  #: Size of the cells in which all maps have the same operation [deg].
+#: Size of the cells for the choice of an operation; all maps in a cell are transformed by the same operation [deg].
+_CELL_DEG: Final = 0.25
 #: Accuracy of a transformation below which it is negligible compared with the accuracy of a map [m].
 NEGLIGIBLE_M: Final = 0.1
-#: Ratio of accuracies below which an operation with a missing grid is reported as better than the used operation.
+#: An operation with a missing grid is reported as better if its accuracy is below this multiple of the accuracy of the
+#: operation that is used.
 _BETTER: Final = 0.9
 
 
@@ -55,7 +57,7 @@ class Georeference:
     latitude_deg: Floats  #: Latitude, shape (n,).
     longitude_deg: Floats  #: Longitude, shape (n,).
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates.
-    operation: str = ""  #: Name of the PROJ operation between the datums; "" if the CRS is based on a modern frame.
+    operation: str = ""  #: Name of the PROJ operation that changed the datum; "" if the CRS is based on a modern frame.
     accuracy_m: float = 0.0  #: Standard deviation in plan of the operation; NaN if unknown.
     notes: tuple[str, ...] = ()
 
@@ -72,7 +74,7 @@ class EllipsoidalHeights:
     height_m: Floats  #: Ellipsoidal height, shape (n,).
     datum: str  #: Height datum of the file, "ellipsoidal" or "orthometric".
     geoid: str = ""  #: Geoid model or operation that was used; "" for ellipsoidal heights.
-    accuracy_m: float = 0.0  #: Standard deviation of the model; NaN if unknown.
+    accuracy_m: float = 0.0  #: Standard deviation of the geoid model or operation; NaN if unknown.
     notes: tuple[str, ...] = ()
 
 
@@ -88,7 +90,7 @@ def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
 
 
 def _cells(box: Box) -> Box:
-    """Return a box extended to full cells, so that all parts of a map have the same operation."""
+    """Return a box extended to full cells, so that all parts of a map are transformed by the same operation."""
     south, north, west, east = box
     low = [float(np.floor(v / _CELL_DEG) * _CELL_DEG) for v in (south, west)]
     high = [float(np.ceil(v / _CELL_DEG) * _CELL_DEG) for v in (north, east)]
@@ -110,14 +112,14 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
     Returns
     -------
     Georeference
-        Coordinates, with the operation between datums and its accuracy.
+        Coordinates in a modern frame, with the operation that changed the datum and the accuracy of the operation.
 
     Raises
     ------
     InputFileError
-        The coordinates are outside the area of use of the CRS, or belong to another grid.
+        The coordinates are outside the area of use of the CRS, or are coordinates of another grid.
     SettingsError
-        PROJ has no operation from the datum of the CRS there, or its grid is not installed.
+        PROJ has no operation from the datum of the CRS at this location, or the grid of the operation is not installed.
     """
     latitude, longitude = _in_degrees(crs, x, y)
     _check_area(crs, latitude, longitude, path=path)
@@ -143,7 +145,7 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return the coordinates of positions in a CRS (inverse of `georeference`), shape (n,) each.
+    """Return the coordinates of positions in the CRS `crs` (inverse of `georeference`), shape (n,) each.
 
     Modern frames are not distinguished, which causes errors of up to 2 m. Raise SettingsError if PROJ has no installed
     operation for the positions.
@@ -179,7 +181,9 @@ class _Chosen:
 
 @lru_cache(maxsize=256)
 def _choose_operation(crs: str, box: Box) -> _Chosen | str:
-    """Return the best operation from a CRS of an older datum to a modern frame within a box, or the reason for none."""
+    """Return the best operation from a CRS of an older datum to a modern frame in a box, or the reason why there is
+    none.
+    """
     source = find_crs(crs).to_2d()
     known = {code: find_operations(source, CRS.from_user_input(code).to_2d(), box) for code in _targets(crs, box)}
     datum = "its own datum" if source.is_bound else get_geodetic_frame(crs).name
@@ -215,7 +219,7 @@ def _choose_operation(crs: str, box: Box) -> _Chosen | str:
 
 def _targets(crs: str, box: Box) -> Iterable[str]:
     """Return the modern frames that a map may be transformed to: the frames of its region, then WGS 84."""
-    if get_geodetic_frame(crs).name == TRANSIT:  # the frames with a known transformation to a realisation of the ITRF
+    if get_geodetic_frame(crs).name == TRANSIT:  # only frames with a known transformation to a realisation of the ITRF
         return ("EPSG:7902",)
     if find_crs(crs).is_bound:  # +towgs84
         return ("EPSG:4326",)
@@ -226,8 +230,9 @@ def _targets(crs: str, box: Box) -> Iterable[str]:
 def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
     """Return the accuracy of the first operation [m], as stated by PROJ or implied by the other operations.
 
-    If another operation differs from the first operation by more than the accuracy of that other operation, the first
-    operation may be wrong by the excess. NaN if PROJ states no accuracy of the first operation.
+    If the results of the first operation and of another operation differ by more than the accuracy of the other
+    operation, the first operation may be wrong by the excess. The result is NaN if PROJ states no accuracy of the first
+    operation.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -244,7 +249,7 @@ def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
 def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
     """Raise InputFileError for points outside the area of use of the frame of a CRS.
 
-    The area of use of the projection is not checked, because projections are used beyond it.
+    The area of use of the projection is not checked, because projections are also used outside their areas.
     """
     south, north, west, east = _bounds(crs)
     of_latitude = south <= latitude_deg.min() and latitude_deg.max() <= north
@@ -271,7 +276,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """Return the bounds of the area of use of the frame of a CRS, with the margin; an empty box without an area."""
+    """Return the bounds of the area of use of the frame of a CRS, with the margin; an empty box if there is no area."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)
@@ -279,8 +284,9 @@ def _bounds(crs: str) -> Box:
 
 
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Raise InputFileError if lengths in the grid and on the ground differ, because the coordinates are of another
-    grid.
+    """Raise InputFileError if lengths in the grid and on the ground differ.
+
+    The coordinates are then coordinates of another grid.
     """
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
@@ -300,7 +306,9 @@ def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, p
 
 @lru_cache(maxsize=32)
 def _to_datum(crs: str) -> tuple[Transformer, float, float]:
-    """Return the conversion of a CRS to coordinates on its datum, and their angular unit and prime meridian [deg]."""
+    """Return the conversion of a CRS to coordinates on its datum, and the angular unit and prime meridian of these
+    [deg].
+    """
     system, datum = find_crs(crs), CRS.from_user_input(_find_frame(crs)).to_2d()
     plan = system.source_crs if system.is_bound and system.source_crs is not None else system
     meridian = datum.prime_meridian

@@ -32,15 +32,16 @@ RASTERS: Final = (
 HeightSource = FilePath | PositionLog  #: File with heights, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest spacing of points with heights [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are read at once.
-_NEAR_M: Final = 15.0  #: Largest distance in plan from the line of positions that are used [m].
-_REACH_M: Final = 200.0  #: Largest distance along the line between a point and the positions that give its height [m].
-#: Standard deviation of the Gaussian weights along the line [m], for RTK fixed positions, and for single-point
-#: positions, whose errors persist for hundreds of metres. The length for single-point positions causes up to 5 m error
-#: in a vertical curve of 2 km radius.
+_NEAR_M: Final = 15.0  #: Largest distance in plan between the line and a position that is used [m].
+#: Largest distance along the line between a point and the positions from which its height is computed [m].
+_REACH_M: Final = 200.0
+#: Standard deviation of the Gaussian weights along the line for RTK fixed positions [m].
 _KERNEL_M: Final = 15.0
+#: Standard deviation of the Gaussian weights along the line for single-point positions, which have errors that persist
+#: for hundreds of metres [m]. It causes an error of up to 5 m in a vertical curve of 2 km radius.
 _LARGEST_KERNEL_M: Final = 150.0
-#: Deviation, in median deviations, beyond which a height has zero weight, and number of reweighting iterations (robust
-#: locally weighted regression, Cleveland 1979, doi:10.1080/01621459.1979.10481038).
+#: Constants of the robust locally weighted regression (Cleveland 1979, doi:10.1080/01621459.1979.10481038): deviation
+#: beyond which a height has zero weight, in median deviations, and number of reweighting iterations.
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
@@ -87,7 +88,7 @@ def with_heights(
 
 
 def _dense(track: Track) -> Track:
-    """Return the track with points at most `_SPACING_M` apart, so that straight track follows the heights, too."""
+    """Return the track with points at most `_SPACING_M` apart, so that distant points get heights in between."""
     pieces = np.ceil(np.diff(track.chainage_m) / _SPACING_M).astype(np.intp)
     if not (pieces > 1).any():
         return track
@@ -150,7 +151,8 @@ def _from_raster(
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
-    """Interpolate a raster at rows and columns, shape (2, n); the result has shape (n,), and is NaN without a value.
+    """Interpolate a raster at rows and columns (2, n); the result has shape (n,), and is NaN where the raster has no
+    value.
 
     The raster is read in windows around successive points.
     """
@@ -213,7 +215,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
     fitted = _smooth(target, place, height, sigma, reach_m=reach_m)
-    # as successive positions have common errors, the standard deviation of a single position is used
+    # averaging does not reduce the standard deviation, because successive positions have common errors
     spread = float(np.median(sigma)) if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
@@ -230,7 +232,9 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
 
 
 def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
-    """Return heights at the chainages `target`, smoothed by local straight lines; NaN beyond `reach_m` of positions."""
+    """Return heights at the chainages `target`, smoothed by local straight lines; NaN farther than `reach_m` from
+    positions.
+    """
     kernel = float(np.clip(_KERNEL_M * np.median(sigma) / SIGMA_HEIGHT_M, _KERNEL_M, _LARGEST_KERNEL_M))
     weight = 1.0 / sigma**2
     for _ in range(_WEIGHED_AGAIN if kernel > _KERNEL_M else 0):
@@ -250,7 +254,7 @@ def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, rea
 
 
 def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
-    """Return the heights at the chainages `target` of locally weighted straight lines; NaN without positions there."""
+    """Return heights at the chainages `target` from locally weighted straight lines; NaN without positions there."""
     fitted = np.full(len(target), np.nan)
     bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
     for k, (low, high) in enumerate(bounds.tolist()):

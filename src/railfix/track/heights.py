@@ -36,7 +36,7 @@ _LOADERS: Final = {
 #: Standard deviation of the Japanese models [m], stated by the GSI from GNSS and levelling.
 _JAPAN_M: Final = 0.02
 GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Accepted geoids.
-#: Advice for orthometric heights without a geoid.
+#: End of messages on orthometric heights without a geoid.
 GEOID_HELP: Final = f"give one (--geoid): {GEOIDS}; or a column geoid_m"
 _EGM96_NAMES: Final = ("egm96", "epsg:5773")
 #: Standard deviation of EGM96 [m], as stated by EPSG (operation 10084).
@@ -62,8 +62,8 @@ def check_height_datum(height_datum: str | None) -> None:
 def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidModel:
     """Compute the heights of a geoid above the ellipsoid at the points of a map.
 
-    The geoid is a name in `JAPAN_MODELS`, ``egm96``, a grid of PROJ, or a vertical or compound CRS. Raise SettingsError
-    if the geoid is unknown or not installed, and InputFileError if it does not cover all points.
+    `geoid` is a name in `JAPAN_MODELS`, ``egm96``, a PROJ grid, or a vertical or compound CRS. Raise SettingsError if
+    the geoid is unknown or not installed, and InputFileError if the geoid does not cover all points.
     """
     key = geoid.strip().lower() if isinstance(geoid, str) else ""
     if isinstance(geoid, CRS) and geoid.to_authority() == ("EPSG", "5773"):
@@ -100,7 +100,8 @@ def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
     return np.asarray(scipy.ndimage.map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
 
 
-_WRAP: Final = 16  #: Columns of the grid that are repeated at both sides, so that the spline is periodic in longitude.
+#: Number of columns of the grid that are repeated at each side, so that the spline is periodic in longitude.
+_WRAP: Final = 16
 
 
 @lru_cache(maxsize=1)
@@ -114,7 +115,7 @@ def _egm96_spline() -> Floats:
 def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
     """Compute geoid heights with PROJ, from a grid file or by the operation from a height datum to the ellipsoid.
 
-    Raise SettingsError if the geoid is unknown, has no height datum, or its grid is not installed.
+    Raise SettingsError if the geoid is unknown or has no height datum, or if the grid is not installed.
     """
     try:
         if isinstance(geoid, str) and (geoid.lower().endswith((".tif", ".tiff", ".gtx")) or _is_file(geoid)):
@@ -177,9 +178,9 @@ def heights_of_file(
 ) -> EllipsoidalHeights:
     """Convert the heights of a file to ellipsoidal heights.
 
-    `datum`, `geoid` and `geoid_m` are stated in the file. A datum and a geoid in `reading` are given by the user, and
-    take precedence. Raise InputFileError if the file names an unknown datum, and SettingsError if no datum is known or
-    if two datums contradict each other.
+    `datum`, `geoid` and `geoid_m` are stated in the file. The datum and the geoid in `reading` are given by the user;
+    they take precedence. Raise InputFileError if the file names an unknown datum, and SettingsError if no datum is
+    known or if two datums contradict each other.
     """
     check_height_datum(reading.height_datum)
     if datum is not None and datum not in HEIGHT_DATUMS:
@@ -246,7 +247,7 @@ def ellipsoidal_heights(
     path: str,
     geoid_m: Floats | None = None,
 ) -> EllipsoidalHeights:
-    """Convert heights of a datum to ellipsoidal heights, by a geoid model or the geoid heights `geoid_m` of the map.
+    """Convert heights to ellipsoidal heights, by a geoid model or the geoid heights `geoid_m` of the map.
 
     Raise SettingsError for contradictory options, and InputFileError for orthometric heights without a geoid.
     """

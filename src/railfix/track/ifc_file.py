@@ -1,4 +1,4 @@
-"""Reader of IFC 4.3 alignments, whose plan, profile and cant become elements of `railfix.track.elements`."""
+"""Reader of IFC 4.3 alignments; plan, profile and cant become elements of `railfix.track.elements`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _LAWS: Final = {
 _ARCS: Final = {
     "CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle", "CLOTHOID": "clothoid",
 }  # fmt: skip
-#: Smallest reduction of the distance to the next element for which another form of the cubic parabola is used [m].
+#: Another form of the cubic parabola is used if it reduces the distance to the next element by more than this [m].
 _SIMILAR_M: Final = 1e-3
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
 _PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
@@ -53,7 +53,7 @@ class _Entity:
 
 @dataclass(frozen=True)
 class _Placement:
-    """Origin and direction of coordinate axes in the project."""
+    """Origin and direction of coordinate axes, in the coordinates of the project."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -72,7 +72,7 @@ class _Placement:
 
 
 class _Step:
-    """Entities of a STEP physical file (ISO 10303-21), by their number."""
+    """Entities of a STEP physical file (ISO 10303-21), by number."""
 
     def __init__(self, path: FilePath) -> None:
         self.path = str(path)
@@ -220,7 +220,9 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of its horizontal layout if the layout is relative to the alignment."""
+    """Return the placement of an alignment, or of the horizontal layout if the layout is placed relative to the
+    alignment.
+    """
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative
@@ -242,7 +244,9 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return the references of placements from an object to the world; raise InputFileError if any is not local."""
+    """Return the references of the placements from an object up to the project; raise InputFileError if one is not
+    local.
+    """
     found: list[Any] = []
     while reference is not None and reference not in found:
         entity = step.at(reference, what="ObjectPlacement")
@@ -256,10 +260,10 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 
 
 def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
-    """Return the elements, with cubic parabolas as ordinates over the tangent.
+    """Return the elements, with cubic parabolas converted to ordinates over the tangent.
 
-    A parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``), unless the next element begins where the form with the
-    projected length, or the form with the Japanese correction, ends.
+    By default a parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``). The form with the projected length, or the
+    form with the Japanese correction, is used if its end is nearer to the start of the next element.
     """
     result: list[Plan] = []
     for element, after in zip(plan, [*plan[1:], None], strict=True):
@@ -280,7 +284,7 @@ def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]
 
 
 def _with_bends(profile: list[ProfileElement]) -> list[ProfileElement]:
-    """Return the elements of a profile; a clothoid begins with the curvature at the end of the previous element."""
+    """Return the elements of a profile; a clothoid starts with the curvature at the end of the previous element."""
     result: list[ProfileElement] = []
     bend = 0.0
     for element in profile:
@@ -317,7 +321,8 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
         raise InputFileError(step.path, f"point {point} has {2 + len(rest)} coordinates; check for commas in numbers")
     law = _law(step, entity, {k: v for k, v in _LAWS.items() if "CANT" not in k and k != "LINEARTRANSITION"})
     if entity.values[-1] == ".CIRCULARARC.":
-        last = first  # some programs write 0, or the radius of the next element; in IFC 4.3.2 both radii are equal
+        # some programs write 0 or the radius of the next element; in IFC 4.3.2, both radii of an arc are equal
+        last = first
     return PlanElement(
         x_m=x * scale,
         y_m=y * scale,
@@ -330,9 +335,9 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
 
 
 def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
-    """Return the elements in plan, with `lean_m` of Viennese bends from the change of cant over them.
+    """Return the elements in plan, with `lean_m` of each Viennese bend from the change of cant over the bend.
 
-    `leans` are the heights of the centre of gravity divided by the gauge, one per element.
+    `leans` has, for each element, the height of the centre of gravity divided by the gauge.
     """
     result = []
     for element, lean, start in zip(plan, leans, plan_starts(plan), strict=True):

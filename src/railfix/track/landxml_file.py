@@ -1,4 +1,4 @@
-"""Reader of LandXML 1.2 alignments, whose plan, profile and cant become elements of `railfix.track.elements`."""
+"""Reader of LandXML 1.2 alignments; plan, profile and cant become elements of `railfix.track.elements`."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _UNITS: Final = {
     "inch": 0.0254,
     "mile": 1609.344,
 }
-#: Transitions given by ordinates over the tangent (`railfix.track.transitions`). All cubic types are equal, with and
-#: without the Japanese correction, because every spiral has an End, which determines the ordinate.
+#: Transitions given by ordinates over the tangent (`railfix.track.transitions`). All cubic types, with and without the
+#: Japanese correction, are treated equally, because the End of a spiral determines the ordinate.
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
-#: Laws of curvature of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve, whose
+#: Laws of curvature of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve; the
 #: curvature consists of two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
@@ -48,15 +48,16 @@ _SPIRALS: Final = {
 }
 _CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHalfWave": "cosine"}
 _SAME_M: Final = 1e-6  #: Length below which an element has no direction and is left out [m].
-#: Half length of the interval in which the kilometrage jumps at a station equation [m].
+#: Half length of the interval within which the kilometrage jumps at a station equation [m].
 _JUMP_M: Final = 0.05
-#: Smallest and largest ratio of the curvature of a transition at its end to the reciprocal of the stated radius.
+#: Smallest and largest accepted ratio of the curvature at the end of a transition to the reciprocal of the stated
+#: radius.
 _ORDINATE_SHARE: Final = (0.9, 1.25)
 _BROKEN_RAD: Final = 0.1  #: Change of direction at a joint that indicates a wrong order of coordinates [rad].
 
 
 def finite_number(text: Any) -> float:
-    """Return a text as a finite number; raise ValueError if it is not a number or not finite."""
+    """Convert a text to a number; raise ValueError if the text is not a finite number."""
     value = float(text)
     if not np.isfinite(value):
         raise ValueError(f"{text} is not finite")
@@ -128,7 +129,7 @@ def _elements(parent: Any) -> list[Any]:
 
 
 def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Stations:
-    """Return the stations of an alignment, from its start and its station equations.
+    """Return the stations of an alignment, from the station of its start and the station equations.
 
     Raise InputFileError if the station equations are not in the order of the line.
     """
@@ -155,11 +156,11 @@ def _point(element: Any, name: str, scale: float, easting_first: bool) -> np.nda
 
 
 def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -> tuple[list[Plan], tuple[str, ...]]:
-    """Return the elements in plan, and a note if the file has easting before northing, which violates LandXML.
+    """Return the elements in plan, and a note if the file has easting before northing, against LandXML 1.2.
 
-    The order is used in which the coordinates lie in the area of the CRS. If this is true of both orders or of neither,
-    the order with fewer breaks of direction between elements is used. Raise InputFileError if the two criteria
-    contradict each other.
+    Of the two orders of coordinates, the order is used in which the coordinates lie in the area of the CRS. If they do
+    so in both orders or in neither, the order with fewer breaks of direction between elements is used. Raise
+    InputFileError if the two criteria contradict each other.
     """
     plans, broken, inside = [], [], []
     for easting_first in (False, True):
@@ -190,7 +191,7 @@ def _turn_at(before: Plan, after: Plan) -> float:
 
 
 def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Plan | None:
-    """Return an element in plan; None if it has no length. Raise InputFileError if its type is not supported."""
+    """Return an element in plan; None if it has no length. Raise InputFileError if the type is not supported."""
     kind = element.tag.rsplit("}", 1)[-1]
     start, end = (_point(element, name, scale, easting_first) for name in ("Start", "End"))
     if kind in ("Line", "Curve", "Spiral") and np.hypot(*(end - start)) < _SAME_M:
@@ -216,7 +217,7 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
         if element.get("spiType") in _ORDINATES:
             return _read_ordinates(path, _ORDINATES[element.get("spiType")], (start, middle, end), (first, last))
         length, law = finite_number(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
-        if last == 0.0:  # from the tangent at the straight end; each law turns by half of curvature times length
+        if last == 0.0:  # use the tangent at the straight end; every law turns by half of curvature times length
             direction = np.arctan2(*(end - middle)[::-1]) - first * length / 2.0
         else:
             direction = np.arctan2(*(middle - start)[::-1])
@@ -239,7 +240,7 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
 def _read_ordinates(
     path: str, shape: Shape, points: tuple[Floats, Floats, Floats], curvature: tuple[float, float]
 ) -> OrdinateElement:
-    """Create a transition of ordinates through start and end, whose tangent at the straight end points to the PI.
+    """Create a transition, defined by ordinates, from start to end; the tangent at the straight end points to the PI.
 
     Raise InputFileError unless exactly one end is straight and the curvature matches the stated radius.
     """
@@ -317,11 +318,11 @@ def _read_profile(path: str, profile: Any, scale: float, start: float) -> list[P
 
 
 def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
-    """Return the elements between cant stations, and notes.
+    """Return the cant elements between successive cant stations, and notes.
 
-    The outer rail is raised unless the file has another rotation point. Cant is in millimetres, or in inches if lengths
-    are imperial (LandXML 1.2). If all values are below 1, the values are assumed to be in the unit of length of the
-    file, as in InfraModel, with a note.
+    The outer rail is raised unless the file states another rotation point. Cant is in millimetres, or in inches if
+    lengths are imperial (LandXML 1.2). If all values are below 1, the values are assumed to be in the unit of length of
+    the file, as in InfraModel, with a note.
     """
     if cant is None:
         return [], ()

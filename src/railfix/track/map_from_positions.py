@@ -22,20 +22,22 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
 #: Note in every map made from positions.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
-_TURN: Final = -0.5  #: Cosine of the turn beyond which the path reverses: 120 degrees.
-#: Largest distance of a position from the straight line between its neighbours; an outlier exceeds all three limits: a
-#: distance [m], a multiple of the median distance, and the ordinate of a curve of this radius [m].
+_TURN: Final = -0.5  #: Cosine of the change of direction beyond which the path reverses (120 degrees).
+#: First limit of the distance between a position and the straight line between its neighbours [m]. An outlier exceeds
+#: this limit and the two following limits.
 _BESIDE_M: Final = 5.0
-_BESIDE_MEDIANS: Final = 6.0
-_LEAST_RADIUS_M: Final = 150.0
-_ROUNDS: Final = 20  #: Largest number of searches for outliers, each without the outliers found before.
+_BESIDE_MEDIANS: Final = 6.0  #: Second limit, as a multiple of the median distance.
+_LEAST_RADIUS_M: Final = 150.0  #: Radius of a curve, whose ordinate between the neighbours is the third limit [m].
+_ROUNDS: Final = 20  #: Largest number of searches for outliers; each search leaves out the outliers found before.
 _ENOUGH: Final = 10  #: Minimum number of positions for a search.
-_ACCELERATION_MPS2: Final = 2.0  #: Acceleration that is allowed for in the distance along the line.
-#: The path between the neighbours of a position counts as straight if both neighbours are within this time of the
-#: position [s], or if the cosine of the change of direction from before to after them has at least this value.
+_ACCELERATION_MPS2: Final = 2.0  #: Acceleration of the train that is tolerated in the deviation along the line.
+#: The path between the neighbours of a position counts as straight if both neighbours are within this time [s].
 _NEAR_S: Final = 2.5
+#: The path also counts as straight if its directions before and after the position are parallel to the line between the
+#: neighbours; this is the smallest cosine of the angles.
 _STRAIGHT: Final = 0.87
-_STANDING_WINDOW_S: Final = 3.0  #: Half length of the window over which the displacement is computed [s].
+#: Half length of the window over which the displacement is computed to detect standstill [s].
+_STANDING_WINDOW_S: Final = 3.0
 
 
 class ThinningLimits(Settings):
@@ -45,14 +47,14 @@ class ThinningLimits(Settings):
     #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). If the deviation is larger,
     #: the farthest position also becomes a point. Times are required, to distinguish a bend from noise at standstill.
     chord_m: float = Field(default=0.30, gt=0)
-    #: Horizontal speed below which the antenna is stationary, so that its positions are noise or drift. Times are
-    #: required; with 0, all positions are kept.
+    #: Horizontal speed below which the antenna is stationary, so that changes of position are noise or drift. Positions
+    #: at standstill are dropped. Times are required. With 0, all positions are kept.
     standing_mps: float = Field(default=0.2, ge=0)
-    #: Longest distance between consecutive points that is not reported as a gap.
+    #: Distance between consecutive points above which a gap is reported.
     jump_m: float = Field(default=50.0, gt=0)
     gap_m: float = Field(default=2000.0, gt=0)  #: Longest gap that is bridged; a longer gap is an error.
-    #: Largest speed of the vehicle. Positions that are reachable only at a higher speed are dropped; without times,
-    #: positions farther than `gap_m` from all remaining positions are dropped.
+    #: Largest speed of the vehicle. Positions that can be reached only at a higher speed are dropped. Without times,
+    #: positions are dropped that are farther than `gap_m` from the positions before and after them.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
@@ -63,17 +65,17 @@ class Thinned:
     kept: Indices  #: Rows of the positions that became points of the map, in ascending order, shape (V,).
     dropped: dict[str, int]  #: Number of dropped rows by reason.
     jumps: Indices  #: Indices of the points before a gap of more than `ThinningLimits.jump_m`, shape (j,).
-    jump_m: Floats  #: Length of each gap in `jumps`, shape (j,).
-    #: Indices of the points at which the path turns by more than 120 degrees, at reversals or wrong positions, shape
-    #: (t,).
+    jump_m: Floats  #: Length of the gap after each of these points, shape (j,).
+    #: Indices of the points at which the path turns by more than 120 degrees, because of a reversal or a wrong
+    #: position, shape (t,).
     turns: Indices
 
 
 def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
     """Return a mask of the rows at which the antenna is stationary, shape (T,).
 
-    The horizontal displacement over `window_s` on both sides is then below `speed_mps` times its duration. Times must
-    rise; without times (NaT) no row is stationary.
+    A row is stationary if the horizontal displacement over a window of `window_s` on both sides is less than
+    `speed_mps` times the duration of the window. Times must rise; without times (NaT) no row is stationary.
     """
     if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
         return np.zeros(len(time), dtype=np.bool_)
@@ -92,8 +94,8 @@ def thin(
 ) -> Thinned:
     """Select the positions, shape (n, 3) ECEF [m], that become points of a map.
 
-    Rows that are NaN, not `usable`, out of reach, outliers or stationary are dropped first, so that noise and drift at
-    standstill cause no loops. The points are at least `ThinningLimits.spacing_m` apart, except in bends
+    Rows are dropped first if they are NaN, not `usable`, out of reach, an outlier, or stationary. Noise and drift at
+    standstill therefore cause no loops. The points are at least `ThinningLimits.spacing_m` apart, except in bends
     (`ThinningLimits.chord_m`). The last position is also kept if it is at least a fifth of the spacing ahead.
     """
     limits = limits or ThinningLimits()
@@ -134,9 +136,9 @@ def thin(
 
 
 def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks:
-    """Return a mask of the rows that one vehicle can have passed, shape (n,).
+    """Return a mask of the rows that one vehicle can have reached in succession, shape (n,).
 
-    The search starts from the longest part without a jump, and goes outward from it.
+    The search starts from the longest part without a jump, and continues towards both ends of the log.
     """
     if len(ecef_m) < 2:
         return np.ones(len(ecef_m), dtype=np.bool_)
@@ -169,7 +171,7 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
     """Return a mask of the positions off the straight line between their neighbours, shape (n,).
 
-    The farthest positions are removed first, because they also displace the lines of their neighbours.
+    The farthest positions are removed first, because the lines of their neighbours pass through them.
     """
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
@@ -200,10 +202,10 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 
 
 def _goes_on(points: Floats, direction: Floats) -> Masks:
-    """Return a mask of the inner points about which the path is straight, in the direction between their neighbours.
+    """Return a mask of the inner points at which the path is straight, given the `direction` between both neighbours.
 
-    Of the two steps before the neighbours, and of the two steps after them, at least one must be in this direction,
-    because a position may be an outlier.
+    Before a point, the path from one or from two points earlier to the previous neighbour must have this direction, and
+    likewise after the point. One of the two may differ, because a position may be an outlier.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -217,7 +219,7 @@ def _goes_on(points: Floats, direction: Floats) -> Masks:
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Return the mask of stationary rows, extended by movements between them that remain within the spacing."""
+    """Return the mask of stationary rows, extended by movements between standstills that remain within the spacing."""
     if not stands.any():
         return stands
     edges = np.flatnonzero(np.diff(stands)) + 1
@@ -229,8 +231,9 @@ def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
 
 
 def _at_spacing(points: Floats, spacing_m: float) -> Indices:
-    """Return the indices of points at least the spacing apart, and the last point if it is at least a fifth of the
-    spacing ahead.
+    """Return the indices of points that are at least the spacing apart.
+
+    The last point is also returned if it is at least a fifth of the spacing ahead.
     """
     if not len(points):
         return np.zeros(0, dtype=np.intp)
@@ -262,7 +265,7 @@ def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
     start, step = points[chosen[piece]], points[chosen[piece + 1]] - points[chosen[piece]]
     share = np.einsum("ni,ni->n", points[inside] - start, step) / np.einsum("ni,ni->n", step, step)
     off = np.linalg.norm(points[inside] - start - share[:, None] * step, axis=1)
-    # a point near an end of the chord would cause a kink
+    # leave out points near an end of the chord, which would cause a kink
     off = np.where((share > 0.2) & (share < 0.8), off, 0.0)
     worst = np.zeros(len(chosen) - 1)
     np.maximum.at(worst, piece, off)
@@ -285,8 +288,8 @@ def from_positions(
     """Create a track from positions, shape (n, 3) ECEF [m], in the order of travel.
 
     The positions are selected by `thin`. `time` is NaT where unknown; `usable` is a mask of the rows that may be used;
-    `spacing_m` is ignored if `limits` are given. The notes of the track report its gaps and reversals, and that it is
-    the path of the antenna. Raise ValueError if fewer than two points are left, or a gap is too long.
+    `spacing_m` is ignored if `limits` are given. The notes of the track report gaps and reversals, and that the track
+    is the path of the antenna. Raise ValueError if fewer than two points are left, or a gap is too long.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
     return create_track(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
@@ -303,7 +306,7 @@ def create_track(
     gap_m: float = 2000.0,
     accuracy: str = "",
 ) -> Track:
-    """Create a track of the positions selected by `thin`.
+    """Create a track from the positions selected by `thin`.
 
     Raise ValueError if fewer than two points are left, or a gap is longer than `gap_m`.
     """
@@ -361,17 +364,17 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     return usable
 
 
-#: Standard deviations of positions, plan and height [m], by RTKLIB quality number: 1 is an RTK fix, with P1's values
-#: for a surveyed map, 2 float, 3 SBAS, 4 differential, and 5 single point without corrections.
+#: Standard deviations of positions in plan and in height [m], by RTKLIB quality number. The numbers are 1 RTK fix (with
+#: P1's values for a surveyed map), 2 RTK float, 3 SBAS, 4 differential, and 5 single point without corrections.
 SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (SIGMA_PLAN_M, SIGMA_HEIGHT_M), 2: (0.5, 1.0), 3: (1.5, 3.0), 4: (1.0, 2.0), 5: (3.0, 6.0)}
 )
 
 
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
-    """Return the standard deviations of a map in plan and height [m], and a note on their basis.
+    """Return the standard deviations of a map in plan and height [m], and a note on how they were obtained.
 
-    Each result is the largest of the value stated in the log, the value of the quality number, and the value of P1.
+    Each is the largest of the value stated in the log, the value for the quality number, and the value of P1.
     """
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]

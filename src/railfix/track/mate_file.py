@@ -2,8 +2,8 @@
 
 The tables are described at https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the
 arc length from its northernmost point. A clothoid is given by its point of zero curvature, the azimuth at this point
-and the arc length from this point. The tables define neither the sign of curves nor the constant of a clothoid. The
-interpretation is therefore used in which a segment meets the adjacent segments of its edge.
+and the arc length from this point. The tables define neither the sign of curves nor the constant of a clothoid. Of all
+interpretations, the one is therefore used in which the segments of an edge meet each other.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def read_edges(path: Path, reading: MapReading) -> list[Segment]:
 
 
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
-    """Create a segment of the points of one track edge.
+    """Create a segment from the points of one track edge.
 
     The table has cant in millimetres; a missing or zero radius is straight track.
     """
@@ -75,7 +75,7 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Largest accepted gap (`_gap`) between two successive segments of an edge [m].
+#: Largest accepted gap between two successive segments of an edge [m], as computed by `_gap`.
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
@@ -99,9 +99,10 @@ def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
-    """Return the rows of each edge, sorted by their distance from its start.
+    """Return the rows of each edge, sorted by distance from the start of the edge.
 
-    The rows are from the file, or from another `table` in its folder; if that table is missing, the result is empty.
+    The rows are from the file, or from another `table` in the same folder. If the other table is missing, the result is
+    empty.
     """
     file = Path(path)
     if table is not None:
@@ -138,7 +139,7 @@ def _find_crs(cell: str) -> str | None:
 
 
 def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
-    """Return the elements of an edge in the interpretations that meet best; raise InputFileError at a gap."""
+    """Return the elements of an edge, in the interpretations that meet best; raise InputFileError if there is a gap."""
     forms = [_forms(path, row) for row in rows]
     gaps = (np.array([[_gap(a, b) for a in before] for b in after]) for before, after in pairwise(forms))
     chosen = cheapest_path([np.zeros(len(options)) for options in forms], gaps)
@@ -192,7 +193,9 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
-    """Create an element from azimuth and curvature, both clockwise; a design has them counter-clockwise from east."""
+    """Create an element from azimuth and curvature, both clockwise; in an element, both are counter-clockwise from
+    east.
+    """
     direction = np.pi / 2.0 - azimuth
     return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
 

@@ -33,15 +33,16 @@ CLEARANCE_M: Final = 3.0  #: Minimum distance between the centrelines of two tra
 ANTENNA_UP_M: Final = 2.5
 ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].
-_NEAR_WAY_M: Final = 5_000.0  #: Length of the routes that are searched before the whole network [m].
+#: Length up to which routes are searched first; the whole network is searched only if this is not enough [m].
+_NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0  #: Largest spacing of the samples in the spatial index [m].
 #: Number of nearest samples that are examined first for each position; more samples are examined if these are not
 #: enough.
 _SAMPLES: Final = 32
-_TOGETHER: Final = 256  #: Number of positions processed at once, which bounds the memory for nearby samples.
-#: Cached properties that do not depend on the connections.
+_TOGETHER: Final = 256  #: Number of positions processed at once, which limits the memory for nearby samples.
+#: Cached properties of `Network` that do not depend on the connections.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
-_NAMED: Final = 8  #: Largest number of tracks of which a message lists all names.
+_NAMED: Final = 8  #: Largest number of tracks that a message lists by name.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +71,7 @@ class Network(NotebookTable):
 
     tracks: tuple[Segment, ...]
     links: tuple[Link, ...]  #: Connections of track ends.
-    notes: tuple[str, ...] = ()  #: Notes on the source of the connections.
+    notes: tuple[str, ...] = ()  #: Notes on how the connections were obtained.
 
     def connect(self, links: tuple[Link, ...], note: str) -> Network:
         """Return the network with new connections and a note on their source; cached data of the points are kept."""
@@ -80,7 +81,7 @@ class Network(NotebookTable):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the tracks as in the file, or the source of a track without a name; repeated names are numbered."""
+        """Names of the tracks in the file, or the sources of tracks without a name; repeated names are numbered."""
         seen: dict[str, int] = {}
         names = []
         for track in self.tracks:
@@ -91,7 +92,7 @@ class Network(NotebookTable):
 
     @cached_property
     def first_point(self) -> Indices:
-        """Index in `points_m` of each track's first point, and the number of points, shape (tracks + 1,)."""
+        """Index in `points_m` of each track's first point, followed by the number of points, shape (tracks + 1,)."""
         return np.concatenate([[0], np.cumsum([len(t.latitude_deg) for t in self.tracks])]).astype(np.intp)
 
     @cached_property
@@ -147,7 +148,7 @@ class Network(NotebookTable):
 
     @cached_property
     def passages(self) -> dict[tuple[int, int], dict[tuple[int, int], None]]:
-        """Ends (track, end) to which a train can pass from an end (track, end), by navigable connections."""
+        """Ends (track, end) to which a train can pass from each end (track, end), over navigable connections."""
         passages: dict[tuple[int, int], dict[tuple[int, int], None]] = {}
         for link in self.links:
             if link.navigable:
@@ -163,7 +164,9 @@ class Network(NotebookTable):
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats]:
-        """Chainages of all points, and of the starts of tracks, on one axis with all tracks 1 m apart [m]."""
+        """Positions of all points, and of the starts of tracks, on one axis on which the tracks follow each other 1 m
+        apart [m].
+        """
         before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
         return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
 
@@ -209,7 +212,9 @@ class Network(NotebookTable):
 
     @cached_property
     def _index(self) -> tuple[scipy.spatial.cKDTree, Indices, Indices, float]:
-        """k-d tree of samples on all segments, segment and track of each sample, and half the largest spacing [m]."""
+        """k-d tree of samples on all segments, segment and track of each sample, and half the largest sample spacing
+        [m].
+        """
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
         inner[self.first_point[1:-1] - 1] = False
@@ -223,9 +228,10 @@ class Network(NotebookTable):
         return scipy.spatial.cKDTree(samples, balanced_tree=False), of, track, reach
 
     def _samples_near(self, points_m: Floats, within_m: float, least: int) -> tuple[Floats, Indices]:
-        """Return the distances and indices of all samples near each point, in at least `least` columns.
+        """Return the distances and indices of all samples near each point, as arrays with at least `least` columns.
 
-        Samples are near if their piece of track can be within `within_m`. The distance is infinite in unused columns.
+        A sample is near if the piece of track that it represents can be within `within_m`. The distance is infinite in
+        unused columns.
         """
         tree, _, _, reach = self._index
         count, short = max(_SAMPLES, least), np.arange(len(points_m))
@@ -247,7 +253,7 @@ class Network(NotebookTable):
         return join_rows(parts)
 
     def _near(self, latitude_deg: Floats, longitude_deg: Floats, within_m: float, most: int) -> Candidates:
-        """Return the result of `near` for a few positions."""
+        """Return the result of `near` for at most `_TOGETHER` positions."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
@@ -259,7 +265,7 @@ class Network(NotebookTable):
         offset = np.where(present & (offset <= within_m), offset, np.inf)
         side = np.einsum("nki,nki->nk", np.cross(step, points[:, None] - start), points[:, None])
         chainage = self.chainage_m[of] + share * np.linalg.norm(step, axis=-1)
-        # sort by track, then by distance, so that the first of a track is its nearest segment
+        # sort by track, then by distance, so that the first segment of each track is the nearest
         order = np.lexsort((offset, track), axis=-1)
         ordered = np.take_along_axis(track, order, axis=1)
         first = np.ones_like(ordered, dtype=np.bool_)
@@ -276,7 +282,7 @@ class Network(NotebookTable):
         )
 
     def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-        """Return the chainages of positions on given tracks, and their distances in plan, shape (n,) each [m].
+        """Return the chainages of positions projected on given tracks, and the distances in plan, shape (n,) each [m].
 
         Both results are NaN without a track (-1) or a position (NaN).
         """
@@ -321,8 +327,9 @@ class Network(NotebookTable):
     ) -> dict[int, tuple[float, list[int]]]:
         """Extend routes to the two entries of the track `stop`, and return the shortest route to each entry.
 
-        `routes` are the routes so far by their last node, an exit. A route consists of its length [m] and its nodes of
-        `graph`, the start node and the nodes at which tracks are entered. An entry that no route reaches is left out.
+        `routes` are the routes so far, by their last node, which is an exit. A route consists of its length [m] and its
+        nodes of `graph`, the start node and the nodes at which tracks are entered. An entry that no route reaches is
+        left out.
         """
         import networkx as nx
 
@@ -342,8 +349,9 @@ class Network(NotebookTable):
         return reached
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
-        """Return the indices of the tracks of the shortest route over given tracks in order; raise MismatchError if
-        none.
+        """Return the tracks of the shortest route over given tracks in order, as indices.
+
+        Raise MismatchError if there is no route.
         """
         route = self.route_over(stops)
         if route is None:
@@ -364,7 +372,9 @@ class Network(NotebookTable):
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:
-    """Return the end points of tracks on the ellipsoid, and outward unit vectors there, shape (tracks, 2, 3) each."""
+    """Return the end points of tracks on the ellipsoid, and outward unit vectors at the ends, shape (tracks, 2, 3)
+    each.
+    """
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     place, before = network._way
     inner = np.clip(np.searchsorted(place, before + _DIRECTION_M), first + 1, last)
