@@ -290,7 +290,7 @@ def test_what_is_assumed_is_said() -> None:
     assert any("no cant" in note for note in antenna_trajectory(without, vehicle()).notes)
     bend = Track.from_ecef(curve.ecef_m, cant_m=curve.cant_m)
     by_bend, by_radius = antenna_trajectory(bend, vehicle()), antenna_trajectory(curve, vehicle())
-    assert any("the side of the cant is that of the bend" in note for note in by_bend.notes)
+    assert any("the side of the cant is taken from the bend" in note for note in by_bend.notes)
     np.testing.assert_allclose(by_bend.ecef_m, by_radius.ecef_m, atol=0.01)
     assert by_radius.notes == ()
     assert isinstance(by_radius, Trajectory)

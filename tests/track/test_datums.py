@@ -155,7 +155,7 @@ def test_the_accuracy_of_the_operation_is_in_the_sigma_of_the_map_and_stated(tmp
     assert "projsync --file uk_os_OSTN15_NTv2_OSGBtoETRS.tif" in notes
     given = read_track(path, sigma_plan_m=0.5)
     assert given.sigma_plan_m == 0.5
-    assert "less than the accuracy of its transformation" in " ".join(given.provenance.notes)
+    assert "better than the accuracy of the map's transformation" in " ".join(given.provenance.notes)
 
 
 def test_the_accuracy_of_the_geoid_is_in_the_sigma_of_the_heights(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def test_kinds_and_older_datums() -> None:
 
 def test_what_is_refused(tmp_path: Path) -> None:
     track = line_at([(50.85, 4.35, 100.0), (50.86, 4.35, 100.0)], "EPSG:4258")
-    with pytest.raises(SettingsError, match="takes no epoch"):
+    with pytest.raises(SettingsError, match="no epoch and no plate apply"):
         track_at(track, np.datetime64("2026-07-01"), epoch=2020.0)
     with pytest.raises(SettingsError, match="plate 'ATLANTIS'"):
         track_at(

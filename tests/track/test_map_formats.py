@@ -419,7 +419,7 @@ def test_railml_net_elements_are_lines(tmp_path: Path) -> None:
 def test_broken_design_files_are_one_sentence(tmp_path: Path) -> None:
     bad = tmp_path / "a.ifc"
     bad.write_text("hello")
-    with pytest.raises(InputFileError, match="no IFC file"):
+    with pytest.raises(InputFileError, match="not an IFC file"):
         read_track(bad)
     bad = tmp_path / "a.xml"
     bad.write_text("<a>")

@@ -85,7 +85,7 @@ def test_a_log_without_sigmas_has_one_estimated_by_its_distances_and_says_so(tmp
     assert stated == pytest.approx(6.0, rel=0.25)
     beside = network(tmp_path, {"A": (0.0, 0.0), "B": (4.5, 0.0)})
     found = matched(beside, logs(tmp_path, np.full(200, 4.5), 0.0, None)[0])
-    assert "4.0 m is taken, because too few lie where only one track is near" in found.notes[0]
+    assert "4.0 m is assumed, because too few of them are near a single track" in found.notes[0]
     assert np.median(found.probability) < 0.95  # of a common error of metres nothing is known
 
 
@@ -98,4 +98,4 @@ def test_a_time_that_steps_back_leaves_probabilities_and_is_said(tmp_path: Path)
     found = matched(net, path)
     assert np.isfinite(found.probabilities).all()
     assert (found.track == 0).all()
-    assert "the time steps back 1 times" in found.notes[0]
+    assert "the time decreases at 1 rows" in found.notes[0]

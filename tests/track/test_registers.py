@@ -176,7 +176,7 @@ def test_segments_that_do_not_meet_and_broken_rows_are_sentences(tmp_path: Path)
     path = _tables(tmp_path, 1.0, "A", turned=False)
     text = path.read_text()
     path.write_text(text.replace("e1,line,700,150,1,LV95,", "e1,line,700,150,1,LV95,1"))
-    with pytest.raises(InputFileError, match=r"edge 'e1': segment 5 begins .* m from the previous one"):
+    with pytest.raises(InputFileError, match=r"edge 'e1': segment 5 starts .* m from the end of the previous"):
         read_segments(path, MapReading())
     path.write_text(text.replace("circle", "spline"))
     with pytest.raises(InputFileError, match=r"'spline'; line, circle or clothoid was expected"):

@@ -381,7 +381,7 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
     left_out = max(low, 0.0) + max(length - high, 0.0)
     where = f"the profile runs from {low:.0f} to {high:.0f} m of an alignment of {length:.0f} m"
     if left_out > _PROFILE_BEYOND_M:
-        raise InputFileError(path, f"{where}; correct its stations, or remove it and give heights (--heights)")
+        raise InputFileError(path, f"{where}; correct the profile's stations, or remove the profile and give heights")
     return (f"{path}: {where}; beyond its ends the outermost gradients are continued",) if left_out > 1.0 else ()
 
 

@@ -132,9 +132,9 @@ def points_at(
         raise SettingsError(f"plate {plate!r} is unknown; expected one of {', '.join(PLATES)}")
     held = HELD.get(frame.name)
     if (epoch is not None or plate is not None) and not (kind == "dynamic" or held):
-        raise SettingsError(f"the map's frame is {frame.name}, which takes no epoch and no plate of its own")
+        raise SettingsError(f"the map's frame is {frame.name}, to which no epoch and no plate apply")
     if parameters is not None and not frame.name.startswith("JGD2011"):
-        raise SettingsError(f"the map's frame is {frame.name}; semi-dynamic parameters are for JGD2011")
+        raise SettingsError(f"the map's frame is {frame.name}; semi-dynamic parameters apply only to JGD2011")
     middle = ecef_m[len(ecef_m) // 2]
     if kind in ("wgs84", "older datum"):
         notes = () if named else _doubt(middle, time)
@@ -280,8 +280,10 @@ def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
         _, shift = points_at(ecef_m[None], code, time)
         size = float(np.hypot(np.hypot(shift.east_m, shift.north_m), shift.up_m))
         parts = f"east {shift.east_m:+.2f}, north {shift.north_m:+.2f}, up {shift.up_m:+.2f} m"
-        found.append(f"in {name}, it is {size:.2f} m off ({parts}); give crs {code} (--crs)")
+        found.append(f"in {name}, it is displaced by {size:.2f} m ({parts}): give crs {code} (--crs)")
     if found:
         choices = "; if ".join(found)
-        return (f"map: no reference frame is named, WGS 84 is assumed; if the map is, as usual there, {choices}",)
+        return (
+            f"map: no reference frame is named, WGS 84 is assumed; if the map is, as usual in its region, {choices}",
+        )
     return ("map: no reference frame is named, WGS 84 is assumed; national frames differ from it by up to 2 m",)

@@ -299,8 +299,8 @@ def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, p
     if ground > 0.0 and abs(grid / ground - 1.0) > LARGEST_SCALE:
         raise InputFileError(
             path,
-            f"the line is {grid:.0f} m long in {system.name}, on the ground there {ground:.0f} m; the "
-            "coordinates are of another grid (--crs)",
+            f"the line is {grid:.0f} m long in {system.name}, but {ground:.0f} m on the ground; the "
+            "coordinates belong to another grid: give the right crs (--crs)",
         )
 
 

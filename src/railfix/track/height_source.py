@@ -176,7 +176,7 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
         raise table.header_error("there is no column height_m or elevation_m")
     known, heights = table.numbers(by), table.numbers(column)
     if len(known) < 2 or not (np.diff(known) > 0.0).all():
-        raise InputFileError(table.path, f"{by} must rise from row to row, with at least two rows")
+        raise InputFileError(table.path, f"{by} must rise from row to row, and at least two rows are required")
     places = track.chainage_m if by == "chainage_m" else track.kilometrage_m
     if np.isnan(places).any():
         raise InputFileError(table.path, f"the profile is by {by}, which the map does not have; give chainage_m")

@@ -264,7 +264,7 @@ def ellipsoidal_heights(
             raise SettingsError(f"{path}: geoid {geoid!r} was given, but the map has geoid_m itself; use one")
         return EllipsoidalHeights(height_m=heights_m + geoid_m, datum=datum, geoid="geoid_m of the map")
     if geoid is None:
-        raise InputFileError(path, f"the heights are orthometric, which needs a geoid; {GEOID_HELP}")
+        raise InputFileError(path, f"the heights are orthometric and require a geoid; {GEOID_HELP}")
     model = geoid_heights(geoid, place, path=path)
     accuracy = f"{model.accuracy_m:g} m" if np.isfinite(model.accuracy_m) else "unknown (--height-sigma)"
     return EllipsoidalHeights(

@@ -78,7 +78,7 @@ class _Step:
         self.path = str(path)
         text = read_text(path)
         if "ISO-10303-21" not in text[:200] or "DATA;" not in text:
-            raise InputFileError(path, "this is no IFC file in STEP form (ISO 10303-21)")
+            raise InputFileError(path, "this is not an IFC file in STEP form (ISO 10303-21)")
         body = re.sub(r"/\*.*?\*/", "", text.split("DATA;", 1)[1], flags=re.S)
         pattern = re.compile(r"#(\d+)\s*=\s*([A-Z0-9_]+)\s*(\((?:[^';]|'(?:[^']|'')*')*\))\s*;")
         self.entities = {int(m[1]): _Entity(m[2], _values(m[3])) for m in pattern.finditer(body)}
@@ -252,7 +252,7 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
         entity = step.at(reference, what="ObjectPlacement")
         if entity.kind != "IFCLOCALPLACEMENT":
             raise InputFileError(
-                step.path, f"an alignment is placed by {entity.kind}, which is not supported; IfcLocalPlacement is"
+                step.path, f"an alignment is placed by {entity.kind}; only IfcLocalPlacement is supported"
             )
         found.append(reference)
         reference = entity.values[0]

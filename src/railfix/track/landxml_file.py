@@ -94,7 +94,8 @@ def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Seg
         except KeyError as error:
             raise InputFileError(
                 path,
-                f"alignment {name!r}: cant of transition type {error} is not supported; {', '.join(_CANT_LAWS)} are",
+                f"alignment {name!r}: cant of transition type {error} is not supported; only {', '.join(_CANT_LAWS)} "
+                "are supported",
             ) from None
         except (TypeError, ValueError, AttributeError):
             raise InputFileError(
@@ -175,7 +176,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             raise InputFileError(
                 path,
                 f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the opposite side "
-                f"of rot; with {orders[1 - chosen]} the reverse is true; correct the order of the coordinates",
+                f"of the attribute rot; with {orders[1 - chosen]} it is the other way round; correct their order",
             )
     else:
         chosen = int(broken[1] < broken[0])
@@ -224,7 +225,7 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
     else:
         kind = f"{kind} {element.get('spiType') or ''}".strip()
         raise InputFileError(
-            path, f"element {kind} is not supported; Line, Curve and Spiral ({', '.join(_CANT_LAWS)}) are"
+            path, f"element {kind} is not supported; only Line, Curve and Spiral ({', '.join(_CANT_LAWS)}) are"
         )
     return PlanElement(
         x_m=float(start[0]),
@@ -283,7 +284,9 @@ def _read_profile(path: str, profile: Any, scale: float, start: float) -> list[P
     for element in _elements(profile):
         kind = element.tag.rsplit("}", 1)[-1]
         if kind not in ("PVI", "ParaCurve", "CircCurve"):
-            raise InputFileError(path, f"profile element {kind} is not supported; PVI, ParaCurve and CircCurve are")
+            raise InputFileError(
+                path, f"profile element {kind} is not supported; only PVI, ParaCurve and CircCurve are"
+            )
         place, height = (finite_number(v) * scale for v in element.text.split()[:2])
         points.append((kind, place - start, height, finite_number(element.get("length") or 0.0) * scale))
     if any(b[1] <= a[1] for a, b in pairwise(points)):

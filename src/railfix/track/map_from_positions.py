@@ -317,8 +317,8 @@ def create_track(
     notes = [ANTENNA_PATH, *([accuracy] if accuracy else [])]
     if thinned.jump_m.max(initial=0.0) > gap_m:
         raise ValueError(
-            f"the positions leave a gap of {thinned.jump_m.max():.0f} m, over {gap_m:g} m, which no straight line "
-            "bridges; give positions of one run"
+            f"the positions have a gap of {thinned.jump_m.max():.0f} m; gaps of more than {gap_m:g} m are not bridged "
+            "by a straight line; give the positions of one run"
         )
     if len(thinned.jumps):
         notes.append(
@@ -327,8 +327,8 @@ def create_track(
         )
     if len(thinned.turns):
         notes.append(
-            f"the path turns back at {plural(thinned.turns, 'point')}: where it lies beside itself, positions are "
-            "ambiguous and the filter may follow the wrong leg, so give positions of a run in one direction"
+            f"the path turns back at {plural(thinned.turns, 'point')}: where its two legs are side by side, positions "
+            "are ambiguous and the filter may follow the wrong leg; give positions of a run in one direction"
         )
     return Track.from_ecef(
         ecef_m[thinned.kept],
@@ -382,13 +382,13 @@ def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
     if np.isfinite(stated).all() and len(stated):
         plan = max(plan, float(np.median(np.hypot(stated[:, 0], stated[:, 1]) / np.sqrt(2.0))))
         height = max(height, float(np.median(stated[:, 2])))
-        reasons.append("the standard deviations of the log")
+        reasons.append("from the standard deviations of the log")
     if log.has_quality:
         worst = [SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[5]) for q in np.unique(log.quality[kept])]
         plan, height = max([plan, *(w[0] for w in worst)]), max([height, *(w[1] for w in worst)])
-        reasons.append("the quality of the positions")
-    basis = " and ".join(reasons) if reasons else "an assumption, for the log states neither quality nor sigma"
-    return plan, height, f"accuracy of the map {plan:.2f} m in plan, {height:.2f} m in height: {basis}"
+        reasons.append("from the quality of the positions")
+    basis = " and ".join(reasons) if reasons else "assumed, because the log states neither quality nor sigma"
+    return plan, height, f"accuracy of the map {plan:.2f} m in plan, {height:.2f} m in height, {basis}"
 
 
 def from_position_log(

@@ -146,7 +146,9 @@ def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
     plan = [options[k] for options, k in zip(forms, chosen, strict=True)]
     for number, (first, second) in enumerate(pairwise(plan), start=2):
         if (gap := _gap(first, second)) > _MEETS_M:
-            raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the previous one")
+            raise InputFileError(
+                path, f"edge {edge!r}: segment {number} starts {gap:.2f} m from the end of the previous one"
+            )
     return plan
 
 
@@ -188,7 +190,7 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
     else:
         raise InputFileError(path, f"a segment has the type {kind!r}; line, circle or clothoid was expected")
     if not forms:
-        raise InputFileError(path, f"edge {row.get('TRACK_EDGE_ID')!r}: its clothoid has a radius below 10 m")
+        raise InputFileError(path, f"edge {row.get('TRACK_EDGE_ID')!r}: a clothoid has a radius below 10 m")
     return [_turn(form) for form in forms] if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0 else forms
 
 

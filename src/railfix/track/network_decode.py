@@ -2,10 +2,11 @@
 
 The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). The state of the model is a track
 near the position, or an unmapped track, together with the common error of the positions. The common error is a
-first-order Gauss-Markov process east, north and up on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The
-remaining error of each position has heavy tails (Student's t) and a correlation time `correlation_s`; the likelihood of
-a position is weighted with the fraction of this time that the position represents. An unmapped track is either parallel
-to the nearest track at a constant distance (`SHIFTS_M`) and clear of all other tracks, or anywhere else.
+first-order Gauss-Markov process in each of the directions east, north and up, on a lattice (Ehrenfest's urn; Kac 1947,
+doi:10.2307/2304386). The remaining error of each position has heavy tails (Student's t) and a correlation time
+`correlation_s`; the log likelihood of a position is weighted with the fraction of this time that the position
+represents. An unmapped track is parallel to the nearest track at a constant distance (`SHIFTS_M`) and clear of all
+other tracks, or it can be anywhere.
 """
 
 from __future__ import annotations
@@ -21,63 +22,65 @@ from railfix.core.array_functions import cheapest_path
 from railfix.core.arrays import Floats, Indices, Masks, read_only
 from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Network
 
-#: Negative logarithm of the likelihood of a position on an unmapped track parallel to no track, relative to a position
-#: at distance 0 from a track.
+#: Negative logarithm of the likelihood of a position on an unmapped track that is parallel to no track, relative to the
+#: likelihood of a position on a mapped track.
 _UNMAPPED_COST: Final = 5.0
-#: Distances to the right of the nearest track at which an unmapped track can be parallel to it [m].
+#: Distances of a parallel unmapped track to the right of the nearest mapped track [m].
 SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
-#: Prior probabilities of `SHIFTS_M`, in inverse proportion to the distance, because most parallel tracks are adjacent.
+#: Prior probability of each of `SHIFTS_M`, inversely proportional to the distance, because most parallel tracks are
+#: near.
 _SHARES: Final = 1.0 / np.abs(SHIFTS_M) / (1.0 / np.abs(SHIFTS_M)).sum()
 #: Probability per position that the distance of a parallel unmapped track changes to an adjacent value of `SHIFTS_M`.
 _DRIFTS: Final = 1e-3
 _SHIFT_STEP_M: Final = 2.0  #: Spacing of `SHIFTS_M` on either side [m].
 _FREEDOM: Final = 8.0  #: Degrees of freedom of Student's t for position errors.
-#: Negative logarithms of transition probabilities per position: to a track without connection, from the map to an
-#: unmapped track and back, and from the map to a parallel unmapped track and back. A train is then on unmapped track
-#: for the fraction `UNMAPPED_PRIOR` of the time, in periods of a quarter of an hour. A change of track by way of
-#: unmapped track is as improbable as a change without connection.
-_JUMP_COST: Final = 17.0
-_LEAVE_COST: Final = 12.0
-_ENTER_COST: Final = 5.0
-_LEAVE_BESIDE_COST: Final = 10.0
-_ENTER_BESIDE_COST: Final = 7.0
+# Negative logarithms of transition probabilities per position. With these values, a train is on unmapped track for the
+# fraction `UNMAPPED_PRIOR` of the time, in periods of a quarter of an hour. A change of track by way of unmapped track
+# is as improbable as a change between tracks without a connection.
+_JUMP_COST: Final = 17.0  #: From a track to a track without connection.
+_LEAVE_COST: Final = 12.0  #: From a mapped track to an unmapped track that is parallel to no track.
+_ENTER_COST: Final = 5.0  #: From an unmapped track that is parallel to no track to a mapped track.
+_LEAVE_BESIDE_COST: Final = 10.0  #: From a mapped track to a parallel unmapped track.
+_ENTER_BESIDE_COST: Final = 7.0  #: From a parallel unmapped track to a mapped track.
 #: Negative logarithm of the probability of passing an open end, where the map ends.
 _OPEN_COST: Final = 2.0
-#: Distance beyond an open end at which a position is off the map: in standard deviations, and its limits [m].
+#: Distance beyond an open end at which a position is off the map, in standard deviations.
 _BEYOND_SIGMAS: Final = 5.0
-_BEYOND_M: Final = (CLEARANCE_M, 10.0)
+_BEYOND_M: Final = (CLEARANCE_M, 10.0)  #: Smallest and largest value of this distance [m].
 _ROUNDED_M: Final = 1e-6
-#: Excess of the path length over the straight distance between two positions that is allowed, for example in a bend:
-#: constant part [m], and fraction of the distance.
+#: Constant part of the largest excess of the path length over the straight distance between two positions [m]; the path
+#: is longer in a bend, for example.
 _SLACK_M: Final = 30.0
-_SLACK_SHARE: Final = 0.2
-#: Difference of path length and distance that halves the probability of a transition over joints [m].
+_SLACK_SHARE: Final = 0.2  #: Part of the largest excess that is proportional to the straight distance, as a fraction.
+#: Difference between path length and straight distance at which the probability of a transition over joints is halved
+#: [m].
 _PASSING_M: Final = 5.0
-#: Minimum gain of a change of track, in expected positions on the right track. At a joint, where the transition
-#: probability is at least `_AT_JOINT`, the minimum is smaller, because a short track of a switch has only one or two
-#: positions.
+#: Cost of a change of track in the returned sequence, as a number of expected pairs of positions on the right tracks.
 _CHANGE: Final = 0.5
+#: Cost of a change at a joint. It is smaller, because a short track of a switch has only one or two positions.
 _CHANGE_AT_JOINT: Final = 0.05
-_AT_JOINT: Final = 0.01
+_AT_JOINT: Final = 0.01  #: Transition probability from which a change counts as a change at a joint.
 COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
-#: Number of balls of the urn of a horizontal axis, and of the vertical axis; a quarter of the number is the variance in
-#: steps.
+#: Number of balls of the urn of a horizontal axis; the variance in squared steps is a quarter of the number.
 _BALLS: Final = 12
-_BALLS_UP: Final = 8
+_BALLS_UP: Final = 8  #: Number of balls of the urn of the vertical axis.
 _BLOCK: Final = 1024  #: Number of positions whose probabilities are in memory at once, if heights are not used.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Positions relative to their candidate tracks, n positions with up to m candidates and S `SHIFTS_M`."""
+    """Positions relative to candidate tracks: n positions with up to m candidates each, and S values of `SHIFTS_M`."""
 
     across: Floats  #: Unit vector to the right of the track, east and north, shape (n, m, 2).
     offset_m: Floats  #: Distance to the right of the track, shape (n, m); infinite without a candidate.
     beyond_m: Floats  #: Distance of the position beyond an end of the track, shape (n, m); 0 if not beyond.
     above_m: Floats  #: Height of the position above the expected antenna height, shape (n, m); NaN without a height.
-    clear: Masks  #: Whether a track at each of `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
-    moved_m: Floats  #: Distance of the nearest track to the right of the previous position's nearest track, (n,).
-    turned: Masks  #: Whether the nearest tracks of this and the previous position have opposite directions, (n,).
+    #: Whether an unmapped track at each of `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
+    clear: Masks
+    #: Distance by which the nearest track is to the right of the nearest track of the previous position, (n,).
+    moved_m: Floats
+    #: Whether the nearest tracks of this position and of the previous position have opposite directions, (n,).
+    turned: Masks
     sigma_m: Floats  #: Standard deviation of a position per horizontal axis, shape (n,).
     sigma_up_m: Floats  #: Standard deviation of the height, shape (n,).
     weight: Floats  #: Fraction of the correlation time that a position represents, shape (n,).
@@ -94,30 +97,34 @@ class Transitions:
         self._track, self._place = candidates.track, candidates.chainage_m
         self._clear, self._moved, self._turned = residuals.clear, residuals.moved_m, residuals.turned
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Search limit, and path lengths within it from an end of a track to the ends of other tracks [m].
+        #: By track and end: the search limit, and the path lengths up to this limit from this end to the ends of other
+        #: tracks [m].
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
-        #: Whether an end of the track is within reach, before and after each transition, shape (n - 1, m).
+        #: Whether an end of the track is within reach of the position before each transition, shape (n - 1, m).
         self._leaves = to_end[:-1] <= self._reach[:, None]
+        #: Whether an end of the track is within reach of the position after each transition, shape (n - 1, m).
         self._enters = to_end[1:] <= self._reach[:, None]
         ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
         at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
         beyond = np.abs(residuals.beyond_m) / np.clip(_BEYOND_SIGMAS * residuals.sigma_m, *_BEYOND_M)[:, None]
         opens = at_end.any(axis=2) & (beyond > 1.0)
         self._same = (self._track[:-1, :, None] == self._track[1:, None, :]) & (self._track[:-1, :, None] >= 0)
-        #: Whether the track is left, or entered, over an open end, because the next, or the previous, position is
-        #: beyond that end; shape (n - 1, m).
+        #: Whether the train leaves the track over an open end, because the next position is beyond that end; shape (n -
+        #: 1, m).
         self._left = (self._same & opens[1:, None, :]).any(axis=2)
+        #: Whether the train enters the track over an open end, because the previous position is beyond that end.
         self._entered = (self._same & opens[:-1, :, None]).any(axis=1)
-        # as errors do not change by metres in one step, a single position beyond the end is not explained by an error
+        # a single position beyond the end is not explained by an error, as errors do not change by metres in one step
         stays = np.where(opens, np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2)), 1.0)
-        #: Likelihood of staying on a track if only the previous, or only the next, position is beyond its open end.
+        #: Likelihoods of staying on a track if only the previous position, or only the next position, is beyond an open
+        #: end of the track.
         self._stays = np.where(self._left, 1.0, stays[:-1]), np.where(self._entered, 1.0, stays[1:])
 
     @property
     def changes(self) -> Masks:
-        """Whether each transition is to another track, or to or from no track, shape (n - 1, m + 1, m + 1)."""
+        """Whether each transition is to another track, or to or from unmapped track, shape (n - 1, m + 1, m + 1)."""
         state = np.column_stack([np.where(self._track < 0, -2, self._track), np.full(len(self._track), -1)])
         return np.asarray(state[:-1, :, None] != state[1:, None, :])
 
@@ -151,7 +158,8 @@ class Transitions:
         return share
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Return the path length from candidate i of position k to candidate j of k + 1 over ends of tracks [m].
+        """Return the path length over ends of tracks from candidate i of position k to candidate j of position k + 1
+        [m].
 
         The length is infinite beyond the search limit.
         """
@@ -186,13 +194,16 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
     apart = np.abs(place[:, None] - SHIFTS_M)
     nearest = apart == apart.min(axis=1, keepdims=True)
     drifted = _DRIFTS * (apart <= apart.min(axis=1, keepdims=True) + _SHIFT_STEP_M)
-    known = apart.min(axis=1, keepdims=True) <= _SHIFT_STEP_M  # otherwise on the reference track, or too far from it
+    # otherwise the shifted track is the reference track, or too far from it
+    known = apart.min(axis=1, keepdims=True) <= _SHIFT_STEP_M
     return np.asarray(np.where(nearest, 1.0, drifted) * known)
 
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the equilibrium probabilities of an urn, and its transition matrix over a time, from row to column."""
+    """Return the equilibrium probabilities of an urn, and the transition matrix (row to column) over a number of
+    seconds.
+    """
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -208,7 +219,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """Lattice of the common error, C values in plan by U heights, with initial probabilities `first`, shape (C, U)."""
+    """Lattice of the common error: C values in plan times U heights; `first` has the initial probabilities (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -219,16 +230,17 @@ class _CommonError:
         self.first = np.outer(np.outer(plan, plan), _urn(self._balls_up, 0.0)[0])
 
     def later(self, share: Floats, seconds: float) -> Floats:
-        """Return the probabilities of lattice points after a time, shape (..., C, U)."""
+        """Return the probabilities of lattice points after a number of seconds, shape (..., C, U)."""
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """Return the expectation of later values, given the lattice point a time before, shape (..., C, U)."""
+        """Return the expectation of `value` for each lattice point a number of seconds earlier, shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
-        """Return values multiplied by the matrix of each axis in turn; a product with one large matrix would wait for
-        threads.
+        """Return values multiplied by the transition matrix of each axis in turn.
+
+        A product with one large matrix would wait for threads.
         """
         axis, heights = len(plan), len(up)
         east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
@@ -254,7 +266,7 @@ def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
     off_track = offset[known, None] - across @ lattice.plan_m.T
     square = off_track**2
     if beyond.any():
-        # the common error can be along the track, too, so that only the remaining distance beyond the end is an error
+        # the common error explains part of a distance beyond the end of the track; only the rest counts as an error
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
     cost = np.full((m + len(SHIFTS_M) + 1, *lattice.first.shape), np.inf)
@@ -273,7 +285,7 @@ def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
 
 
 def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
-    """Return the most probable sequence of tracks, and the probability of each candidate.
+    """Return the best sequence of tracks, and the probability of each candidate.
 
     Returns
     -------
@@ -285,14 +297,14 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
     length = _BLOCK // len(lattice.up_m)
-    # for a long log, the first position of each block is stored, and each block is recomputed on the backward pass
+    # to save memory, only the first position of each block is stored; each block is recomputed on the backward pass
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
     probability, gains, changes = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1)), moves.changes
     after = expected = np.ones((states, *lattice.first.shape))
     move = np.eye(states)
-    none = np.arange(m + 1)  # all unmapped states are added up
+    none = np.arange(m + 1)  # first state of each group: each candidate, and all unmapped states together
     for start in reversed(firsts):
         block = [at for _, at in _forward(residuals, moves, lattice, start, firsts[start], min(start + length, n))]
         for k in reversed(range(start, start + len(block))):
@@ -325,7 +337,7 @@ class _At:
 def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
-    """Yield the forward recursion at the positions from `start` to before `stop`.
+    """Yield the forward recursion at each position from `start` up to, not including, `stop`.
 
     The recursion begins with the state probabilities `first` or, if `first` is None, with the prior.
     """
@@ -349,7 +361,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """Return the sequence with the largest expected number of right successive pairs less the cost of changes."""
+    """Return the sequence with the largest expected number of right successive pairs minus the cost of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

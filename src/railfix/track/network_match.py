@@ -21,37 +21,37 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, Ca
 from railfix.track.network_decode import SHIFTS_M, Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
-#: Standard deviation of the distance of positions from their track, if it is neither stated nor can be estimated [m].
+#: Standard deviation of the distance of positions from their track, if the log does not state it and it cannot be
+#: estimated [m].
 SIGMA_M: Final = 4.0
-_LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimate of this standard deviation [m].
-_ALONE_M: Final = 15.0  #: Least additional distance of the second track for a position to be used in the estimate [m].
-#: Median distance of positions from their track, in metres and as a multiple of their noise, beyond which the positions
-#: are not on that track.
+_LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimated standard deviation of the distance [m].
+#: A position is used in the estimate if the second track is at least this much farther away than the first [m].
+_ALONE_M: Final = 15.0
+#: Median distance of positions from their track beyond which the positions are not on that track [m].
 _LARGEST_LEVEL_M: Final = 5.0
-_BESIDE: Final = 3.0
-_ENOUGH: Final = 30  #: Minimum number of positions for the estimate.
-_COMMON_M: Final = 2.0  #: Largest standard deviation of the common error of positions: satellites, atmosphere, map [m].
+_BESIDE: Final = 3.0  #: The same limit as a multiple of the noise of positions; the larger limit applies.
+_ENOUGH: Final = 30  #: Minimum number of positions to estimate the standard deviation.
+#: Upper bound of the standard deviation of the common error of all positions (satellites, atmosphere, map) [m].
+_COMMON_M: Final = 2.0
 #: Ratio of the standard deviation of the common error to the stated standard deviation, up to `_COMMON_M`.
 _COMMON_SHARE: Final = 0.7
 _BEST: Final = 0.1  #: Quantile of the stated standard deviations from which the common error is computed.
-#: Minimum search distance for tracks [m], search distance in standard deviations, and its maximum [m].
-_WITHIN_M: Final = 30.0
-_WITHIN_SIGMAS: Final = 5.0
-_FARTHEST_M: Final = 100.0
-#: Positions farther from all tracks than this multiple of the search distance are wrong if the train is near a track
-#: again within this time [s].
-_FAR: Final = 6.0
+_WITHIN_M: Final = 30.0  #: Minimum search distance for tracks [m].
+_WITHIN_SIGMAS: Final = 5.0  #: Search distance for tracks in standard deviations.
+_FARTHEST_M: Final = 100.0  #: Maximum search distance for tracks [m].
+_FAR: Final = 6.0  #: A position is far from all tracks beyond this multiple of the search distance.
+#: Positions far from all tracks are wrong if the train is near a track again within this time [s].
 _WRONG_S: Final = 60.0
 _MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position far from all tracks.
-#: Values of `Candidates` without a track.
+#: Values in `Candidates` where there is no further track.
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
-#: Values of `Matched` for a position that was not matched.
+#: Values in `Matched` for a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_ROUNDED_M: Final = 0.1  #: Tolerance of the distance between tracks [m].
+_ROUNDED_M: Final = 0.1  #: Tolerance in comparisons of the distance between tracks [m].
 _STEP_S: Final = 0.4  #: Time step assumed where times are missing or decrease [s].
 _MOST_TRACKS: Final = 16  #: Largest number of candidate tracks for a position.
-_APART_UP_M: Final = 1.0  #: Least height difference of candidate tracks for which heights are used [m].
+_APART_UP_M: Final = 1.0  #: Heights are used if the heights of candidate tracks differ by more than this [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +69,10 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions transformed from the frame of the satellites to the frame of the map, and the shift.
+        """Return the positions transformed from the frame of the satellites to the frame of the map, and a description.
 
-        Raise MismatchError if the log is far from the network, or has no times although the shift depends on time.
+        Raise MismatchError if the log is far from the network, or if the transformation depends on time and the log has
+        no times.
         """
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
@@ -115,15 +116,16 @@ def _check_region(network: Network, log: PlanLog) -> None:
 class Matched:
     """Positions of a log matched to the tracks of a network, n rows; shapes (n,) unless stated."""
 
-    track: Indices  #: Track in the most probable sequence of tracks; -1 if on no track of the network.
+    track: Indices  #: Track in the best sequence of tracks; -1 if the position is on no track of the network.
     chainage_m: Floats  #: Chainage on the track.
     offset_m: Floats  #: Distance from the track in plan, positive to the right.
     #: Probability of `track` given the whole log; NaN without a position, or for a position rejected as wrong.
     probability: Floats
     candidates: Candidates  #: Tracks near each position.
-    #: Probability of each candidate, shape (n, m); the complement of the sum is the probability of an unmapped track.
+    #: Probability of each candidate, shape (n, m). The probabilities and the probability of an unmapped track add up to
+    #: 1.
     probabilities: Floats
-    notes: tuple[str, ...] = ()  #: Assumptions made on the log.
+    notes: tuple[str, ...] = ()  #: Notes on assumptions about the log.
 
     def take(self, rows: Indices) -> Matched:
         """Return the matched positions of selected rows."""
@@ -142,7 +144,9 @@ def read_plan_positions(
 
 
 def plan_log(log: PositionLog, *, antenna_up_m: float | None = None) -> PlanLog:
-    """Convert a position log to `PlanLog`; the sigma in plan is the root mean square of both horizontal axes."""
+    """Convert a position log to `PlanLog`; the sigma in plan is the root mean square of the sigmas of both horizontal
+    axes.
+    """
     latitude, longitude, height = log.geodetic
     return PlanLog(
         path=log.path,
@@ -216,7 +220,7 @@ def match(
 
 
 def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None) -> tuple[Floats, tuple[str, ...]]:
-    """Return standard deviations of the positions' distances from their track [m], and a note if they are assumed."""
+    """Return the standard deviation of each position's distance from the track [m], and a note on assumed values."""
     if sigma_m is not None:
         return np.full(len(given), sigma_m), ()
     stated = np.isfinite(log.sigma_m[given])
@@ -224,27 +228,27 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
     if stated.all():
         return sigma, ()
     estimate, how = _estimate_sigma(network, log, given[~stated])
-    note = f"{log.path}: {int((~stated).sum())} positions state no sigma, {estimate:.1f} m is taken{how} (--sigma)"
+    note = f"{log.path}: {int((~stated).sum())} positions state no sigma, {estimate:.1f} m is assumed{how} (--sigma)"
     return np.where(stated, sigma, estimate), (note,)
 
 
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
-    """Estimate the standard deviation of the distances from a track [m], and return it with a clause on its basis.
+    """Return the standard deviation of distances from a track [m], and a clause on how it was obtained.
 
-    The estimate is from the median distance of positions near a single track, because near parallel tracks, an error
-    cannot be distinguished from a position on another track.
+    It is estimated from the median distance of positions near a single track. Near parallel tracks, an error cannot be
+    distinguished from a position on another track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
     near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)
     first, second = np.abs(near.offset_m[:, 0]), np.abs(near.offset_m[:, -1])
     alone = np.isfinite(first) & (second > first + _ALONE_M) if near.offset_m.shape[1] > 1 else np.isfinite(first)
     if alone.sum() < _ENOUGH:
-        return SIGMA_M, ", because too few lie where only one track is near"
+        return SIGMA_M, ", because too few of them are near a single track"
     own = near.offset_m[alone, 0]
     level, noise = (float(np.median(np.abs(v))) / _NORMAL_MEDIAN for v in (own, np.diff(own) / np.sqrt(2.0)))
     if level > max(_LARGEST_LEVEL_M, _BESIDE * noise):
-        return max(noise, SIGMA_M / 2.0), ", because they do not lie on the tracks"
-    return max(level, _LEAST_SIGMA_M, network.sigma_plan_m), ", from their distances where only one track is near"
+        return max(noise, SIGMA_M / 2.0), ", because the positions are not on the tracks"
+    return max(level, _LEAST_SIGMA_M, network.sigma_plan_m), ", from the distances of positions near a single track"
 
 
 def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
@@ -253,11 +257,11 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
     if not len(back):
         return ()
     first = log.time[given[back[0] + 1]]
-    return (f"{log.path}: the time steps back {len(back)} times, first to {first}; rows are taken in their order",)
+    return (f"{log.path}: the time decreases at {len(back)} rows, first to {first}; the order of the rows is kept",)
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Find the tracks within a distance of each position, and within a larger distance of positions far from tracks."""
+    """Find the tracks within a distance of each position; for positions far from all tracks, the distance is larger."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -271,7 +275,8 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
     """Return a mask of the positions far from all tracks that are wrong, shape (n,).
 
-    A position is wrong if the last position near a track before it and the next after it are at most `_WRONG_S` apart.
+    Such a position is wrong if the last earlier position near a track, and the next later position near a track, are at
+    most `_WRONG_S` apart.
     """
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):
@@ -283,7 +288,9 @@ def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
 
 
 def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
-    """Estimate the ratio of actual to stated sigmas, at least 1, from changes of the distance over `correlation_s`."""
+    """Estimate the ratio of actual to stated sigmas, at least 1, from changes of the offset from the track over
+    `correlation_s`.
+    """
     seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
     rows = np.arange(len(seconds))
     later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)
@@ -295,7 +302,9 @@ def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
 
 
 def _median_scale(ratio: Floats) -> float:
-    """Return the scale of values relative to a standard normal distribution, at least 1, from their absolute median."""
+    """Return the spread of values relative to a standard normal distribution, at least 1, from the median of absolute
+    values.
+    """
     ratio = np.abs(ratio[np.isfinite(ratio)])
     return max(1.0, float(np.median(ratio)) / _NORMAL_MEDIAN) if len(ratio) else 1.0
 
@@ -337,7 +346,7 @@ def _residuals(
     weight[0] = 1.0
     sigma_up = np.full(len(given), np.nan) if log.sigma_up_m is None else log.sigma_up_m[given]
     sigma_up = np.where(np.isfinite(sigma_up), sigma_up, 2.0 * sigma_m)
-    # reflections bias heights to one side for minutes
+    # increase the sigmas, because reflections bias heights to one side for minutes
     sigma_up = sigma_up * _median_scale(np.nanmin(np.abs(above), axis=1, initial=np.inf) / sigma_up)
     axis, beyond = over(right, 0.0), over(np.where(outward, ahead_m, 0.0), 0.0)
     of_antenna = ANTENNA_SIGMA_M if log.antenna_up_m is None else 0.0
@@ -352,14 +361,14 @@ def _residuals(
         sigma_up_m=sigma_up,
         weight=weight,
         seconds=seconds,
-        # the error of the map's transformation is common to all positions, too
+        # includes the error of the map's transformation, which is also common to all positions
         common_m=float(np.hypot(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M), network.datum_plan_m)),
         common_up_m=float(np.linalg.norm([of_codes, of_antenna, network.sigma_height_m])) if counts else 0.0,
     )
 
 
 def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) -> dict[str, Any]:
-    """Compute the fields `clear`, `moved_m` and `turned` of `Residuals`, for unmapped tracks parallel to a track."""
+    """Compute the fields `clear`, `moved_m` and `turned` of `Residuals`, which describe parallel unmapped tracks."""
     cosine = np.einsum("nmi,ni->nm", across, across[:, 0])
     offset = np.where(np.isfinite(offset_m), offset_m, 0.0)
     right_m = offset[:, :1] - offset * cosine  # distance of each candidate to the right of the nearest track
@@ -375,7 +384,7 @@ def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) 
 
 
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
-    """Expand matched positions to all rows of a log; rows that are not in `rows` have no match."""
+    """Expand matched positions, which are in `rows` of a log, to all `count` rows; the other rows have no match."""
 
     def over(values: Any, empty: float) -> Any:
         full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)

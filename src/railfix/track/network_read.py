@@ -23,8 +23,9 @@ from railfix.track.route import MapReading, Segment, check_order, first_gap, ori
 from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
-TOLERANCE_M: Final = 0.5  #: Largest distance between connected ends if the file states no connections [m].
-#: Largest change of direction between two tracks that a train passes [rad]; the legs of a switch differ by about pi.
+TOLERANCE_M: Final = 0.5  #: Ends are connected up to this distance if the file states no connections [m].
+#: Largest change of direction of a train that passes from one track to another [rad]. Between the two legs of a switch,
+#: the direction would change by about pi.
 _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
 
@@ -42,7 +43,7 @@ def read_network(
 
 
 def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
-    """Connect tracks to a network, as stated by their files or by their ends; see `read_network`."""
+    """Connect tracks to a network, as their files state, or where their ends meet; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
@@ -54,7 +55,9 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
     note = f"tracks are connected at ends within {tolerance_m:g} m; {len(cuts)} tracks are divided where another "
     note += "track ends at them"
     if packed := [path for path in paths if ending(path) == ".pbf"]:
-        note += f"; {packed[0]} is read without the ids of its nodes, which 'osmium cat FILE.osm.pbf -o FILE.osm' keeps"
+        note += (
+            f"; {packed[0]} is read without node ids; to keep them, convert it: 'osmium cat FILE.osm.pbf -o FILE.osm'"
+        )
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 
@@ -84,7 +87,7 @@ def _of_nodes(tracks: list[Segment]) -> Network:
 
 
 def _relations(path: FilePath) -> list[Relation]:
-    """Return the connections stated by a file; an empty list if it states none."""
+    """Return the connections that a file states; an empty list if the file states none."""
     kind = find_kind(path)
     if kind == "xml":
         return read_railml_relations(path)
@@ -132,7 +135,7 @@ def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tupl
     ends, outward = end_points(network)
     pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
     level = np.array([track.metadata.get("level", "") for track in network.tracks])
-    # a bridge and a tunnel whose ends meet in plan are not connected; a track on the ground connects to either
+    # ends of a bridge and a tunnel that meet in plan are not connected; a track on the ground is connected to both
     apart = (level[pairs[:, 0] // 2] != level[pairs[:, 1] // 2]) & (level[pairs // 2] != "").all(axis=1)
     pairs = pairs[~apart]
     pairs = pairs[np.lexsort(pairs.T[::-1])]
@@ -172,7 +175,7 @@ def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]
 
 
 def _divide(whole: Network, places: Mapping[int, Sequence[float]]) -> tuple[Network, list[int]]:
-    """Return the network with tracks divided at inner chainages [m], and the original track's index for each part."""
+    """Return the network with tracks divided at inner chainages [m], and for each part the original track's index."""
     parts: list[tuple[Segment, int]] = []
     for k, track in enumerate(whole.tracks):
         way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
@@ -202,15 +205,15 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
     )
 
 
-_GAP_M: Final = 5.0  #: Distance of two unconnected ends below which they are a gap in one track [m].
-_JOINT_M: Final = 0.5  #: Largest distance between connected ends that is not reported [m].
+_GAP_M: Final = 5.0  #: Distance of two unconnected ends below which the distance is reported as a gap in one track [m].
+_JOINT_M: Final = 0.5  #: Distance between connected ends above which the distance is reported [m].
 #: Largest change of direction over a navigable connection [deg]; a 1:4.5 switch turns by 12.5 deg over its length.
 _KINK_DEG: Final = 15.0
-#: Smallest spacing of parallel tracks [m], which leaves clearance between vehicles.
+#: Smallest possible spacing of parallel tracks, at which vehicles pass each other [m].
 _LEAST_SPACING_M: Final = 2.5
-#: Distance from the end of a track within which its spacing is not checked, because tracks join in a switch [m].
+#: Distance from the end of a track within which the spacing is not checked, because tracks join in a switch [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Minimum length over which too small a spacing is reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Length from which too small a spacing is reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,7 +234,7 @@ class NetworkQuality:
     tracks: int  #: Number of tracks.
     switches: int  #: Number of track ends from which a train can pass to several tracks.
     ends: int  #: Number of track ends without a navigable connection.
-    parts: int  #: Number of parts of the network that are not connected with each other.
+    parts: int  #: Number of parts of the network between which there is no connection.
     length_m: float  #: Total length of the tracks.
     findings: tuple[NetworkFinding, ...]  #: Faults of the network, beginning with the kinds in `FAULTS`.
 
@@ -292,7 +295,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
 
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
-    """Yield connections of ends that are apart, and navigable connections with a kink."""
+    """Yield connections of ends that do not meet, and navigable connections with a kink."""
     ends, outward = end_points(network)
     for link in network.links:
         first, second, tracks = (link.first, link.first_end), (link.second, link.second_end), (link.first, link.second)
@@ -307,7 +310,7 @@ def _joints(network: Network) -> Iterator[NetworkFinding]:
 
 
 def _too_near(network: Network) -> Iterator[NetworkFinding]:
-    """Yield pairs of tracks that are nearer than `_LEAST_SPACING_M`, away from their ends."""
+    """Yield pairs of tracks that are nearer to each other than `_LEAST_SPACING_M`, away from the ends of the tracks."""
     latitude = np.concatenate([t.latitude_deg for t in network.tracks])
     longitude = np.concatenate([t.longitude_deg for t in network.tracks])
     track = np.repeat(np.arange(len(network.tracks)), np.diff(network.first_point))

@@ -1,4 +1,4 @@
-"""Route of a run through a network of tracks, and filling of gaps in its log along the shortest route."""
+"""Route of a run through a network of tracks, and filling of gaps in the log along the shortest route."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from railfix.track.network_match import Matched, PlanLog
 
 #: Rows to be filled: only rows without a position ("gaps"), or also rows with positions off the map ("off-map").
 Rows = Literal["gaps", "off-map"]
-#: Largest distance of a track from a drifting position, and largest difference between the length of a route and the
-#: distance travelled [m].
+#: Largest distance of a track from a position off the map, and largest difference between the length of a route and the
+#: distance travelled according to these positions [m].
 _DRIFT_M = 500.0
-_STEPS = 15  #: Number of steps of which the median is taken, because positions jump.
+_STEPS = 15  #: Number of steps of which the median is taken, to suppress jumps of positions.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,16 +31,16 @@ class Filled:
 
     track: Indices  #: Index of the track; -1 without a position or a route.
     chainage_m: Floats  #: Chainage on the track.
-    #: Largest distance between the train and a filled position if the train is on the route; infinite before the first
-    #: and after the last known position, and NaN where the position is not filled.
+    #: Largest distance between the train and a filled position, if the train is on the route. Infinite before the first
+    #: and after the last known position; NaN where the position was not filled.
     bound_m: Floats
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
     """Fill rows without a usable position along the shortest route between known positions.
 
-    The speed on the route is assumed to be constant. If the log has positions off the map, and `rows_to_fill` includes
-    them, the speed of these positions is used instead.
+    The speed on the route is assumed to be constant. If the log has positions off the map and `rows_to_fill` is
+    "off-map", the speed of these positions is used instead.
     """
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
@@ -70,7 +70,7 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
 def _fill_before(
     network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
 ) -> None:
-    """Fill rows before the first or after the last known position, as far as the log has positions off the map."""
+    """Fill rows before the first or after the last known position as far as the log has positions, in place."""
     rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
     if len(rows) < 2:
         return
@@ -98,8 +98,8 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 def _distance_m(log: PlanLog) -> Floats:
     """Return the distance travelled, shape (n,) [m]; NaN without a position.
 
-    The distance is the sum of the steps between positions, each replaced by the median over `_STEPS`, because positions
-    jump.
+    The distance is the sum of the steps between positions. Each step is replaced by the median over `_STEPS` steps, to
+    suppress jumps of positions.
     """
     from scipy.ndimage import median_filter
 
@@ -113,9 +113,10 @@ def _distance_m(log: PlanLog) -> Floats:
 def _put_on(
     filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
 ) -> None:
-    """Place rows on a route in proportion to `at`, of which the first value is at the start of the route.
+    """Place rows on a route in proportion to the values `at`, in place.
 
-    The last value of `at` is at the end of the route. With `ends_known`, the position at the end is known, too.
+    The first value of `at` belongs to the start of the route, the last value to the end. With `ends_known`, the
+    position at the end is known, as at the start.
     """
     numbers, enter, leave = legs
     share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
@@ -131,8 +132,8 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Return the tracks of the shortest route between two positions, and the chainages at which they are entered and
-    left.
+    """Return the tracks of the shortest route between two positions, and where the train enters and leaves each track
+    [m].
 
     The positions are given by track index and chainage [m]. The result is None if there is no route.
     """
@@ -154,10 +155,11 @@ def _fill_legs(
 
 
 def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:
-    """Return the indices of the tracks passed by a run in order of travel, and of tracks that cannot be joined to them.
+    """Return the tracks passed by a run in order of travel, and the tracks that cannot be joined to this route, as
+    indices.
 
     Each track is in the route once. Raise MismatchError if no position lies on a track; the message names the log and
-    the location of its positions.
+    the location of the positions.
     """
     seen = matched.track[matched.track >= 0]
     if not len(seen):
@@ -166,10 +168,11 @@ def find_route(network: Network, matched: Matched, path: str = "the log") -> tup
     share = {t: float(matched.probabilities[matched.candidates.track == t].sum()) for t in set(passed)}
     routes = [network.route_over(passed)]
     if routes[0] is None:
-        # the train turned back, the map has a gap, or positions are on a track that was not passed
+        # there is no route if the train turned back, the map has a gap, or positions were matched to a track that was
+        # not passed
         routes = [_choose_route(network, order, share) for order in (passed, passed[::-1])]
     once = [part for route in routes if route is not None for part in _once(network, route)]
-    # `fsum` does not depend on the order, so that the return over the same tracks has an equal sum
+    # `fsum` does not depend on the order, so that the same tracks in opposite order have an equal sum
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
 
@@ -181,7 +184,7 @@ def left_out_note(network: Network, left_out: Sequence[int]) -> str:
 
 
 def _beside(network: Network, matched: Matched) -> str:
-    """Return a clause on the distance of positions from the tracks, for the message that they are on no track."""
+    """Return a clause on the distance between positions and tracks, for the message that no position is on a track."""
     track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
     near = track >= 0
     if not near.any():
@@ -190,11 +193,13 @@ def _beside(network: Network, matched: Matched) -> str:
     away = float(np.median(offset[track == most]))
     side = "right" if away > 0.0 else "left"
     where = f"{abs(away):.1f} m {side} of {network.names[most]}"
-    return f": the positions lie {where}; the map lacks their track, or is displaced"
+    return f": the positions lie {where}; their track is missing from the map, or the map is displaced"
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:
-    """Return the longest parts of a route that pass no joint twice, except at their end."""
+    """Return the longest parts of a route that pass no joint twice, except that a part may end at a joint that it
+    passed.
+    """
     joints = _joints(network, route)
     parts: list[list[int]] = []
     last = 0
@@ -223,9 +228,10 @@ def _joints(network: Network, route: list[int]) -> list[int]:
 
 
 def _choose_route(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
-    """Return a route over the most probable tracks in the order of first passage.
+    """Return a route over the most probable tracks, in the order in which the run first passed them.
 
-    In descending order of probability, a track is left out if no route joins it to the tracks kept before.
+    The tracks are tried in descending order of probability. A track is left out if no route joins it to the tracks kept
+    so far.
     """
     rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
 

@@ -17,10 +17,9 @@ class Passes(NamedTuple):
 
     position: Indices  #: Index of the position.
     segment: Indices  #: Index of the segment.
-    #: Distances from the start of the segment to the projection of the position on the extended segment, and to the
-    #: nearest point of the segment.
+    #: Distance from the start of the segment to the projection of the position on the extended segment.
     along_m: Floats
-    foot_m: Floats
+    foot_m: Floats  #: Distance from the start of the segment to the point of the segment nearest to the position.
     offset_m: Floats  #: Vector from the nearest point to the position, shape (P, 3).
     lowest: Masks  #: True if no adjacent segment in the list is nearer to the position.
     again: Masks  #: True if the previous segment is equally near, because the nearest point is shared.
@@ -29,8 +28,8 @@ class Passes(NamedTuple):
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
     """Find all segments within `reach_m` of each position (n, 3).
 
-    Segments whose middle is within `reach_m` plus half of the longest segment are returned, so that some are farther
-    than `reach_m`.
+    The result has all segments with a middle within `reach_m` plus half of the longest segment; some are farther than
+    `reach_m`.
     """
     length, tangent = trajectory.length_m, trajectory.tangent
     middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])

@@ -36,13 +36,13 @@ from railfix.track.vector_file import (
 RFC_CRS: Final = "OGC:CRS84"
 #: Property that identifies a connection of two tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
-#: Key under which all properties and the id of a line's feature are kept.
+#: Key under which all properties and the id of a feature are kept in the properties of its lines.
 _FEATURE: Final = "@feature"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
 def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_GeojsonLine]:
-    """Yield every LineString in a GeoJSON object, with the members of its parents that apply to it.
+    """Yield every LineString in a GeoJSON object, with the members that it inherits from its parents.
 
     Raise InputFileError if an object has no lines or no geometry.
     """
@@ -86,7 +86,7 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
 
 
 def _is_no_line(feature: dict[str, Any]) -> bool:
-    """Return whether a feature is a point, an area such as a station, or has no geometry."""
+    """Return whether a feature is a point or an area (such as a station), or has no geometry."""
     geometry = feature.get("geometry")
     if geometry is None and "geometry" in feature:
         return True
@@ -94,7 +94,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name of a feature, or its id, as property "name"; an empty dictionary if it has neither."""
+    """Return the name or else the id of a feature, as property "name"; an empty dictionary without both."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -138,7 +138,9 @@ class _GeojsonLine:
         raise self.error(f"{key} is {value!r}; a text was expected")
 
     def array(self, key: str, blank: float) -> Floats | None:
-        """Return a property with one value per point, shape (n,), or None if it is missing; null becomes `blank`."""
+        """Return a property with one value per point, shape (n,), or None if the property is missing; null becomes
+        `blank`.
+        """
         value = self.properties.get(key)
         if value is None:
             return None
@@ -165,9 +167,10 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
 
 
 def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
-    """Return the positions of coordinates in the order easting, northing or longitude, latitude, shape (n, 2) or more.
+    """Return the positions of coordinates in the order easting, northing (or longitude, latitude), shape (n, 2) or
+    more.
 
-    Raise InputFileError if coordinates of a geographic CRS are not degrees of longitude and latitude.
+    Raise InputFileError if the CRS is geographic and the coordinates are not degrees of longitude and latitude.
     """
     if find_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
@@ -207,7 +210,7 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _without_geometry(document: dict[str, Any]) -> list[int]:
-    """Return the numbers, from 1, of features without geometry (null, RFC 7946, 3.2) that are not connections."""
+    """Return the numbers (from 1) of features without geometry (null, RFC 7946, 3.2) that are not connections."""
     features = [f if isinstance(f, dict) else {} for f in document.get("features") or ()]
     empty = [f.get("geometry", ...) is None and RELATION not in (f.get("properties") or {}) for f in features]
     return [number for number, without in enumerate(empty, start=1) if without]
@@ -248,7 +251,7 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     )
 
 
-#: Attribute of the track, conversion factor, and value of an empty cell for each optional column.
+#: For each optional column: attribute of the track, conversion factor, and value for an empty cell.
 OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "kilometrage_m": ("kilometrage_m", 1.0, np.nan),
     "cant_mm": ("cant_m", 1e-3, np.nan),
@@ -265,7 +268,7 @@ KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m",
 
 
 def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]:
-    """Return the optional attributes of points, each from `read(column, blank)`, in the units of `Track`.
+    """Return the optional attributes of points in the units of `Track`; `read(column, blank)` returns a column.
 
     An attribute for which `read` returns None is left out. A radius of 0, for straight track, becomes infinite.
     """
@@ -315,7 +318,7 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
 def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColumns:
     """Return the table with column names of other programs replaced by the names of railfix.
 
-    The height column is named by its datum. Raise InputFileError if the datum is not given.
+    The height column is renamed according to the height datum. Raise InputFileError if the datum is not given.
     """
     places = with_usual_names(table, ("latitude_deg", "longitude_deg"))
     named = with_usual_names(places, ("height_m",))

@@ -1,7 +1,7 @@
 """Quality checks of a track map: spacing, mid-chord deviation, kinks, duplicates, kilometrage, gradient and cant.
 
 The checks are necessary because a map error affects all satellites alike, so that no screen of the observations can
-detect it (P1 2.2(1), 4.1(3)).
+detect the error (P1 2.2(1), 4.1(3)).
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from railfix.track.track import BACKWARDS, HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Rounding of coordinates that is reported [deg]; it causes errors of up to 0.6 m.
-_LEAST_CANT_M: Final = 5e-4  #: Maximum cant of a map below which the unit must be wrong [m].
+_LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this, the unit must be wrong [m].
 _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are probably the same point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
-_ADVERSE_M: Final = 0.005  #: Cant below which its sign is not checked [m].
-_CENTIMETRE_M: Final = 0.01  #: Largest distance of chord and arc for `needed_spacing_m` [m].
-#: Largest change of direction at a point, if it is also sharper than `least_radius_m`, that is not a kink.
+_ADVERSE_M: Final = 0.005  #: Cant below which the sign of the cant is not checked [m].
+_CENTIMETRE_M: Final = 0.01  #: Largest distance between chord and arc for `needed_spacing_m` [m].
+#: A change of direction at a point above this is a kink, if it is also sharper than `least_radius_m`.
 _KINK_DEG: Final = 3.0
-_SHARP_KINK_DEG: Final = 15.0  #: Largest kink that is a warning; a sharper kink is an error.
+_SHARP_KINK_DEG: Final = 15.0  #: Change of direction up to which a kink is a warning; a sharper kink is an error.
 #: Largest deviation of the height of a point from the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
-#: Largest difference of the gradient attribute from the heights, over `_GRADIENT_WINDOW_M`.
+#: Largest difference between the mean gradient of the map and the gradient of the heights, over `_GRADIENT_WINDOW_M`.
 _GRADIENT_DIFFERENCE_PERMILLE: Final = 5.0
 _GRADIENT_WINDOW_M: Final = 100.0
 
@@ -40,9 +40,11 @@ _GRADIENT_WINDOW_M: Final = 100.0
 class MapLimits(Settings):
     """Limits of a track map; a value on the limit passes."""
 
-    mid_chord_m: float = Field(default=0.30, gt=0)  #: Largest distance of chord and arc in mid-segment (P1 4.1(3)).
+    #: Largest distance between chord and arc in mid-segment (P1 4.1(3)).
+    mid_chord_m: float = Field(default=0.30, gt=0)
     spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment; tens of metres on straight track in P1 2.2(1).
-    #: Longest segment that is not reported as a gap, which indicates a wrong point or a missing part of the line.
+    #: Length of a segment above which the segment is reported as a gap: a point is wrong, or a part of the line is
+    #: missing.
     gap_m: float = Field(default=2000.0, gt=0)
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
     gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest gradient of a segment.
@@ -55,16 +57,12 @@ class Finding:
 
     severity: Severity
     kind: str  #: Kind of the fault, a key of `_FAULTS` without "small".
-    #: Indices of the first and last point of the range.
-    first: int
-    last: int
-    #: Chainage and kilometrage of the first point; the kilometrage may be NaN.
-    chainage_m: float
-    kilometrage_m: float
-    #: Worst value in the range and its limit; NaN if the fault has no value or no limit.
-    value: float
-    limit: float
-
+    first: int  #: Index of the first point of the range.
+    last: int  #: Index of the last point of the range.
+    chainage_m: float  #: Chainage of the first point.
+    kilometrage_m: float  #: Kilometrage of the first point; NaN if unknown.
+    value: float  #: Worst value in the range; NaN if the fault has no value.
+    limit: float  #: Limit of the value; NaN if the fault has no limit.
     sentence: str  #: Location and description of the fault for the user.
 
 
@@ -74,7 +72,7 @@ class TrackQuality(NotebookTable):
 
     track: Track
     limits: MapLimits
-    geometry: Geometry  #: Spacing, turns, mid-chord deviations and gradients that were checked.
+    geometry: Geometry  #: Geometry of the track that was checked.
     findings: tuple[Finding, ...]  #: Faults found: first the errors, then the warnings, each in order of chainage.
 
     @property
@@ -116,7 +114,7 @@ def error_note(quality: TrackQuality) -> tuple[str, ...]:
 
 #: Severity and description of each kind of fault; ``{value}`` is the worst value, ``{limit}`` its limit.
 _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
-    "duplicate": ("warning", "the same point twice or more, which other commands read once"),
+    "duplicate": ("warning", "the same point is repeated; other commands read it once"),
     "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),
     "rounded": (
         "warning",
@@ -131,7 +129,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "kink": ("warning", "the direction turns by {value:.1f} degrees at one point (limit {limit:g})"),
     "kilometrage break": (
         "warning",
-        "the kilometrage changes by {value:.4g} m, which is not the distance; metres were expected",
+        "the kilometrage changes by {value:.4g} m, but the distance is different; metres were expected",
     ),
     "kilometrage reversal": ("warning", "the kilometrage reverses its direction"),
     "kilometrage absent": ("warning", "the map has no kilometrage here"),
@@ -228,8 +226,8 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
     """Yield the curves with negative cant.
 
-    The findings are errors if all curves to one side have negative cant, and otherwise warnings, as negative cant is
-    usual in turnouts.
+    The findings are errors if all curves to one side have negative cant. Otherwise they are warnings, because negative
+    cant is usual in turnouts.
     """
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))

@@ -43,7 +43,7 @@ def read_track(
     Parameters
     ----------
     paths : path or sequence of paths
-        Several files are joined in the given order, each in whichever direction fits.
+        Several files are joined in the given order; each file is reversed if necessary.
     crs : str, optional
         Coordinate reference system of files that do not name it, for example ``EPSG:6677``.
     height_datum : {"ellipsoidal", "orthometric"}, optional
@@ -149,7 +149,7 @@ def check_heights(
 def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of one map file as segments, in the order of the file; see `read_track` for errors.
 
-    Segments of a file without heights have the height datum `NO_HEIGHTS`.
+    If a file has no heights, its segments have the height datum `NO_HEIGHTS`.
     """
     segments = [_without_repeated(segment, reading) for segment in _read_segments(file, reading)]
     if (given := reading.sigma_plan_m) is not None:
@@ -186,8 +186,10 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with a given accuracy in plan, which includes the transformation from the datum of the map."""
-    note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
+    """Return a segment with a given accuracy in plan, which is taken to include the transformation from the map's
+    datum.
+    """
+    note = f"map: {given_m:g} m in plan (--plan-sigma) is better than the accuracy of the map's transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)
 

@@ -40,7 +40,7 @@ class MapOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class MapReading:
-    """Options for reading a map file, which are arguments of `railfix.track.read_track`."""
+    """Options for reading a map file; they are arguments of `railfix.track.read_track`."""
 
     crs: str | None = None
     height_datum: str | None = None
@@ -51,9 +51,9 @@ class MapReading:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """Points of one file or feature, with ellipsoidal heights; heights are NaN if the file has none (`NO_HEIGHTS`)."""
+    """Points of one file or feature with ellipsoidal heights, which are NaN if the file has none (`NO_HEIGHTS`)."""
 
-    source: str  #: Name of the file, and of the feature in it if there are several.
+    source: str  #: Name of the file, followed by the name of the feature if the file has several features.
     file: str  #: Name of the file.
     #: Coordinates of the points in `frame`, shape (n,).
     latitude_deg: Floats
@@ -64,20 +64,20 @@ class Segment:
     cant_m: Floats
     radius_m: Floats
     gradient_permille: Floats
-    #: CRS and height datum of the file, and the geoid used.
-    crs: str
-    height_datum: str
-    geoid: str
-    metadata: dict[str, str]  #: Name, accuracy and origin, if the file states them.
+    crs: str  #: CRS of the file.
+    height_datum: str  #: Height datum of the file.
+    geoid: str  #: Geoid by which the heights were converted.
+    metadata: dict[str, str]  #: Name, accuracy and origin of the segment, as far as the file states them.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the segment.
-    #: Standard deviations of coordinate transformations, which are added to the accuracy of the map; NaN if unknown.
+    #: Standard deviation of the transformation of the coordinates in plan; NaN if unknown. It is added to the accuracy
+    #: of the map.
     datum_plan_m: float = 0.0
-    datum_height_m: float = 0.0
+    datum_height_m: float = 0.0  #: Standard deviation of the transformation of the heights, likewise.
     notes: tuple[str, ...] = ()
-    nodes: tuple[str, ...] = ()  #: OpenStreetMap node ids of the points; empty if the file has none.
+    nodes: tuple[str, ...] = ()  #: OpenStreetMap node ids of the points; empty if the file has no node ids.
 
     def reverse(self) -> Segment:
-        """Return the segment in the opposite direction; the signs of radius and gradient change."""
+        """Return the segment in the opposite direction; radius and gradient change their signs."""
         names = ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
         turned = {name: getattr(self, name)[::-1] for name in names}
         turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
@@ -113,11 +113,13 @@ def make_segment(
 
 
 SAME_POINT_M = 0.05  #: Distance below which the ends of two segments are the same point [m].
-MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that a straight line bridges [m].
+MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that is bridged by a straight line [m].
 
 
 def _ends(segments: Sequence[Segment]) -> Floats:
-    """Return the ECEF positions of first and last points, shape (n, 2, 3) [m]; missing heights count as 0."""
+    """Return the ECEF positions of each segment's first and last point, shape (n, 2, 3) [m]; missing heights count as
+    0.
+    """
     columns = ("latitude_deg", "longitude_deg", "height_m")
     ends = np.array([[getattr(s, name)[[0, -1]] for name in columns] for s in segments])
     return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
@@ -142,7 +144,8 @@ def check_order(segments: Iterable[Segment]) -> None:
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Return segments in the same order, reversed where necessary, so that each begins at the previous segment's end.
+    """Return the segments in the same order, with segments reversed so that each one begins where the previous one
+    ends.
 
     Raise InputFileError if a gap is wider than `max_gap_m`.
     """
@@ -160,7 +163,7 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
 
 
 def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
-    """Return whether each segment, with ends (n, 2, 3), must be reversed to begin at the previous segment's end."""
+    """Return whether each segment must be reversed to begin where the previous one ends; `ends` has shape (n, 2, 3)."""
     turned = [False] * len(ends)
     if len(ends) > 1:
         distance = np.linalg.norm(ends[0][:, None] - ends[1][None, :], axis=-1).min(axis=1)
@@ -194,9 +197,9 @@ def join(
 ) -> Track:
     """Join segments to one track.
 
-    A point shared by two segments is kept once. The attributes of this point are from the earlier segment or, where
-    this segment has none, from the later segment. Raise InputFileError if segments do not meet, and MismatchError if
-    their frames differ.
+    A point shared by two segments is kept once. The attributes of this point are from the earlier segment; an attribute
+    that the earlier segment lacks is from the later segment. Raise InputFileError if segments do not meet, and
+    MismatchError if their frames differ.
     """
     pieces = orient(segments, max_gap_m=max_gap_m)
     ends = _ends(pieces)
@@ -235,7 +238,9 @@ def join(
 
 
 def one_frame(pieces: Sequence[Segment]) -> str:
-    """Return the frame of all pieces; raise MismatchError if frames differ, which would cause a step of up to 2 m."""
+    """Return the reference frame of all pieces; raise MismatchError if frames differ, because steps of up to 2 m would
+    result.
+    """
     frames = {piece.frame: piece.source for piece in pieces}
     if len(frames) > 1:
         what = "; ".join(f"{source} in {frame}" for frame, source in frames.items())
@@ -248,7 +253,8 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the worst standard deviation of the pieces [m], including the transformation from their datum.
+    """Return the largest standard deviation of the pieces [m], including the transformation from the datum of each
+    piece.
 
     The standard deviation of a piece is stated in the metadata `key` of its file, or is `default` if the file states
     none. Raise InputFileError if a value is not a positive number.

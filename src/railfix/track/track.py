@@ -22,11 +22,11 @@ SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about t
 #: Note on a section whose points are joined in reverse order; it follows the name of the section.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
-#: Largest difference between a segment's change of kilometrage and its length that is not a break, in addition to a
-#: twentieth of the length [m].
+#: A segment has a break if its length and its change of kilometrage differ by more than this plus a twentieth of the
+#: length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of ellipsoidal heights of railways, including tunnels below the sea [m].
-ANOTHER_PLACE_M = 100_000.0  #: Distance of a log from a map beyond which they are at different locations [m].
+ANOTHER_PLACE_M = 100_000.0  #: Distance between a log and a map beyond which their locations are different [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +36,9 @@ class Provenance:
     files: tuple[str, ...] = ()  #: Files from which the map was read.
     crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` if the files do not name it.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the track; see `railfix.track.frames`.
-    #: Height datum given by the user and datum that was used, "ellipsoidal" or "orthometric"; "" if not given.
-    height_datum_asked: str = ""
-    height_datum_used: str = "ellipsoidal"
-    geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" if none was.
+    height_datum_asked: str = ""  #: Height datum given by the user, "ellipsoidal" or "orthometric"; "" if not given.
+    height_datum_used: str = "ellipsoidal"  #: Height datum that was used.
+    geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" if not used.
     notes: tuple[str, ...] = ()  #: Notes that must be in every result computed with this map.
 
 
@@ -63,20 +62,20 @@ class Track(NotebookTable):
     """Centreline of a route of V points, in the order of the route."""
 
     name: str
-    latitude_deg: Floats  #: Geodetic coordinates in `Provenance.frame`, shape (V,).
-    longitude_deg: Floats
+    latitude_deg: Floats  #: Geodetic latitude in `Provenance.frame`, shape (V,).
+    longitude_deg: Floats  #: Longitude in `Provenance.frame`, shape (V,).
     height_m: Floats  #: Ellipsoidal height of the middle between the rail tops, shape (V,).
-    #: Kilometrage of the line, shape (V,); may jump or decrease; NaN where the map has none.
+    #: Kilometrage of the line, shape (V,); it may jump or decrease; NaN where the map has none.
     kilometrage_m: Floats
-    cant_m: Floats  #: Height of the outer above the inner rail, shape (V,); NaN where the map has none.
+    cant_m: Floats  #: Height of the outer rail above the inner rail, shape (V,); NaN where the map has none.
     #: Horizontal radius, positive in a curve to the right in the direction of rising chainage, infinite on straight
     #: track, NaN where the map has none; shape (V,).
     radius_m: Floats
     gradient_permille: Floats  #: Gradient, positive if the line rises with chainage; NaN if unknown; shape (V,).
     section: Integers  #: Index of each point's section in `sections`, shape (V,).
     sections: tuple[str, ...] = ("track",)  #: Files or features that were joined to the route, in order.
-    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map across the line and in height.
-    sigma_height_m: float = SIGMA_HEIGHT_M
+    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map across the line.
+    sigma_height_m: float = SIGMA_HEIGHT_M  #: Standard deviation of the map in height.
     provenance: Provenance = field(default_factory=Provenance)
 
     def __post_init__(self) -> None:
@@ -161,9 +160,9 @@ class Track(NotebookTable):
 
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
-    """Return a mask of segments, shape (V - 1,), whose kilometrage has a break.
+    """Return a mask of the segments in which the kilometrage has a break, shape (V - 1,).
 
-    A break is a difference from the length by more than `KILOMETRAGE_BREAK_M` plus a twentieth of the length.
+    There, length and change of kilometrage differ by more than `KILOMETRAGE_BREAK_M` plus a twentieth of the length.
     """
     return _jumps(np.diff(chainage_m), np.diff(kilometrage_m))
 
@@ -176,9 +175,9 @@ def _jumps(length_m: Floats, change_m: Floats) -> Masks:
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
     """Interpolate the kilometrage at chainages of any shape.
 
-    The result is NaN for NaN, and where a point of the segment has no kilometrage. The kilometrage is linear between
-    two points, and is extrapolated beyond the ends. Within a segment that has a break, the kilometrage is extrapolated
-    from the nearer point in the direction of the kilometrage on that side of the break.
+    The result is NaN where the chainage is NaN, and where a point of the segment has no kilometrage. The kilometrage is
+    linear between two points, and is extrapolated beyond the ends. Within a segment that has a break, the kilometrage
+    is extrapolated from the nearer point, in the direction that it has on the same side of the break.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2

@@ -1,4 +1,4 @@
-"""Trajectory of an antenna as a polyline in ECEF, to which its position is constrained, and nearest-point search."""
+"""Trajectory of an antenna: a polyline in ECEF, to which the antenna's position is constrained, with search."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from railfix.core.geodesy import axes_at
 from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
-#: Number of candidates in the first round of the search. The number is multiplied by 4 in each further round, for
-#: positions whose nearest point is not yet proven.
+#: Number of candidates in the first round of the search. In each further round, for positions with a nearest point that
+#: is not yet proven, the number is multiplied by 4.
 _FIRST_CANDIDATES = 6
 _CHUNK = 2_000_000  #: Largest product of the numbers of positions and candidates in one array.
 
 
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
-    """Return the fraction (0 to 1) of a segment at its nearest point, and the distance; shapes (..., 3) broadcast."""
+    """Return the nearest point of a segment as a fraction (0 to 1), and the distance to it; (..., 3) broadcast."""
     offset = points_m - start_m
     squared = np.einsum("...i,...i->...", step_m, step_m)
     share = np.minimum(np.maximum(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0), 1.0)
@@ -32,7 +32,7 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
 
 
 class NearestOnPolyline:
-    """Search structure for nearest points of a polyline, shape (V, 3), with samples along its segments."""
+    """Search structure for nearest points of a polyline, shape (V, 3), with samples along the segments."""
 
     def __init__(self, points_m: Floats) -> None:
         self._start = points_m[:-1]
@@ -47,7 +47,7 @@ class NearestOnPolyline:
         self._tree = scipy.spatial.cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
 
     def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
-        """Return the nearest segment, the distance along it and the distance from it for positions (n, 3), shape (n,).
+        """Return, for positions (n, 3), the nearest segment and the distances along and from this segment, shape (n,).
 
         For a position that is NaN, the segment is -1, and the distances are NaN.
         """
@@ -70,7 +70,7 @@ class NearestOnPolyline:
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Find the nearest of the segments of the nearest samples, and whether no other segment can be nearer."""
+        """Find the nearest segment among those of the nearest samples, and whether no other segment can be nearer."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
@@ -81,10 +81,10 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Return the nearest of C candidate segments (n, C) to each point (n, 3), its fraction, and the distance."""
+    """Return for each point (n, 3) the nearest of C candidate segments (n, C), the fraction and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
-    # of equally near segments, the first on the line is returned, whatever the order of the candidates
+    # return the first of equally near segments on the line, whatever the order of the candidates
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
     row, column = np.arange(len(points_m)), place.argmin(axis=1)
     return segment[row, column], share[row, column], best
@@ -93,7 +93,7 @@ def nearest_segments(
 #: Largest distance between the end of a closed line and another part of it [m]; a second track is farther away.
 _CLOSED_M: Final = 3.0
 _SAME_WAY: Final = 0.9  #: Cosine of the largest angle between two parts that count as parallel.
-_END_M: Final = 100.0  #: Distance along the line from its end within which no other part is searched for [m].
+_END_M: Final = 100.0  #: Parts of a line within this distance of its end, along the line, are not searched [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
@@ -104,9 +104,7 @@ def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest part of the line beside and parallel to its end [m]; NaN without such a
-    part.
-    """
+    """Return the arc length of the nearest part of the line beside and parallel to an end [m]; NaN without a part."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -129,28 +127,27 @@ class Trajectory(FrozenArrays, NotebookTable):
     Lateral offsets are positive to the right, seen in the direction of rising chainage.
     """
 
-    name: str  #: Name of the antenna, or of the track used as its path.
+    name: str  #: Name of the antenna, or of the track that is used as its path.
     ecef_m: Floats  #: ECEF coordinates of the points, shape (V, 3).
-    chainage_m: Floats  #: Chainage of the track at the reference point, strictly rising, shape (V,).
+    chainage_m: Floats  #: Chainage of the reference point of the vehicle on the track, strictly rising, shape (V,).
     kilometrage_m: Floats  #: Kilometrage at the reference point, shape (V,); NaN where the map has none.
     cant_m: Floats  #: Cant of the track at the reference point, shape (V,); NaN where the map has none.
     #: Roll of the car body, positive to the right, shape (V,); 0 if the track itself is used as the path.
     roll_deg: Floats
-    reference: str = "antenna"  #: Point of the vehicle to which `chainage_m` refers.
+    reference: str = "antenna"  #: Reference point of the vehicle, to which `chainage_m` refers.
     #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising, shape (V,). This
     #: chainage relates the positions of two antennas on one vehicle. None without a vehicle.
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
     #: Distance of the antenna ahead of the middle between the bogies, toward the vehicle's front.
     antenna_ahead_m: float = 0.0
-    #: Distances of the vehicle's front end ahead of the middle between its bogies, and of its rear end behind the
-    #: middle; None where unknown.
+    #: Distance of the vehicle's front end ahead of the middle between the bogies; None if unknown.
     front_end_m: float | None = None
-    rear_end_m: float | None = None
-    #: Lateral distance of the contact points of a wheelset, to which cant refers; None without a vehicle.
+    rear_end_m: float | None = None  #: Distance of the vehicle's rear end behind this middle; None if unknown.
+    #: Distance between the contact points of a wheelset, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
-    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map in plan and height, used in the solution.
-    sigma_height_m: float = SIGMA_HEIGHT_M
+    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map in plan, used in the solution.
+    sigma_height_m: float = SIGMA_HEIGHT_M  #: Standard deviation of the map in height, used in the solution.
     notes: tuple[str, ...] = ()  #: Notes that must be in every result.
 
     def __post_init__(self) -> None:
@@ -173,10 +170,9 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @classmethod
     def from_antenna_path(cls, track: Track) -> Trajectory:
-        """Create a trajectory from a map that is the antenna's path itself, as from a survey; `notes` records this.
+        """Create a trajectory from a map that is itself the path of an antenna; `notes` records this.
 
-        On a train, the antenna is above the track, so that its path differs in curves; `antenna_trajectory` computes
-        it.
+        In curves, the path of a train's antenna differs from the track; `antenna_trajectory` computes this path.
         """
         check_type(track, Track, "track")
         return cls(
@@ -269,8 +265,8 @@ class Trajectory(FrozenArrays, NotebookTable):
         """Return the segment at each arc length, of any shape, and the distance along the segment [m].
 
         A point shared by two segments belongs to the later segment. Before the start, the result is the first segment
-        with a negative distance. Beyond the end, the result is the last segment; for NaN, the last segment with a
-        distance of NaN.
+        with a negative distance. Beyond the end, the result is the last segment. For NaN, it is the last segment with
+        the distance NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)
@@ -337,5 +333,5 @@ def between_points(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats,
     share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)
     if values.ndim > 1:
         share = share[..., None]
-    # exact at both ends of a segment
+    # this form is exact at both ends of a segment
     return np.asarray((1.0 - share) * values[section] + share * values[section + 1])

@@ -22,8 +22,9 @@ from railfix.core.arrays import Floats
 
 Shape = Literal["cubic", "half-sine"]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_PIECES: Final = 16  #: Intervals of the quadrature of the length; with 12 nodes each it is exact to rounding.
-_ROUNDS: Final = 30  #: Number of fixed-point iterations for the length on the tangent, which converge within ten.
+#: Number of intervals for the quadrature of the length, which is exact to rounding with 12 nodes in each interval.
+_PIECES: Final = 16
+_ROUNDS: Final = 30  #: Number of fixed-point iterations for the length on the tangent; ten are enough to converge.
 _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end of a half-sine.
 
 
@@ -31,9 +32,8 @@ _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end 
 class OrdinateElement:
     """Transition between straight and curve, defined by ordinates over the tangent at its straight end."""
 
-    #: Easting and northing of the first point.
-    x_m: float
-    y_m: float
+    x_m: float  #: Easting of the first point.
+    y_m: float  #: Northing of the first point.
     direction_rad: float  #: Direction at the first point, counter-clockwise from the x axis (east).
     tangent_m: float  #: Length X on the tangent.
     ordinate_m: float  #: Ordinate at X, positive to the left of the tangent, seen from the straight end.
@@ -81,7 +81,7 @@ class OrdinateElement:
 
     @property
     def turn_rad(self) -> float:
-        """Direction at the curved end less the direction at the straight end, positive to the left [rad]."""
+        """Direction at the curved end minus direction at the straight end, positive to the left [rad]."""
         return float(np.arctan(self._ordinates(np.array([self.tangent_m]))[1][0]))
 
     @property
@@ -104,7 +104,7 @@ class OrdinateElement:
         """Return the easting and northing, shape (n, 2) [m], at distances along the curve from the first point [m]."""
         x = self._place_on_tangent(way_m)
         own = np.stack([x, self._ordinates(x)[0]], axis=-1)
-        if not self.into:  # a transition from the curve to the straight is the same curve from its curved end
+        if not self.into:  # a transition from curve to straight is the same curve, travelled from the curved end
             cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
             own = (np.array([self.tangent_m, self.ordinate_m]) - own) @ np.array([[cosine, -sine], [sine, cosine]])
         cosine, sine = np.cos(self.direction_rad), np.sin(self.direction_rad)
@@ -116,7 +116,7 @@ def cubic_of_length(
 ) -> OrdinateElement:
     """Compute a cubic parabola of a given curve length.
 
-    `first` and `last` are the curvatures at the ends, one of which is 0, positive to the left [1/m]. The variant is
+    `first` and `last` are the curvatures at the ends, positive to the left [1/m]; one of them is 0. The variant is
     ``"length"`` (IFC), ``"tangent"`` (length on the tangent) or ``"corrected"`` (Japanese railways).
     """
     into = first == 0.0

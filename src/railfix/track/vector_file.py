@@ -35,13 +35,13 @@ SIGMA_M: Final = 2.0
 ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Metadata entry of a segment from OpenStreetMap.
 #: Values of the tag `railway` for tracks in use.
 _RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail", "rack")
-#: Values of the tag `railway` for features that are not tracks in use.
+#: Values of the tag `railway` for other features, which are not tracks in use.
 _OTHERS: Final = (
     "abandoned", "construction", "disused", "dismantled", "demolished", "funicular", "historic", "loading_ramp",
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
     "turntable", "yard",
 )  # fmt: skip
-#: Columns that can contain the id of a feature, beginning with columns that only OpenStreetMap export programs write.
+#: Columns that can contain the id of a feature; the first ones are written only by OpenStreetMap export programs.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
 _ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
@@ -49,7 +49,7 @@ _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
 CROSSING: Final = "x"  #: Prefix of the id of a node at which tracks cross without a connection.
-_LEFT_OUT: Final = "@left out"  #: Key of the reason for which a way with valid tags is left out.
+_LEFT_OUT: Final = "@left out"  #: Key of the reason why a way with valid tags is left out.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +58,13 @@ class Way:
 
     row: dict[str, Any]  #: Tags and id of the way.
     points_deg: np.ndarray[Any, np.dtype[np.float64]]  #: Longitude and latitude of the points, shape (n, 2).
-    #: Node ids of the points, empty if the file has none. The id of a crossing without connection begins with
+    #: Node ids of the points; empty if the file has no node ids. The id of a crossing without a connection begins with
     #: `CROSSING`.
     nodes: tuple[str, ...] = ()
 
 
 def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the OpenStreetMap tags of a feature, together with its columns."""
+    """Return the columns of a feature, with its OpenStreetMap tags added."""
     tags = dict(row)
     for name in ("tags", "all_tags", "other_tags"):
         value = row.get(name)
@@ -106,7 +106,7 @@ def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
 
 
 def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return the origin of a feature from OpenStreetMap, with its name ("way/7 Main Line") and non-zero level.
+    """Return the origin, name ("way/7 Main Line") and non-zero level of a feature from OpenStreetMap.
 
     Without an id, there is no name and no level. A feature that is not recognised as from OpenStreetMap has an origin
     only if it has the tag of a railway in use.
@@ -124,7 +124,7 @@ def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def find_level(tags: Mapping[str, Any]) -> int:
-    """Return the level of a way from its tags layer, bridge and tunnel; 0 on the ground."""
+    """Return the level of a way, from the tags layer, bridge and tunnel; 0 on the ground."""
     try:
         return int(str(tags.get("layer") or ""))
     except ValueError:
@@ -133,7 +133,7 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Return the segments of a file, with a note in the first segment on the lines left out.
+    """Return the segments of a file, with a note in the first segment on lines that were left out.
 
     Raise InputFileError if there is no segment.
     """
@@ -146,7 +146,7 @@ def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]
 
 
 def read_osm_xml(path: FilePath) -> list[Way]:
-    """Read the railway ways of an OSM XML file, whose elements can be in any order.
+    """Read the railway ways of an OSM XML file; the elements can be in any order.
 
     Raise InputFileError if the file is not XML or has no railway way.
     """
@@ -182,8 +182,8 @@ def _is_crossing(tags: Mapping[Any, Any]) -> bool:
 def read_overpass(path: str, elements: Any) -> list[Way]:
     """Read the railway ways from the elements of an Overpass JSON file.
 
-    Ways need a geometry (`out geom`), or their nodes must be in the file. Raise InputFileError if elements are not
-    valid or there is no railway way.
+    Each way must have a geometry (`out geom`), or its nodes must be in the file. Raise InputFileError if elements are
+    not valid or there is no railway way.
     """
     if not isinstance(elements, list) or not all(isinstance(e, dict) for e in elements):
         raise InputFileError(path, "elements is not a list of objects, as Overpass writes them")
@@ -216,10 +216,10 @@ def _ways(
     nodes: Mapping[str, tuple[float, float]],
     crossings: Set[str],
 ) -> list[Way]:
-    """Return ways with their points; a way that is partly outside the extract is divided into parts.
+    """Return ways with points; a way that is partly outside the extract is divided into parts.
 
-    A way without two successive points is returned without points and with a reason (`_LEFT_OUT`). Raise InputFileError
-    if no way has two points.
+    A way without two successive known points is returned without points, and with a reason (`_LEFT_OUT`). Raise
+    InputFileError if no way has two points.
     """
     found, short = [], []
     for row, refs in ways:
@@ -239,14 +239,15 @@ def _ways(
     return [*found, *short]
 
 
-_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns with the name of a line, by rank.
+#: Columns that can contain the name of a line, the preferred column first.
+_NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")
 
 
 def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
     """Read the features of each layer of a file through GDAL.
 
-    Return for each layer the CRS, the properties of the features, and their geometries. Only features whose geometry
-    type ends with `geometry` ("LineString") are read, or all features, without geometry, for "none". Raise
+    Return for each layer the CRS, the properties of the features, and their geometries. Only features with a geometry
+    type that ends with `geometry` ("LineString") are read. For "none", all features are read, without geometry. Raise
     InputFileError if GDAL cannot read the file.
     """
     with needs_extra(f"{path}: {KIND_WORDS[find_kind(path)]}"):
@@ -256,7 +257,8 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
     pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are not heights, and not used
+            # measures (M values) are not heights, and are not used
+            warnings.filterwarnings("ignore", "Measured", UserWarning)
             with unpacked_file(path) as file:
                 found = [
                     pyogrio.raw.read(file, layer=layer, read_geometry=geometry != "none")
@@ -323,7 +325,7 @@ def _features(
 
 
 def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return the standard deviations that a feature states, as metadata."""
+    """Return, as metadata, the standard deviations that are given in the attributes of a feature."""
     keys = ("sigma_plan_m", "sigma_height_m")
     return {key: str(row[key]) for key in keys if row.get(key) is not None and row[key] == row[key]}
 
@@ -339,8 +341,8 @@ def plan_segment(
 ) -> Segment:
     """Create a segment from coordinates in easting-northing or longitude-latitude order, shape (n, 2) or (n, 3).
 
-    Points repeated in plan are left out, and heights that are all 0 count as missing. Raise InputFileError if fewer
-    than two points are left, some heights are missing, or coordinates are not valid.
+    Points that repeat the previous point in plan are left out. If all heights are 0, they count as missing. Raise
+    InputFileError if fewer than two points are left, some heights are missing, or coordinates are not valid.
     """
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():

@@ -25,10 +25,10 @@ from railfix.track.trajectory import Trajectory, joins_m
 
 Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 
-#: Distance between the contact points of the wheels less the gauge, about the width of a rail head [m].
+#: Distance between the contact points of both wheels minus the gauge; about the width of a rail head [m].
 RAIL_HEAD_M: Final = 0.070
 PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
-_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment at which its chord is compared with the path.
+_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment at which the chord is compared with the path.
 #: Shortest segment of the path [m].
 _SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
@@ -49,8 +49,8 @@ class Vehicle(Settings):
 
     model_config = ConfigDict(strict=True)
     name: str = "vehicle"
-    bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight-line distance between the two bogie centres.
-    #: Track gauge; cant is measured over the gauge plus `RAIL_HEAD_M`.
+    bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight distance between the two bogie centres.
+    #: Track gauge. Cant is measured over the distance between the contact points, the gauge plus `RAIL_HEAD_M`.
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
     #: Length over the ends (buffers or couplers); None where unknown.
@@ -66,7 +66,7 @@ class Vehicle(Settings):
 
     @property
     def ends_m(self) -> tuple[float | None, float | None]:
-        """Distances of the front end ahead of the middle between the bogies, and of the rear end behind it [m].
+        """Distance of the front end ahead of the middle between the bogies, and of the rear end behind the middle [m].
 
         The values are None where unknown.
         """
@@ -93,11 +93,12 @@ def read_vehicle(path: FilePath) -> Vehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Positions and attitudes of the car body at n chainages, with axes for a vehicle facing rising chainage."""
+    """Positions and attitudes of the car body at n chainages; the axes are those of a vehicle that faces rising
+    chainage.
+    """
 
-    #: Lower and higher chainage of the two bogie centres, shape (n,).
-    lower_m: Floats
-    upper_m: Floats
+    lower_m: Floats  #: Chainage of the bogie centre with the lower chainage, shape (n,).
+    upper_m: Floats  #: Chainage of the bogie centre with the higher chainage, shape (n,).
     origin: Floats  #: ECEF position midway between the bogie centres, shape (n, 3) [m].
     #: Unit vectors of the body axes in ECEF, shape (n, 3).
     forward: Floats
@@ -107,7 +108,7 @@ class Body:
 
 
 class _VehicleLine:
-    """Centreline and roll by cant as functions of chainage; a closed line continues beyond its ends."""
+    """Centreline, and roll due to cant, as functions of chainage; a closed line continues beyond its ends."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
         self.chainage = track.chainage_m
@@ -148,7 +149,7 @@ class _VehicleLine:
         return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
-        """Return the roll by cant, shape (n,) [rad], which is constant beyond an open end."""
+        """Return the roll due to cant, shape (n,) [rad]; it is constant beyond an open end."""
         before, after = self.joins
         last = self.chainage[-1]
         open_start, open_end = self.open_ends
@@ -158,10 +159,10 @@ class _VehicleLine:
 
 
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
-    """Return the cant, positive for roll to the right, shape (V,) [m], and notes.
+    """Return the signed cant, positive for roll to the right, shape (V,) [m], and notes.
 
-    The sign follows from the radius, or from the bend of the points where the map has no radius. On straight track, the
-    sign follows from the nearest curve. Raise MismatchError if there is cant but no curve.
+    The sign follows from the map's radius or, where the map has no radius, from the bend of the points. On straight
+    track, the sign follows from the nearest curve. Raise MismatchError if there is cant but no curve.
     """
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
     canted = cant != 0.0
@@ -176,10 +177,12 @@ def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
         side = np.where(np.isfinite(track.radius_m), np.sign(track.radius_m), 0.0)
     if (canted & np.isnan(track.radius_m)).any():
         side = np.where(np.isnan(track.radius_m), _side_of_bends(track), side)
-        notes.append("the side of the cant is that of the bend of the centreline where the map has no radius")
+        notes.append("where the map has no radius, the side of the cant is taken from the bend of the centreline")
     curved = np.flatnonzero(side)
     if not curved.size:
-        raise MismatchError(f"{track.name}: the track has cant but no curve, so its side is unknown; give radius_m")
+        raise MismatchError(
+            f"{track.name}: the track has cant but no curve, so the side of the cant is unknown; give radius_m"
+        )
     place = np.interp(track.chainage_m, track.chainage_m[curved], np.arange(curved.size))
     side = np.where(side == 0.0, side[curved[np.rint(place).astype(np.intp)]], side)
     return cant * side, tuple(notes)
@@ -195,7 +198,7 @@ def _side_of_bends(track: Track) -> Floats:
 
 
 def _bogies(line: _VehicleLine, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
-    """Return the chainages of the bogies, at equal distances from `middle` and with the bogie distance as chord [m]."""
+    """Return the chainages of both bogies [m], at equal distances from `middle`; the chord is the bogie distance."""
     half = np.full(len(middle), distance_m / 2.0)
     active = np.arange(len(middle))
     for _ in range(_MAX_ITERATIONS):
@@ -242,20 +245,20 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Return the chainage of the centreline point abeam the antenna, in the plane across the body [m]."""
+    """Return the chainage of the centreline point that is abeam the antenna, in the plane across the body [m]."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
         chainage -= ahead
         if np.abs(ahead).max() < _CONVERGED_M:
             return chainage
-    raise MismatchError("the line bends so sharply that no point of it is abeam the antenna")
+    raise MismatchError("the line bends so sharply that no point of the line is abeam the antenna")
 
 
 def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
     """Return chainages of the body's middle at which the antenna's path is computed [m].
 
-    The result has the chainages of the track's points, and further chainages where the path deviates from a chord by
+    These are the chainages of the track's points, and further chainages where the path would deviate from a chord by
     more than `PATH_TOLERANCE_M`.
     """
     half = _end_halves(line, track, vehicle)
@@ -288,7 +291,10 @@ def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaO
 
 
 def _end_halves(line: _VehicleLine, track: Track, vehicle: Vehicle) -> tuple[float, float]:
-    """Return the distances from both ends of the track at which the body's middle has both bogies on the track [m]."""
+    """Return the distance of the body's middle from each end of the track [m] when the outer bogie is at this end.
+
+    The distance is 0 at an end at which a closed track continues.
+    """
     first, last = 0.0, line.chainage[-1]
     half = np.where(line.open_ends, vehicle.bogie_distance_m / 2.0, 0.0)
     for _ in range(_MAX_ITERATIONS):
@@ -309,8 +315,8 @@ def antenna_trajectory(
     Both bogie centres are on the centreline, with the bogie distance as chord. At each bogie, the track rolls by
     ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean of both rolls (P1
     3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the vertical rotated by the roll. The
-    path begins and ends where a bogie reaches the end of the track. On a closed track, the path begins and ends where
-    the body's middle reaches the end of the map, so that the path is also closed.
+    path begins and ends where a bogie reaches an end of the track. On a closed track, the path begins and ends where
+    the body's middle is at the ends of the map, so that the path is also closed.
 
     Parameters
     ----------
@@ -325,8 +331,8 @@ def antenna_trajectory(
     Returns
     -------
     Trajectory
-        Path with a point for each point of the track that the body's middle passes, and more points where the path
-        deviates from a chord by more than `PATH_TOLERANCE_M`.
+        Path with a point for each point of the track that the body's middle passes, and further points where the path
+        would deviate from a chord by more than `PATH_TOLERANCE_M`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Readers of LandXML alignments, railML 3 track centrelines, and ERA RINF topology in RDF.
 
-In the RINF ontology (http://data.europa.eu/949/, version 3) a `LinearElement` has a geometry (GeoSPARQL, WKT), and a
-`NetRelation` connects two ends that meet, as in railML 3.
+In the RINF ontology (http://data.europa.eu/949/, version 3), a `LinearElement` has a geometry (GeoSPARQL, WKT). A
+`NetRelation` connects the ends of two elements that meet, as in railML 3.
 """
 
 from __future__ import annotations
@@ -31,12 +31,10 @@ if TYPE_CHECKING:
 class Relation:
     """Connection of two net elements, as in railML 3 and RailTopoModel."""
 
-    #: Names of the two elements.
-    first: str
-    second: str
-    #: Connected end of each element: 0 for its start, 1 for its end.
-    first_end: int
-    second_end: int
+    first: str  #: Name of the first element.
+    second: str  #: Name of the second element.
+    first_end: int  #: Connected end of the first element: 0 for the start, 1 for the end.
+    second_end: int  #: Connected end of the second element: 0 for the start, 1 for the end.
     navigable: bool  #: Whether trains can pass from one element to the other.
 
 
@@ -97,7 +95,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
 
 
 def read_railml_relations(path: FilePath) -> list[Relation]:
-    """Read the net relations of a railML 3 file; the result is empty for other XML files."""
+    """Read the net relations of a railML 3 file; the list is empty for other XML files."""
     root = read_root(path)
     relations = []
     for item in root.iterfind(".//{*}netRelation"):
@@ -125,13 +123,13 @@ _ERA: Final = "http://data.europa.eu/949/"
 _GEO: Final = "http://www.opengis.net/ont/geosparql#"
 _LABEL: Final = "http://www.w3.org/2000/01/rdf-schema#label"
 _TYPE: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type"
-#: LINESTRING in WKT, which in GeoSPARQL can be preceded by its CRS.
+#: LINESTRING in WKT; in GeoSPARQL, the CRS can precede it.
 _WKT: Final = re.compile(r"\s*(?:<(?P<crs>[^>]+)>)?\s*LINESTRING\s*Z?\s*\((?P<points>[^)]*)\)\s*", re.IGNORECASE)
 _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the linear elements with a geometry of a RINF file as segments; raise InputFileError if there is none."""
+    """Read as segments the linear elements of a RINF file that have a geometry; InputFileError: there is none."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [
@@ -186,7 +184,7 @@ def _graph(path: FilePath) -> Graph:
 
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
-    """Return the triples of a file, cached because segments and relations are read in separate calls."""
+    """Return the triples of a file; they are cached, because segments and relations are read in separate calls."""
     with needs_extra(f"{path}: RDF"):
         from rdflib import Graph
     data = read_bytes(path)
@@ -195,7 +193,7 @@ def _parse(path: str, _: str) -> Graph:
     name = "json-ld" if begin[:1] in (b"{", b"[") else "turtle" if begin[:1] != b"<" or begin == b"<http" else "xml"
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of rdflib's own classes
+            warnings.simplefilter("ignore", DeprecationWarning)  # the warnings concern rdflib's own classes
             return Graph().parse(data=data, format=name)
     except Exception as error:  # noqa: BLE001 - each rdflib parser raises its own errors
         raise InputFileError(path, f"this is no {name} ({str(error).splitlines()[0]})") from None
@@ -214,6 +212,6 @@ def _values(graph: Graph, subject: Any, predicate: str) -> list[Any]:
 
 
 def _name(graph: Graph, subject: Any) -> str:
-    """Return the label of a resource, otherwise the last part of its address."""
+    """Return the label of a resource; without a label, the last part of the resource's address."""
     labels = _values(graph, subject, _LABEL)
     return str(labels[0]) if labels else re.split(r"[/#]", str(subject))[-1]
