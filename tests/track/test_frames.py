@@ -129,7 +129,7 @@ def test_semidynamic_files_that_cannot_be_used_are_one_sentence(tmp_path: Path) 
     time, path = np.datetime64("2026-07-01"), _semidynamic(tmp_path / "s.par")
     with pytest.raises(InputFileError, match="no parameters for a part of the map"):
         track_at(osaka, time, parameters=path)
-    with pytest.raises(SettingsError, match="are for JGD2011"):
+    with pytest.raises(SettingsError, match="apply only to JGD2011"):
         track_at(europe, time, parameters=path)
     (tmp_path / "text.par").write_text("no parameters\n" * 20)
     with pytest.raises(InputFileError, match="not a parameter file of semi-dynamic correction"):
@@ -142,7 +142,7 @@ def test_a_map_without_a_frame_names_its_doubt(tmp_path: Path) -> None:
     track = read_track([path])
     same, shift = track_at(track, np.datetime64("2026-07-01"))
     assert same is track
-    assert "0.89 m off" in shift.notes[0]
+    assert "displaced by 0.89 m" in shift.notes[0]
     assert "ETRS89" in shift.notes[0]
     path.write_text("# crs: EPSG:4979\nlatitude_deg,longitude_deg,height_m\n50.85,4.35,100\n50.86,4.35,100\n")
     assert track_at(read_track([path]), np.datetime64("2026-07-01"))[1].notes == ()

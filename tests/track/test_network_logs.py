@@ -81,7 +81,7 @@ def test_a_log_without_sigmas_has_one_estimated_by_its_distances_and_says_so(tmp
     noise = np.random.default_rng(2).normal(0.0, 6.0, 200)
     found = matched(net, logs(tmp_path, noise, 0.0, None)[0])
     assert len(found.notes) == 1
-    stated = float(found.notes[0].split(" no sigma, ")[1].split(" m is taken")[0])
+    stated = float(found.notes[0].split(" no sigma, ")[1].split(" m is assumed")[0])
     assert stated == pytest.approx(6.0, rel=0.25)
     beside = network(tmp_path, {"A": (0.0, 0.0), "B": (4.5, 0.0)})
     found = matched(beside, logs(tmp_path, np.full(200, 4.5), 0.0, None)[0])
