@@ -47,7 +47,7 @@ def test_the_good_inputs_are_good(desk: Desk, kind: str) -> None:
 
 
 @pytest.mark.parametrize(("kind", "fault"), CASES, ids=lambda name: name.replace("/", "-"))
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -> None:
     FAULTS[fault](desk.folder / kind)
     before = contents(desk.folder)
@@ -71,7 +71,7 @@ def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -
 
 @pytest.mark.requirement("G4")
 @pytest.mark.parametrize("name", MISTAKES)
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name: str) -> None:
     command, code, words = (MISTAKES[name][key] for key in ("command", "exit", "words"))
     files, words = MISTAKES[name].get("files", {}), [words] if isinstance(words, str) else words

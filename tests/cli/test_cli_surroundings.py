@@ -42,7 +42,7 @@ def text_of(output: str) -> str:
 @pytest.mark.parametrize(
     ("words", "code", "sentence"), [(row["words"], int(row["exit"]), row["sentence"]) for row in BAD_WORDS]
 )
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_bad_words_end_with_one_sentence(desk: Desk, tmp_path: Path, words: str, code: int, sentence: str) -> None:
     log = "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --out {out}"
     text = words.replace("{log}", log).replace("{desk}", str(desk.folder)).replace("{out}", str(tmp_path / "out"))
@@ -83,7 +83,7 @@ def test_a_reader_that_stops_reading_is_no_defect(desk: Desk) -> None:
         *(pytest.param(w, marks=pytest.mark.slow) for w in ("--version", "simulate --list")),
     ],
 )
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_a_full_device_is_one_sentence(desk: Desk, words: str) -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123
         done = subprocess.run(
@@ -128,7 +128,7 @@ def test_a_name_that_is_not_utf_8_is_one_sentence(tmp_path: Path) -> None:
     ],
     ids=lambda words: words.split()[0],
 )
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_tables_are_whole_in_a_log_of_80_columns(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:

@@ -70,7 +70,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("command", TO_FILE, ids=lambda text: " ".join(text.split()[:2]))
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, command: str) -> None:
     ending = next(end for word, end in ENDINGS.items() if word in command)
     out = desk.folder / f"there{ending}"
@@ -93,7 +93,7 @@ def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, 
 
 
 @pytest.mark.parametrize("command", TO_FOLDER, ids=lambda text: " ".join(text.split()[:2]))
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_existing_results_are_replaced_only_when_asked(desk: Desk, command: str) -> None:
     out = desk.folder / "out"
     out.mkdir()
@@ -260,7 +260,7 @@ KILLED: Final = {
 
 
 @pytest.mark.parametrize("name", ["run", pytest.param("simulate", marks=pytest.mark.slow)])
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_the_next_run_works_after_a_kill(desk: Desk, name: str) -> None:
     _check_kills(desk, KILLED[name], 1, signal.SIGKILL, seed=1)
 

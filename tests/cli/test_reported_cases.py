@@ -12,7 +12,7 @@ pytestmark = pytest.mark.requirement("A6", "G5")
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.every(4)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("row", list_rows(), ids=lambda row: f"{row.file}-{row.command}")
 def test_every_command_makes_the_right_of_a_reported_file(row: Row, recordings: Path, tmp_path: Path) -> None:
     right, code, text = run_row(row, recordings / "cases", tmp_path)

@@ -296,7 +296,7 @@ def test_arrays_of_a_trajectory_and_records_stay_read_only_in_another_process() 
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_a_terminal_is_told_of_compilation_once(tmp_path: Path, terminal: bool) -> None:
     program = "import railfix.kernels.windows, railfix.kernels.search"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}

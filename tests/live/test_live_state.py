@@ -64,7 +64,7 @@ def live(
     return pl.read_parquet(out / "train.parquet"), numbers, (folder / f"{name}.log").read_text()
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 def test_a_restart_continues_as_without_one(parts: dict[str, Path], tmp_path: Path) -> None:
     """Filter and sequence of two sessions with a state file are those of one session over the whole log."""
     state = ["--state", str(tmp_path / "state")]

@@ -92,7 +92,7 @@ def beyond_m(message: TrainMessage, middle_m: float, ahead_m: dict[int, float]) 
     return off, safe
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.requirement("A8")
 @pytest.mark.parametrize("facing", ["rising", "falling"])
 def test_the_true_ends_are_inside_the_bounds_in_every_message_of_every_form(

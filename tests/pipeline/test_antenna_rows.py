@@ -141,7 +141,7 @@ def _assert_same(parts: list[AntennaResult], expected: AntennaResult) -> None:
 @pytest.mark.requirement("A8")
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("channels", ["same channels", "signals of its own", "channels of its own"])
-@pytest.mark.every(6)
+@pytest.mark.every(8)
 def test_rows_of_two_antennas_give_the_results_of_each_alone(settings: str, channels: str) -> None:
     config, logs = parse_config(SETTINGS[settings]), _logs(channels)
     alone = tuple(name for name in config.screens if name not in ("antenna_pair", "antenna_spacing"))

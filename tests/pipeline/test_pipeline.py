@@ -47,7 +47,7 @@ def chunked(size: int, length: int) -> list[int]:
 
 @pytest.mark.requirement("A8")
 @pytest.mark.parametrize(("size", "epochs"), CHUNKS.items())
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_chunks_give_the_whole(size: int, epochs: int):
     """Two antennas, every screen on, every array of the result."""
     one = processor({"filter": "track"})

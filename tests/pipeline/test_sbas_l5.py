@@ -155,7 +155,7 @@ def test_satellites_are_rejected_by_do_not_use_and_all_by_type_0(folder: Path) -
 
 def test_corrected_codes_are_true_ranges() -> None:
     """Without noise: to the resolution of the messages and the growth of errors between them, group delays included."""
-    quiet = scenario(code_sigma_m=0.0, phase_sigma_m=0.0)
+    quiet = scenario(code_sigma_m=0.0, phase_sigma_m=0.0).replaced(duration_s=40.0)
     simulation = Simulation(quiet)
     observations = concatenate(list(simulation.observations("front")))[:30]
     config = parse_config({"filter": "off", "protection": "off", "sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})

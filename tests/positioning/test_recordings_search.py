@@ -183,7 +183,7 @@ def compare_positions(calls: Calls, at_most: int | None) -> tuple[int, float]:
 
 @pytest.mark.requirement("A3")
 @pytest.mark.parametrize("name", RUNS)
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_search_equals_exhaustive_search(recordings: Path, calls: Calls, name: str):
     RUNS[name](recordings)
     compared, ties = compare_searches(calls, 150)

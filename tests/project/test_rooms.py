@@ -34,15 +34,22 @@ FLOORS: Final[tuple[tuple[str, ...], ...]] = (
 FLOOR_OF: Final = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 
+@cache
+def _statements(path: Path) -> list[ast.Import | ast.ImportFrom | ast.FunctionDef | ast.AsyncFunctionDef]:
+    """Imports and functions of a file, wherever in the file they stand."""
+    kinds = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.AsyncFunctionDef)
+    return [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, kinds)]
+
+
 def _room(path: Path) -> str:
     """Room of a source file: the first name below the package."""
     return path.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
 def _imported_rooms(path: Path) -> set[str]:
-    """Rooms that one file imports, wherever in the file the import stands."""
+    """Rooms that one file imports."""
     rooms: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in _statements(path):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -118,7 +125,7 @@ def test_files_do_not_import_each_other_in_a_circle() -> None:
     modules = _modules()
     imports: dict[str, set[str]] = {name: set() for name in modules}
     for name, path in modules.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in _statements(path):
             if isinstance(node, ast.Import):
                 imports[name] |= {alias.name for alias in node.names} & modules.keys()
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -165,7 +172,7 @@ def test_functions_have_at_most_60_lines_of_body() -> None:
     long = {
         f"{path.relative_to(ROOT)}:{node.lineno} {node.name}": lines
         for path in SOURCE.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in _statements(path)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and (lines := _body_lines(node)) > 60
     }
     assert long == {}, "which step of these functions has a name of its own?"

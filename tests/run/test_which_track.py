@@ -202,7 +202,7 @@ def _from(codes: StandstillCodes, first: int, epochs: int) -> StandstillCodes:
 
 
 @pytest.mark.parametrize(("kind", "decisions"), [("base", 0.9), ("alone", 0.0)])
-@pytest.mark.every(3)
+@pytest.mark.every(4)
 def test_roof_with_invented_yards_is_never_on_a_wrong_track(
     roof: dict[str, StandstillCodes], kind: str, decisions: float
 ) -> None:

@@ -442,7 +442,7 @@ def test_random_pitch_has_its_sigma_and_none_at_rest() -> None:
 
 
 @pytest.mark.parametrize("jerk", [0.1, 0.4, 2.0])
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_the_jerk_stays_within_its_limit_and_the_stops_where_they_are(jerk: float) -> None:
     settings = RunSettings(stations=(Station(at_m=30.0), Station(at_m=400.0), Station(at_m=720.0)), stand_s=25.0)
     plain = run_curve(LINE, settings, 100.0, contact_m=1.137)

@@ -361,7 +361,7 @@ def lines(folder: Path) -> dict[str, LineSettings]:
 
 
 @pytest.mark.parametrize("kind", ["elements", "generated", "file"])
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_rtklib_stands_where_the_antenna_is_on_any_line(tmp_path: Path, kind: str) -> None:
     """Everything switched off but the swaying: an independent single point is the truth within a centimetre."""
     program = shutil.which("rnx2rtkp")

@@ -237,7 +237,7 @@ def test_satellites_from_the_table_change_no_digit_that_is_written() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 7, 64])
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_any_cutting_gives_the_same_numbers(size: int) -> None:
     scenario = Scenario(duration_s=10.0, receiver=ReceiverSettings(clock_steps="millisecond", clock_drift=1e-6))
     simulation = Simulation(scenario)

@@ -83,7 +83,7 @@ def _sensors_of(sensors: SensorEpochs | None, cut: slice) -> SensorEpochs | None
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("name", ["sensors", "faults", "branches", "off map", "gap"])
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 def test_epochs_one_by_one_give_what_the_whole_gives(name: str) -> None:
     epochs, line, sensors = _case(name)
     whole, _ = track(epochs, line, sensors=sensors, levels=True)
@@ -100,7 +100,7 @@ def test_epochs_one_by_one_give_what_the_whole_gives(name: str) -> None:
 
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize(("name", "first"), [("sensors", 55), ("faults", 67)])
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     epochs, line, sensors = _case(name)
     before, cut = slice(0, first), slice(first, first + 7)
