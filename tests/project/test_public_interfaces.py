@@ -21,10 +21,8 @@ EXCEPTIONS: Final[dict[str, str]] = {
 DOCUMENTED: Final = frozenset({"_replace", "_fields", "_asdict", "_make", "_field_defaults", "_missing_"})
 #: Packages, or parts of them, that are the insides of another.
 INSIDES: Final = ("llvmlite", *(f"numba.{part}" for part in "core np cpython parfors typed.typedobjectutils".split()))
-NODES: Final = tuple(
-    getattr(ast, name)
-    for name in "Import ImportFrom FunctionDef AsyncFunctionDef ClassDef Name Attribute Call Assign Delete AugAssign AnnAssign".split()
-)
+_NODES: Final = "Import ImportFrom FunctionDef AsyncFunctionDef ClassDef Name Attribute Call Assign Delete AugAssign"
+NODES: Final = (ast.AnnAssign, *(getattr(ast, name) for name in _NODES.split()))
 CALLS: Final = frozenset({"exec", "eval", "gc.disable", "gc.freeze", "gc.unfreeze", "importlib.util.LazyLoader"})
 
 
