@@ -58,23 +58,13 @@ def message(sequence: int, place_m: float, *, facing: int = 1, age_s: float = 0.
 
 #: State, event -> state. Events: a counted report; silence up to 3 s, to 120 s, beyond.
 TABLE = {
-    ("unknown", "report"): "tracked",
-    ("unknown", "short"): "unknown",
-    ("unknown", "long"): "unknown",
-    ("unknown", "beyond"): "unknown",
-    ("tracked", "report"): "tracked",
-    ("tracked", "short"): "tracked",
-    ("tracked", "long"): "simulated",
-    ("tracked", "beyond"): "error",
-    ("simulated", "report"): "tracked",
-    ("simulated", "short"): "simulated",
-    ("simulated", "long"): "simulated",
-    ("simulated", "beyond"): "error",
-    ("error", "report"): "tracked",
-    ("error", "short"): "error",
-    ("error", "long"): "error",
+    ("unknown", "report"): "tracked", ("unknown", "short"): "unknown", ("unknown", "long"): "unknown",
+    ("unknown", "beyond"): "unknown", ("tracked", "report"): "tracked", ("tracked", "short"): "tracked",
+    ("tracked", "long"): "simulated", ("tracked", "beyond"): "error", ("simulated", "report"): "tracked",
+    ("simulated", "short"): "simulated", ("simulated", "long"): "simulated", ("simulated", "beyond"): "error",
+    ("error", "report"): "tracked", ("error", "short"): "error", ("error", "long"): "error",
     ("error", "beyond"): "error",
-}
+}  # fmt: skip
 
 EVENTS = st.lists(
     st.one_of(

@@ -16,27 +16,12 @@ DECODED: Final = {
 
 #: Message types of L1 (DO-229D, table A-3).
 TYPE_NAMES: Final = {
-    0: "do not use for safety",
-    1: "PRN mask",
-    2: "fast corrections",
-    3: "fast corrections",
-    4: "fast corrections",
-    5: "fast corrections",
-    6: "integrity",
-    7: "fast correction degradation",
-    9: "GEO navigation",
-    10: "degradation parameters",
-    12: "network time",
-    17: "GEO almanacs",
-    18: "ionospheric grid mask",
-    24: "mixed fast and long-term corrections",
-    25: "long-term corrections",
-    26: "ionospheric delays",
-    27: "service region",
-    28: "clock-ephemeris covariance",
-    62: "internal test",
-    63: "null",
-}
+    0: "do not use for safety", 1: "PRN mask", 2: "fast corrections", 3: "fast corrections", 4: "fast corrections",
+    5: "fast corrections", 6: "integrity", 7: "fast correction degradation", 9: "GEO navigation",
+    10: "degradation parameters", 12: "network time", 17: "GEO almanacs", 18: "ionospheric grid mask",
+    24: "mixed fast and long-term corrections", 25: "long-term corrections", 26: "ionospheric delays",
+    27: "service region", 28: "clock-ephemeris covariance", 62: "internal test", 63: "null",
+}  # fmt: skip
 #: Message types of L5 (ICAO Annex 10, 8th edition, appendix B, 3.5.14).
 L5_TYPE_NAMES: Final = {
     0: "do not use for safety",

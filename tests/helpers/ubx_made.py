@@ -36,21 +36,9 @@ def rawx(observations: Observations, epoch: int) -> bytes:
         )
         tracking = 1 | (6 if np.isfinite(phase) else 0)
         rows += struct.pack(
-            "<ddfBBBBHBBBBBx",
-            code,
-            np.nan_to_num(phase),
-            np.nan_to_num(doppler),
-            GNSS[name[0]],
-            int(name[1:]) + (100 if name[0] == "S" else 0),
-            0,
-            0,
-            64_000,
-            int(np.nan_to_num(cn0)),
-            1,
-            1,
-            1,
-            tracking,
-        )
+            "<ddfBBBBHBBBBBx", code, np.nan_to_num(phase), np.nan_to_num(doppler), GNSS[name[0]],
+            int(name[1:]) + (100 if name[0] == "S" else 0), 0, 0, 64_000, int(np.nan_to_num(cn0)), 1, 1, 1, tracking,
+        )  # fmt: skip
     week, second = to_week(observations.time[epoch])
     head = struct.pack("<dHbBBBH", float(second), int(week), 18, len(rows) // 32, 1, 1, 0)
     return frame(0x0215, head + rows)

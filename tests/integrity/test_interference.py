@@ -118,27 +118,17 @@ def scene(*, epochs: int = 40, jump: float = 0.0, clock: float = 0.0, parted: fl
     unit = to_satellite / distance[..., None]
     rate = (unit * (np.array([0.0, 300.0, 2000.0]) - velocity)).sum(axis=2) + 3.0
     return MotionInputs(
-        time=time,
-        break_before=np.zeros(epochs, dtype=bool),
-        channel=np.array([f"{'GE'[k // 6]}{k:02d}1C" for k in range(12)]),
-        group=group,
-        near_ecef_m=ecef + 5.0,
-        sat_ecef_m=sat,
-        sat_velocity_mps=np.broadcast_to(np.array([0.0, 300.0, 2000.0]), sat.shape),
-        code_m=corrected + later[:, None] * clock,
-        rate_mps=rate + 0.05 * rng.standard_normal(rate.shape),
-        corrected_code_m=corrected,
-        sigma_m=np.full(distance.shape, 0.5),
-        used=np.ones(distance.shape, dtype=bool),
-        named=np.zeros(distance.shape, dtype=bool),
-        noise_scale=np.ones(epochs),
+        time=time, break_before=np.zeros(epochs, dtype=bool),
+        channel=np.array([f"{'GE'[k // 6]}{k:02d}1C" for k in range(12)]), group=group, near_ecef_m=ecef + 5.0,
+        sat_ecef_m=sat, sat_velocity_mps=np.broadcast_to(np.array([0.0, 300.0, 2000.0]), sat.shape),
+        code_m=corrected + later[:, None] * clock, rate_mps=rate + 0.05 * rng.standard_normal(rate.shape),
+        corrected_code_m=corrected, sigma_m=np.full(distance.shape, 0.5), used=np.ones(distance.shape, dtype=bool),
+        named=np.zeros(distance.shape, dtype=bool), noise_scale=np.ones(epochs),
         clock_offset_m=np.broadcast_to(np.array([0.0, 8.0]), (epochs, 2)),
-        clock_sigma_m=np.broadcast_to(np.array([0.0, 1.0]), (epochs, 2)),
-        off_line_m=np.full(epochs, 1.0),
-        doubted=np.zeros(epochs, dtype=bool),
-        antenna=np.zeros(epochs, dtype=np.intp),
+        clock_sigma_m=np.broadcast_to(np.array([0.0, 1.0]), (epochs, 2)), off_line_m=np.full(epochs, 1.0),
+        doubted=np.zeros(epochs, dtype=bool), antenna=np.zeros(epochs, dtype=np.intp),
         lines=(SearchIndex(synthetic.line()),),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.requirement("B8")

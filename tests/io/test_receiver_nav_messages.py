@@ -20,26 +20,10 @@ pytestmark = pytest.mark.requirement("A8")
 
 #: Attributes of RTKLIB's ephemeris by the names of the fields here.
 EPHEMERIS = {
-    "af0_s": "f0",
-    "af1": "f1",
-    "af2": "f2",
-    "eccentricity": "e",
-    "m0": "M0",
-    "delta_n": "deln",
-    "omega0": "OMG0",
-    "i0": "i0",
-    "omega": "omg",
-    "omega_dot": "OMGd",
-    "i_dot": "idot",
-    "cuc": "cuc",
-    "cus": "cus",
-    "crc": "crc",
-    "crs": "crs",
-    "cic": "cic",
-    "cis": "cis",
-    "toe_sow_s": "toes",
-    "health": "svh",
-}
+    "af0_s": "f0", "af1": "f1", "af2": "f2", "eccentricity": "e", "m0": "M0", "delta_n": "deln", "omega0": "OMG0",
+    "i0": "i0", "omega": "omg", "omega_dot": "OMGd", "i_dot": "idot", "cuc": "cuc", "cus": "cus", "crc": "crc",
+    "crs": "crs", "cic": "cic", "cis": "cis", "toe_sow_s": "toes", "health": "svh",
+}  # fmt: skip
 
 
 def rtklib() -> Any:

@@ -29,25 +29,11 @@ from railfix.io.train_message import (
 pytestmark = pytest.mark.requirement("A8")
 
 PLACED = TrainMessage(
-    train=7,
-    sequence=41,
-    time_ns=1_400_000_000_000_000_000,
-    sent_ns=1_400_000_000_030_000_000,
-    line=3,
-    chainage_cm=1_234_567,
-    over_cm=812,
-    under_cm=655,
-    speed_cmps=-2_512,
-    speed_bound_cmps=9,
-    direction=-1,
-    facing=1,
-    status=MessageStatus.POSITION,
-    sources=Source.FRONT_RECEIVER | Source.TACHOMETER,
-    protection_level_cm=900,
-    track_permille=999,
-    length_cm=4_000,
-    complete=True,
-)
+    train=7, sequence=41, time_ns=1_400_000_000_000_000_000, sent_ns=1_400_000_000_030_000_000, line=3,
+    chainage_cm=1_234_567, over_cm=812, under_cm=655, speed_cmps=-2_512, speed_bound_cmps=9, direction=-1, facing=1,
+    status=MessageStatus.POSITION, sources=Source.FRONT_RECEIVER | Source.TACHOMETER, protection_level_cm=900,
+    track_permille=999, length_cm=4_000, complete=True,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["train", "chainage_cm", "direction", "length_cm", "session"])

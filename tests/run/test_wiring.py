@@ -40,42 +40,28 @@ POSITION_PATHS = {
     **{name: name for name in ("longitude_deg", "height_m", "n_used", "n_rejected", "noise_scale")},
     **{f"{axis}_m": f"ecef_m:{i}" for i, axis in enumerate("xyz")},
     **{f"conventional_{axis}_m": f"point.ecef_m:{i}" for i, axis in enumerate("xyz")},
-    "conventional_chainage_m": "conventional_chainage_m",
-    "conventional_offset_m": "conventional_offset_m",
-    "raim_statistic": "raim.statistic",
-    "raim_threshold": "raim.threshold",
-    "raim_level_m": "raim.protection_level_m",
-    "protection_level_m": "protection.level.level_m",
-    "protection_fault_free_m": "protection.level.fault_free_m",
+    "conventional_chainage_m": "conventional_chainage_m", "conventional_offset_m": "conventional_offset_m",
+    "raim_statistic": "raim.statistic", "raim_threshold": "raim.threshold", "raim_level_m": "raim.protection_level_m",
+    "protection_level_m": "protection.level.level_m", "protection_fault_free_m": "protection.level.fault_free_m",
     "protection_one_fault_m": "protection.level.one_fault_m",
     "protection_two_faults_m": "protection.level.two_fault_m",
     "protection_k_fault_free": "protection.level.k_fault_free",
     "protection_k_one_fault": "protection.level.k_one_fault",
     "protection_k_two_faults": "protection.level.k_two_faults",
-    "protection_separation": "protection.level.separation",
-    "map_offset_across_m": "map_offset.across_m",
-    "map_offset_up_m": "map_offset.up_m",
-    "map_detectable_across_m": "map_offset.detectable_m:0",
-    "map_detectable_up_m": "map_offset.detectable_m:1",
-    "map_offset_statistic": "map_offset.statistic",
-}
+    "protection_separation": "protection.level.separation", "map_offset_across_m": "map_offset.across_m",
+    "map_offset_up_m": "map_offset.up_m", "map_detectable_across_m": "map_offset.detectable_m:0",
+    "map_detectable_up_m": "map_offset.detectable_m:1", "map_offset_statistic": "map_offset.statistic",
+}  # fmt: skip
 #: The same of `AlongTrack`; a factor after an asterisk.
 TRAIN_PATHS = {
     **{name: name for name in ("chainage_m", "kilometrage_m", "latitude_deg", "longitude_deg", "height_m")},
-    **{f"{axis}_m": f"ecef_m:{i}" for i, axis in enumerate("xyz")},
-    "along_sigma_m": "tracked.sigma_m",
-    "branch_probability": "tracked.probability",
-    "protection_level_m": "tracked.level_m",
-    "protection_noise_m": "tracked.level_noise_m",
-    "protection_separation_m": "tracked.separation_m",
-    "over_reading_m": "tracked.amount_m",
-    "under_reading_m": "tracked.amount_m",
-    "measured_chainage_m": "sensed.under_m",
-    "measured_gradient_permille": "sensed.gradient*1000",
-    "measured_curvature_1pm": "sensed.curvature_1pm",
-    "measured_cant_mm": "sensed.cant_m*1000",
-    "metric_antenna_spacing_m": "spacing_error_m",
-    "innovation_wheel_m": f"tracked.sensed:{Kind.WHEEL - 3}",
+    **{f"{axis}_m": f"ecef_m:{i}" for i, axis in enumerate("xyz")}, "along_sigma_m": "tracked.sigma_m",
+    "branch_probability": "tracked.probability", "protection_level_m": "tracked.level_m",
+    "protection_noise_m": "tracked.level_noise_m", "protection_separation_m": "tracked.separation_m",
+    "over_reading_m": "tracked.amount_m", "under_reading_m": "tracked.amount_m",
+    "measured_chainage_m": "sensed.under_m", "measured_gradient_permille": "sensed.gradient*1000",
+    "measured_curvature_1pm": "sensed.curvature_1pm", "measured_cant_mm": "sensed.cant_m*1000",
+    "metric_antenna_spacing_m": "spacing_error_m", "innovation_wheel_m": f"tracked.sensed:{Kind.WHEEL - 3}",
     "innovation_radar_m": f"tracked.sensed:{Kind.RADAR - 3}",
     "innovation_force_mps2": f"tracked.sensed:{Kind.FORCE - 3}",
     "innovation_place_m": f"tracked.sensed:{Kind.PLACE - 3}",
@@ -83,9 +69,8 @@ TRAIN_PATHS = {
     **{
         name: f"tracked.{name}"
         for name in ("speed_mps", "speed_sigma_mps", "acceleration_mps2", "hypotheses", "code_weight", "motion_weight")
-    },
-    **{name: f"tracked.{name}" for name in ("wheel_scale", "radar_scale", "force_offset_mps2", "map_scale")},
-}
+    }, **{name: f"tracked.{name}" for name in ("wheel_scale", "radar_scale", "force_offset_mps2", "map_scale")},
+}  # fmt: skip
 
 
 def marked(value: Any, random: np.random.Generator) -> Any:

@@ -51,20 +51,9 @@ TRUTH_OF: Final = {"f9p": "urbannav", "m8t": "urbannav", "gsdc": "gsdc", "japan"
 PARKED_DEG: Final = (35.8729254, 138.3898229, 1004.46)
 #: Keys of JSON files that two runs of the same code do not share.
 VOLATILE: Final = {
-    "version",
-    "versions",
-    "kernels",
-    "railfix",
-    "seconds",
-    "command",
-    "created",
-    "started",
-    "finished",
-    "sha256",
-    "wall_s",
-    "positioning_s",
-    "bytes",
-}
+    "version", "versions", "kernels", "railfix", "seconds", "command", "created", "started", "finished", "sha256",
+    "wall_s", "positioning_s", "bytes",
+}  # fmt: skip
 
 
 def railfix(*arguments: object) -> None:
