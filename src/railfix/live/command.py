@@ -21,7 +21,6 @@ from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
 from railfix.live.console import Metrics, PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.forms import TABLES
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.live.sinks import Outlet, open_sink, parse_file_target
@@ -33,12 +32,12 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.result_tables import round_floats
 from railfix.run.driver import find_record_time
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
 from railfix.run.processor_setup import check_base_place, make_processor, parse_position
 from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
+from railfix.run.tally import TABLES, make_tables
 
 #: Number of results kept in memory before they are written.
 _BLOCK = 600
@@ -47,8 +46,8 @@ _BLOCK = 600
 class ResultTables:
     """Context manager that writes ``positions.*``, ``train.*`` and ``passings.*`` of a session into a folder."""
 
-    def __init__(self, out: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
-        self._folder = OutputFolder(out, overwrite=overwrite, inputs=list(inputs))
+    def __init__(self, out: Path, *, overwrite: Overwrite, inputs: Sequence[Path], passings: bool) -> None:
+        self._folder, self._passings = OutputFolder(out, overwrite=overwrite, inputs=list(inputs)), passings
         self._parts: dict[str, list[pl.DataFrame]] = {name: [] for name in TABLES}
 
     def __enter__(self) -> ResultTables:
@@ -59,18 +58,15 @@ class ResultTables:
         """Add the rows of one output; rows are written in blocks."""
         if output.result is None or output.part == "message":
             return
-        for name, table_of in TABLES.items():
-            if (table := table_of(output.result)) is not None:
-                self._parts[name].append(table)
+        for name, table in make_tables(output.result, passings=self._passings).items():
+            self._parts[name].append(table)
         if len(self._parts["positions"]) >= _BLOCK:
             self._write()
 
     def _write(self) -> None:
         for name, tables in self._parts.items():
             if tables:
-                table = pl.concat(tables)
-                self._folder.append_parquet(f"{name}.parquet", table)
-                self._folder.append_csv(f"{name}.csv", round_floats(table))
+                self._folder.append_rows(name, pl.concat(tables))
                 tables.clear()
 
     def __exit__(
@@ -213,7 +209,10 @@ def _hooks(
         observers.append(say_balises)
     sensed, save, streams = None, None, {}
     if inputs.out is not None:
-        tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=_files_read(inputs)))
+        kept, passings = _files_read(inputs), engine.processor.balises is not None
+        tables = held.enter_context(
+            ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=kept, passings=passings)
+        )
         rows: Outlet[LiveOutput] = Outlet(f"tables {inputs.out}", tables.add, waiting=live.waiting * 10, full=full)
         held.callback(_close, rows, log)
         observers.append(rows.send)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -20,8 +20,8 @@ from railfix.core.timescale import GPS_EPOCH, gpst_minus_utc
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown, encode, etcs_report, to_json
 from railfix.live.engine import LiveOutput
 from railfix.live.settings import LiveSettings
-from railfix.pipeline.result_tables import passing_table, positions_table, train_table
 from railfix.pipeline.results import Result
+from railfix.run.tally import TABLES
 
 Form = Callable[[LiveOutput], bytes]
 #: Largest uncertainty that an ETCS position report can express, less a margin for the rounding of the distance [cm].
@@ -105,14 +105,6 @@ def etcs_form(settings: LiveSettings) -> Form:
         return json.dumps(report, separators=(",", ":")).encode() + b"\n"
 
     return etcs_bytes
-
-
-#: Functions that return the result tables; a table without rows is None.
-TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
-    "positions": positions_table,
-    "train": lambda result: train_table(result) if result.fusion else None,
-    "passings": lambda result: passing_table(result) if any(own.passings for own in result.fusion.values()) else None,
-}
 
 
 def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:

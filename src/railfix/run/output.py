@@ -320,6 +320,13 @@ class OutputFolder:
                 self._parquet[name] = ParquetFile(self.stage(name), table.schema)
             self._parquet[name].append(table)
 
+    def append_rows(self, name: str, table: pl.DataFrame) -> None:
+        """Append rows to the Parquet file of a table, and rounded rows to its CSV file."""
+        from railfix.pipeline.result_tables import round_floats
+
+        self.append_parquet(f"{name}.parquet", table)
+        self.append_csv(f"{name}.csv", round_floats(table))
+
     def end_parquet(self, metadata: Mapping[str, str] | None = None) -> None:
         """End all Parquet files, with `metadata` in each footer; `scan` can then read them."""
         while self._parquet:
@@ -332,17 +339,13 @@ class OutputFolder:
         """Apply a function to blocks of rows of a table, in order, and write its Parquet and CSV files again."""
         import polars as pl
 
-        from railfix.pipeline.result_tables import round_floats
-
         file = f"{name}.parquet"
         self._csv.pop(f"{name}.csv").close()
         with _writing(self.path / file):
             self._parquet.pop(file).end()
             before = pl.scan_parquet(self.stage(file).replace(self.staging / f"{file}.before"))
             for start in range(0, before.select(pl.len()).collect().item(), _ROWS):
-                table = transform(before.slice(start, _ROWS).collect())
-                self.append_parquet(file, table)
-                self.append_csv(f"{name}.csv", round_floats(table))
+                self.append_rows(name, transform(before.slice(start, _ROWS).collect()))
 
     def scan(self, name: str) -> pl.LazyFrame:
         """Return a lazy frame of a Parquet file after `end_parquet`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,7 +28,6 @@ from railfix.pipeline.result_tables import (
     observations_table,
     passing_table,
     positions_table,
-    round_floats,
     smoothed_table,
     train_table,
     with_smoothed,
@@ -330,6 +329,23 @@ def _count_left_out(
         counts[name] = (before[0] + int(left_out[:, k].sum()), before[1])
 
 
+#: Functions that return the tables of results by name; the tables of the filter are None without the filter.
+TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
+    "positions": positions_table,
+    "train": lambda result: train_table(result) if result.fusion else None,
+    "passings": lambda result: passing_table(result) if result.fusion else None,
+}
+
+
+def make_tables(result: Result, *, passings: bool) -> dict[str, pl.DataFrame]:
+    """Return the tables of a chunk by name: positions, with the filter also its positions and, if wanted, passings.
+
+    The table of passings may have no rows.
+    """
+    tables = {name: table_of(result) for name, table_of in TABLES.items() if passings or name != "passings"}
+    return {name: table for name, table in tables.items() if table is not None}
+
+
 @dataclass(frozen=True, kw_only=True)
 class ResultRows:
     """Writer of the tables of a run, chunk by chunk."""
@@ -345,9 +361,7 @@ class ResultRows:
 
     def write(self, result: Result) -> None:
         """Append the rows of a chunk to the tables; on a route of a network, the rows include the tracks."""
-        tables = {"positions": positions_table(result)}
-        if result.fusion:
-            tables["train"] = train_table(result)
+        tables = make_tables(result, passings=self.passings)
         if self.observations:
             tables["observations"] = observations_table(result)
         if self.checks is not None and result.fusion:
@@ -355,8 +369,6 @@ class ResultRows:
             self.checks.take(antenna_positions(name, result.antennas[name]), antenna_train(name, result.fusion[name]))
         for name, own in result.fusion.items():
             self.balise_notes.extend(balise_notes(name, own.passings))
-        if self.passings:
-            tables["passings"] = passing_table(result)
         for name, kept in self.replays.items():
             if name in result.fusion:
                 kept.keep(result.replays[name])
@@ -365,9 +377,10 @@ class ResultRows:
             if "train" in tables:
                 tables["train"], _ = self.line.route.on_tracks(tables["train"], self.line.track)
         for name, table in tables.items():
-            self.folder.append_parquet(f"{name}.parquet", table)
-            if name != "observations":
-                self.folder.append_csv(f"{name}.csv", round_floats(table))
+            if name == "observations":
+                self.folder.append_parquet(f"{name}.parquet", table)
+            else:
+                self.folder.append_rows(name, table)
 
 
 #: Maximum number of notes on balises in a run.
