@@ -15,6 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 from itertools import product
 from pathlib import Path
@@ -315,6 +316,18 @@ def test_a_session_that_does_not_begin_leaves_no_file(tmp_path: Path) -> None:
     done = RUNNER.invoke(app, [*words, "--send", f"json@{tmp_path / 'messages'}"])
     assert "cannot be connected to" in " ".join(done.output.split())
     assert not list(tmp_path.iterdir())
+    (kept := tmp_path / "kept").write_text("messages of yesterday")
+    for more in ((), ("--metrics", "127.0.0.1:99999")):
+        done = RUNNER.invoke(app, [*words, "--send", f"json@{kept}", "--overwrite", *more])
+        assert done.exit_code
+        assert kept.read_text() == "messages of yesterday"
+    for result, left in ((None, "messages of yesterday"), (object(), '{"version":1,')):  # without and with an epoch
+        sink = asyncio.run(open_sink(f"json@{kept}", overwrite="replace"))
+        sink.send(output(1))
+        sink.send(replace(output(2), result=result))  # type: ignore[arg-type]
+        sink.close()
+        assert kept.read_text().startswith(left)
+    assert kept.read_text().count('"sequence":') == 2
 
 
 def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ The forms are functions of `railfix.live.forms`. The targets are ``-`` (standard
 from __future__ import annotations
 
 import asyncio
+import os
 import queue
 import socket
 import sys
@@ -121,15 +122,29 @@ class Sink(Protocol):
 
 @dataclass
 class ByteTarget:
-    """File or standard output, written without a buffer, so that messages reach their reader at once."""
+    """File or standard output, written without a buffer, so that messages reach their reader at once.
+
+    The earlier content of a file is replaced by the first epoch's message. Messages without input wait for it, because
+    a session whose sources cannot be opened has only these.
+    """
 
     form: Form
     file: IO[bytes]
     path: Path | None = None  #: None for the standard output.
+    #: Messages that wait while the file has its earlier content; None if it has none.
+    waiting: bytes | None = None
 
     def send(self, output: LiveOutput) -> None:
         """Write one message."""
-        data = memoryview(self.form(output))
+        message = self.form(output)
+        if self.waiting is not None:
+            message = self.waiting + message
+            if output.result is None and len(message) < _LARGEST_BACKLOG:
+                self.waiting = message
+                return
+            self.file.truncate(0)
+            self.waiting = None
+        data = memoryview(message)
         while data:
             data = data[self.file.write(data) :]
 
@@ -294,13 +309,19 @@ def parse_file_target(text: str) -> Path | None:
     return None if other else Path(target)
 
 
+def _open_without_change(path: Path) -> IO[bytes]:
+    """Open a file for writing without a buffer; its content remains. Raise OSError if it cannot be opened."""
+    return open(path, "wb", buffering=0, opener=lambda name, flags: os.open(name, flags & ~os.O_TRUNC, 0o666))
+
+
 async def open_sink(
     text: str, settings: LiveSettings | None = None, *, overwrite: str = "refuse", full: str = "drop"
 ) -> Sink:
     """Open the sink of a text ``FORM@TARGET``; `full` is as for `Outlet`.
 
-    Raise SettingsError if the text has no valid form or target. Raise OutputError if the target cannot be opened, or is
-    an existing file and `overwrite` is "refuse".
+    The content of an existing file remains until the first epoch's message. Raise SettingsError if the text has no
+    valid form or target. Raise OutputError if the target cannot be opened, or is an existing file and `overwrite` is
+    "refuse".
     """
     settings = settings or LiveSettings()
     name, at, target = text.partition("@")
@@ -334,7 +355,8 @@ async def open_sink(
         if path.exists() and overwrite == "refuse":
             raise OutputError(f"{target}: the file exists already; give another file, or add --overwrite")
         try:
-            opened = ByteTarget(form, path.open("wb", buffering=0), path)
+            earlier = path.is_file() and path.stat().st_size > 0
+            opened = ByteTarget(form, _open_without_change(path), path, b"" if earlier else None)
         except OSError as error:
             raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
     return OutletSink(shown, opened, waiting=settings.waiting, full=full)
