@@ -102,6 +102,11 @@ def test_a_sample_goes_to_the_first_epoch_after_it_and_to_none_that_a_restart_ha
             engine.push("front", epoch, now_ns=tag)
             engine.poll(now_ns=tag)
         assert given == expected[first:]
+    given.clear()
+    for epoch, tag in zip(epochs[:5], tags, strict=False):  # after a restart the table is used as at a start
+        engine.push("front", epoch, now_ns=tag)
+        engine.poll(now_ns=tag)
+    assert given == [[0.0, 1.0, 2.0, 3.0, 4.0], *expected[3:5]]
 
 
 def using(corrected: CorrectedRanges, count: int) -> CorrectedRanges:

@@ -140,7 +140,7 @@ class LiveEngine:
         self._from_satellites: deque[_FromSatellites] = deque()
         self._heard = self._heard_at_push = 0
         self._based_to: np.datetime64 | None = None
-        self._samples = SensorSamples()
+        self._samples = self._tables = SensorSamples()
         self._heard_to = dict.fromkeys(sensors, np.datetime64("NaT", "ns"))
         self._sequence = 0
         self.frame = TrainFrame.of(processor.trajectories, settings)
@@ -172,6 +172,8 @@ class LiveEngine:
         self._heard_to[sensed.sensor] = np.fmax(self._heard_to[sensed.sensor], sensed.until)
         if sensed.samples:
             self._samples = self._samples.merge(sensed.samples)
+            if sensed.until == FOREVER:
+                self._tables = self._tables.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
         """Return the sensors that have not reported up to an epoch's time tag."""
@@ -278,13 +280,13 @@ class LiveEngine:
         return True
 
     def _restart(self) -> None:
-        """Restart positioning after a receiver's restart; only navigation records and SBAS messages are kept."""
+        """Restart positioning after a receiver's restart, with navigation records, SBAS messages and whole tables."""
         self.counts["restart"] += 1
         self.lag.reset()
         self.reports.append("a receiver came back with older time tags: positioning restarts")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
-        self._samples = SensorSamples()
+        self._samples = self._tables  # a sensor's stream has only samples from before, a table also those to come
         for name in self._antennas:
             self._waiting[name].clear()
 
@@ -390,13 +392,9 @@ class LiveEngine:
         epochs = {name: head.epoch for name, head in heads.items()}
         self._done_ns = max(head.tag_ns for head in heads.values())
         screened = self.processor.screen(
-            epochs,
-            self._state,
-            navigation=news.navigation,
-            messages=news.messages,
-            base=news.base,
+            epochs, self._state, navigation=news.navigation, messages=news.messages, base=news.base,
             sensors=self._samples_until(self._done_ns) if self._heard_to else None,
-        )
+        )  # fmt: skip
         result, self._state = self.processor.along_track(*self.processor.position(*screened))
         self._tell_changes(self._state, result.notes)
         self._check_order(result)
