@@ -8,12 +8,14 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
+import polars as pl
 import pytest
 from typer.testing import CliRunner
 
 from bad_inputs import Desk
 from railfix.cli import app
 from railfix.io.receiver.framing import find_frames
+from railfix.io.sensor_tables import COLUMNS
 from railfix.run.doctor import examine_files
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
@@ -37,6 +39,48 @@ def test_each_file_is_known_by_its_content(desk: Path) -> None:
     front, rear = found.command.split().index("--front"), found.command.split().index("--rear")
     assert found.command.split()[front + 1].endswith("front.obs")
     assert found.command.split()[rear + 1].endswith("rear.obs")
+
+
+#: Content of a table of each kind; a time stands in braces.
+TABLES = {
+    "tachometer": "time_gpst,pulse,volts\n{},1,0.5\n", "radar": "time_gpst,speed_mps\n{},4\n",
+    "ranging": "time_gpst,unit,range_m\n{},A,90\n", "ranging_units": "unit,x_m,y_m,z_m\nA,4279000,643000,4670500\n",
+    "balises": "time_gpst,balise\n{},B1\n", "list of balises": "balise,chainage_m\nB1,9\nB2,20\n",
+    "inertial": f"time_gpst,{','.join(COLUMNS['inertial'])}\n{{}},0,0,-9.8,0,0,0\n",
+    "heights": "kilometrage_m,elevation_m\n0,80\n900,81\n",
+    "unknown": "time_gpst,antenna,balise,latest_gpst\n{},a,B1,{}\n",
+}  # fmt: skip
+
+
+@pytest.mark.requirement("A6")
+def test_each_table_is_known_by_its_header_and_read_as_its_command_reads_it(desk: Path, tmp_path: Path) -> None:
+    time, paths = "2024-03-05T03:10:01.000000000", {name: tmp_path / f"{name}.txt" for name in TABLES}
+    for name, path in paths.items():
+        path.write_text(TABLES[name].replace("{}", time))
+    own = {name: desk / f"{name}.csv" for name in ("pulses", "acceleration", "sections")}
+    inputs = [desk / name for name in ("front.obs", "brdc.nav", "line.csv")]
+    found = examine_files([*inputs, *paths.values(), *own.values()])
+    assert [finding.kind for finding in found.findings[3:]] == [*paths, *own]
+    assert all(finding.facts for finding in found.findings if finding.kind != "unknown")
+    assert [text for text in found.problems if "unknown.txt" not in text] == []
+    words = found.command.split(" --")
+    for name in ("tachometer", "radar", "ranging", "ranging_units", "balises", "inertial"):
+        assert f"{name.replace('_', '-')} {paths[name]}" in words
+    assert f"balise-list '{paths['list of balises']}'" in words
+    paths["radar"].write_text(TABLES["radar"].replace("{}", "2024-03-06T03:10:01"))
+    paths["tachometer"].write_text("time_gpst,pulse\n,1\n")
+    several = examine_files([*inputs, *(paths[name] for name in ("radar", "ranging", "balises", "tachometer"))])
+    said = " ".join(several.problems)
+    for text in (
+        "has no time in common",
+        "needs also the ranging units",
+        "also the list of balises",
+        "time_gpst is empty",
+    ):
+        assert text in said
+    packed = tmp_path / "a.parquet"
+    pl.DataFrame({"time_gpst": [np.datetime64(time)], "speed_mps": [1.0]}).write_parquet(packed)
+    assert examine_files([packed]).findings[0].facts == ("1 reading (--radar)",)
 
 
 @pytest.mark.requirement("A6")

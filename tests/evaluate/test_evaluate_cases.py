@@ -34,9 +34,10 @@ from railfix.evaluate import (
 )
 from railfix.evaluate.accuracy import block_limits
 from railfix.evaluate.epoch_table import distance_travelled, with_missing
-from railfix.evaluate.evaluation_inputs import list_position_tables, read_sections
+from railfix.evaluate.evaluation_inputs import list_position_tables
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.io.reference_log import AntennaReference
+from railfix.io.sections import read_sections
 from railfix.run import run_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import Track, read_track, write_track_csv

@@ -12,10 +12,11 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, places_in_groups
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
-from railfix.evaluate.evaluation_inputs import EvaluationOptions, RunFolder, Sections, floats
+from railfix.evaluate.evaluation_inputs import EvaluationOptions, RunFolder, floats
 from railfix.evaluate.integrity import PARTS, STATED
 from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, bracket, compute_errors
 from railfix.io.reference_log import AntennaReference
+from railfix.io.sections import Sections
 
 #: Status of an epoch missing in the log.
 NOT_LOGGED: Final = "not_logged"

@@ -24,12 +24,12 @@ from railfix.evaluate.evaluation_inputs import (
     EvaluationOptions,
     RunFolder,
     read_run,
-    read_sections,
 )
 from railfix.evaluate.integrity import Integrity, Level, judge_levels
 from railfix.evaluate.intervals import branch_table, interval_table, level_table, outage_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
+from railfix.io.sections import read_sections
 
 #: File names under which a reference is searched for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")

@@ -1,4 +1,4 @@
-"""Inputs of an evaluation: settings, sections of the line, and the folder of a run with its tables."""
+"""Inputs of an evaluation: settings, and the folder of a run with its tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from railfix.core.options import option
 from railfix.core.reasons import Status
 from railfix.core.settings import INPUTS, Settings
 from railfix.core.tables import reading_table
-from railfix.io.named_columns import read_named_columns
 from railfix.pipeline.level_stage import KINDS
 from railfix.run.inputs import ColumnNames
 from railfix.run.record import RunRecord, read_parquet, read_record
@@ -350,51 +349,3 @@ class EvaluationOptions(Settings):
     replicates: int = Field(default=1000, ge=1)  #: Number of resamples.
     seed: int = option("Seed of the random numbers of the confidence limits.", 0, metavar="N", ge=0)
     confidence: float = Field(default=0.95, gt=0.0, lt=1.0)  #: Probability of the confidence limits, between 0 and 1.
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sections:
-    """S stretches of the line with their environment, in rising order, without overlap."""
-
-    path: Path
-    from_m: Floats  #: Chainage of the start, shape (S,) [m].
-    to_m: Floats  #: Chainage of the end, shape (S,) [m]; the end is part of the last stretch only.
-    environment: tuple[str, ...]
-
-    def at(self, chainage_m: Floats) -> Strings:
-        """Return the environment at chainages, shape (T,); blank outside every section and for NaN."""
-        names = np.array([*self.environment, ""])
-        index = np.searchsorted(self.from_m, chainage_m, side="right") - 1
-        safe = np.maximum(index, 0)
-        last = (safe == len(self.to_m) - 1) & (chainage_m == self.to_m[-1])
-        inside = (index >= 0) & ((chainage_m < self.to_m[safe]) | last)
-        return np.asarray(names[np.where(inside, safe, len(names) - 1)])
-
-
-def read_sections(path: Path) -> Sections:
-    """Read the sections of a line from a CSV file with the columns ``from_m,to_m,environment``.
-
-    Raise InputFileError if a column is missing, or a section has no length, no environment, or overlaps another.
-    """
-    table = read_named_columns(path)
-    for name in ("from_m", "to_m", "environment"):
-        if name not in table:
-            raise InputFileError(
-                path, f"has no column {name}; from_m, to_m and environment are needed", line=table.header_line
-            )
-    if not len(table):
-        raise InputFileError(path, "has no section below the header")
-    first, last = table.numbers("from_m"), table.numbers("to_m")
-    for row, name in enumerate(table.cells["environment"]):
-        if not name:
-            raise table.error(row, "the environment is empty; expected a word such as open or tunnel")
-        if not first[row] < last[row]:
-            raise table.error(row, f"from_m {first[row]:g} is not below to_m {last[row]:g}; correct the section")
-    order = np.argsort(first, kind="stable")
-    over = np.flatnonzero(first[order][1:] < last[order][:-1] - 1e-6)
-    if len(over):
-        row = int(order[over[0] + 1])
-        raise table.error(row, f"the section from {first[row]:g} m overlaps another section; correct the limits")
-    return Sections(
-        path=path, from_m=first[order], to_m=last[order], environment=tuple(table.cells["environment"].gather(order))
-    )

@@ -13,8 +13,8 @@ from railfix.io.receiver.framing import is_receiver_log, read_head
 
 FileKind = Literal[
     "observations", "navigation", "rinex", "sp3", "sbas", "receiver", "nmea", "novatel", "rtklib", "gpx", "table",
-    "mate", "geojson", "kml", "osm", "xml", "rdf", "ifc", "dxf", "gml", "gpkg", "shp", "fgb", "pbf", "toml", "android",
-    "unknown",
+    "parquet", "mate", "geojson", "kml", "osm", "xml", "rdf", "ifc", "dxf", "gml", "gpkg", "shp", "fgb", "pbf", "toml",
+    "android", "unknown",
 ]  # fmt: skip
 #: Kinds of position logs. A table or GPX file may also be a track map.
 POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", "gpx", "receiver")
@@ -28,6 +28,7 @@ KIND_WORDS: Final[dict[FileKind, str]] = {
     "rinex": "a RINEX file of clocks or meteorology", "sp3": "an SP3 file of precise orbits (--sp3)",
     "sbas": "a log of SBAS messages (--sbas)", "receiver": "a receiver's log", "nmea": "an NMEA log",
     "novatel": "a NovAtel log", "rtklib": "an RTKLIB solution (.pos)", "gpx": "a GPX file", "table": "a table",
+    "parquet": "a Parquet table",
     "android": "a log of Android's GnssLogger, which also writes a RINEX file", "mate": "an EGNSS MATE table",
     "geojson": "a JSON file", "kml": "a KML file", "osm": "an OpenStreetMap file", "xml": "an XML file",
     "rdf": "an RDF file", "ifc": "an IFC file", "dxf": "a DXF file", "gml": "a GML file", "gpkg": "a GeoPackage",
@@ -36,7 +37,8 @@ KIND_WORDS: Final[dict[FileKind, str]] = {
 }  # fmt: skip
 #: First bytes of binary files.
 _BINARY: Final[dict[FileKind, bytes]] = {
-    "gpkg": b"SQLite format 3\0", "shp": b"\0\0\x27\n", "fgb": b"fgb\x03", "dxf": b"AutoCAD Binary DXF",
+    "parquet": b"PAR1", "gpkg": b"SQLite format 3\0", "shp": b"\0\0\x27\n", "fgb": b"fgb\x03",
+    "dxf": b"AutoCAD Binary DXF",
 }  # fmt: skip
 #: Patterns that identify a kind in the first bytes of a text, in the order in which they are tried.
 _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
@@ -124,3 +126,10 @@ def _header_line(head: bytes) -> str:
     coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     lines = head.decode(coding, "replace").splitlines()
     return next((line for line in lines if line.strip() and not line.startswith("#")), "")
+
+
+def read_column_names(path: FilePath) -> tuple[str, ...]:
+    """Return the column names in the header line of a text table."""
+    line = _header_line(read_head(path))
+    separator = next((mark for mark in ",;\t|" if mark in line), ",")
+    return tuple(name.strip().strip('"') for name in line.split(separator))

@@ -105,6 +105,12 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
     return False
 
 
+def is_named(theirs: str, name: str) -> bool:
+    """Return whether a column name of a file is railfix's `name`, or a usual name for it in the same unit."""
+    plain = "".join(c for c in theirs.lower() if c.isalnum())
+    return plain in _USUAL.get(name, ()) or theirs.lower() == name
+
+
 def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
     """Return the table with columns of usual names ("Latitude", "lon", "alt") renamed to railfix's `names`.
 
@@ -117,7 +123,7 @@ def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
         word, _, unit = name.rpartition("_")
         for theirs in list(cells):
             plain = "".join(c for c in theirs.lower() if c.isalnum())
-            if plain in _USUAL.get(name, ()) or theirs.lower() == name:
+            if is_named(theirs, name):
                 cells[name] = cells.pop(theirs)
                 usual[name] = theirs
                 break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,6 +81,18 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     if "balise" in present and (empty := table["balise"].is_null()).any():
         raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: balise is empty; name it")
     return table
+
+
+def find_sensor_table(names: Collection[str]) -> str | None:
+    """Return the kind in `COLUMNS` of a table with columns of the given names; None if there is no such kind."""
+    present = set(names)
+    for kind, columns in COLUMNS.items():
+        needed = {name for name in columns if not name.startswith("[")}
+        if not needed:  # one of the columns that may be absent alone is required
+            needed = (present & set(names_of_columns(kind)) - {"direction"}) or {""}
+        if needed <= present and ("time_gpst" in present) == (kind not in _TIMELESS):
+            return kind
+    return None
 
 
 def names_of_columns(kind: str) -> list[str]:

@@ -6,6 +6,7 @@ import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,7 +17,7 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.files import LENIENT
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.gnss.observations import ObservationHeader
-from railfix.io.file_kind import KIND_WORDS, MAPS, POSITIONS, FileKind, find_kind, has_times
+from railfix.io.file_kind import KIND_WORDS, MAPS, POSITIONS, FileKind, find_kind, has_times, read_column_names
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.mate import mate_table
 from railfix.io.positions import read_positions
@@ -24,6 +25,7 @@ from railfix.io.sp3 import read_sp3
 from railfix.pipeline.config import Config
 from railfix.ranges.sbas.files import read_sbas
 from railfix.run.checks import RECORD_REACH, Span, navigation_span, spans_apart
+from railfix.run.doctor_tables import PAIRS, TABLE_KINDS, TableKind, find_table_kind, read_table_facts, sensor_options
 from railfix.track.network_read import connect_network, is_route
 from railfix.track.quality import check_track, error_note
 from railfix.track.read import read_segments
@@ -33,9 +35,10 @@ from railfix.track.vehicle import read_vehicle
 
 _SECOND: Final = np.timedelta64(1, "s")
 _MOST_NOTES: Final = 5  #: Maximum number of notes shown for one file.
-Kind = Literal[
-    "observations", "navigation", "orbits", "sbas", "track", "vehicle", "settings", "positions", "unknown"
-]  # fmt: skip
+Kind = (
+    Literal["observations", "navigation", "orbits", "sbas", "track", "vehicle", "settings", "positions", "unknown"]
+    | TableKind
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +123,8 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
 def _find_kinds(path: Path) -> tuple[Kind, ...]:
     """Return the possible kinds of a file, the most likely first."""
     kind = find_kind(path)
+    if kind in ("table", "parquet", "mate") and (table := find_table_kind(path)) is not None:
+        return ("unknown",) if table == "other" else (table,)
     if kind in ("table", "gpx"):
         without: tuple[Kind, ...] = ("track",) if kind == "table" else ("positions", "track")
         return ("positions",) if has_times(path) else without
@@ -128,8 +133,17 @@ def _find_kinds(path: Path) -> tuple[Kind, ...]:
     return _KINDS.get(kind, ("unknown",))
 
 
+#: Columns of maps and logs of positions, for messages.
+_PLACES: Final = "a track map has latitude_deg and longitude_deg, a log of positions also times, or x_m, y_m, z_m"
+
+
 def _unknown(path: Path) -> FileFinding:
-    raise InputFileError(path, f"not recognised: it is {KIND_WORDS[find_kind(path)]}, and no command reads it")
+    if (kind := find_kind(path)) == "table":
+        columns = ", ".join(read_column_names(path)[:_MOST_NOTES])
+        raise InputFileError(
+            path, f"not recognised: no command reads a table with its columns ({columns}, ...); {_PLACES}"
+        )
+    raise InputFileError(path, f"not recognised: it is {KIND_WORDS[kind]}, and no command reads it")
 
 
 def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
@@ -291,6 +305,11 @@ def _settings(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="settings", facts=(f"changed: {', '.join(changed) or 'nothing'}",))
 
 
+def _table(path: Path, kind: TableKind) -> FileFinding:
+    phrase, span = read_table_facts(path, kind)
+    return FileFinding(path=path, kind=kind, facts=(phrase,), span=span)
+
+
 def _orbits(path: Path) -> FileFinding:
     orbits = read_sp3(path)
     step = float(np.median(np.diff(orbits.time)) / _SECOND)
@@ -331,6 +350,7 @@ _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "unknown": _unknown,
     "vehicle": _vehicle,
     "settings": _settings,
+    **{kind: partial(_table, kind=kind) for kind in TABLE_KINDS},
 }
 
 
@@ -373,6 +393,16 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
                     problems.append(
                         f"{other.path}: lies {apart / 1000:,.0f} km from the position in the header of {log.path}"
                     )
+    for table in (finding for finding in findings if finding.kind in TABLE_KINDS):
+        other_kind = next((kind for of, kind in PAIRS.items() if of == table.kind), None)
+        if logs and other_kind and not _filter(findings, other_kind) and table.kind != "list of balises":
+            problems.append(f"{table.path}: a run needs also the {other_kind.replace('_', ' ')}; give both tables")
+        if (
+            readable
+            and table.span is not None
+            and all(spans_apart(table.span, log.span) for log in readable if log.span)
+        ):
+            problems.append(f"{table.path}: has no time in common with the logs")
     if len(readable) == 2:
         one, two = (log.span for log in readable)
         assert one is not None
@@ -402,6 +432,9 @@ def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str
     }  # fmt: skip
     for kind, (option, most) in options.items():
         words += [word for finding in _filter(findings, kind)[:most] for word in (option, str(finding.path))]
-    words += list(dict.fromkeys(word for finding in findings for word in finding.options))
+    words += sensor_options({finding.kind: finding.path for finding in findings if finding.kind in TABLE_KINDS})
+    heights = [str(finding.path) for finding in _filter(findings, "heights")] or ["log"]
+    options_of_files = dict.fromkeys(word for finding in findings for word in finding.options)
+    words += [heights[0] if word == "log" else word for word in options_of_files]
     words += [] if date is None else ["--date", str(date.astype("datetime64[s]"))]
     return shlex.join([*words, "--out", "results"])
