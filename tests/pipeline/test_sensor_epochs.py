@@ -55,6 +55,10 @@ def test_ways_and_forces_of_each_second() -> None:
     found, _, _ = sensor_epochs(_samples(), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS)
     np.testing.assert_allclose(found.wheel_m[1:], 10.0, atol=1e-3)
     np.testing.assert_allclose(found.radar_m[1:], 10.0, atol=1e-9)
+    limits = LIMITS.replaced(radar_sigma_mps=0.3)
+    rougher, _, _ = sensor_epochs(_samples(), EPOCHS, bent_line(), SensorState.empty(), limits=limits)
+    for each, sigma_mps in ((found, 0.1), (rougher, 0.3)):  # ten independent speeds in a second
+        np.testing.assert_allclose(each.radar_sigma_m[1:], sigma_mps / np.sqrt(10.0))
     t = np.arange(1.0, SECONDS)
     np.testing.assert_allclose(found.force_mps2[1:], 0.05 * (np.cos(t[:-1]) - np.cos(t[1:])), atol=5e-4)
     assert found.wheel_sign == "measured"

@@ -59,7 +59,6 @@ class LineReferences:
 #: Minimum standard deviation of a two-way range [m]: the 0.19 to 0.24 m of P2 3.3, increased because of echoes and
 #: drifts of the unit's reply delay.
 _RANGE_SIGMA_M: Final = 0.5
-_RADAR_SIGMA_MPS: Final = 0.1
 
 
 class SensorLimits(Settings):
@@ -84,6 +83,8 @@ class SensorLimits(Settings):
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     #: Usual interval of radar speed samples.
     radar_step_s: float = Field(default=0.1, gt=0)
+    #: Standard deviation of one radar speed; the errors of the samples between two epochs are independent.
+    radar_sigma_mps: float = Field(default=0.1, gt=0)
     #: Standard deviation of a mean force between two epochs: body pitching in addition to the sensor's noise (1 mrad is
     #: 0.01 m/s2), and errors of the map's gradient.
     force_sigma_mps2: float = Field(default=0.05, gt=0)
@@ -176,7 +177,7 @@ def sensor_epochs(
     if len(radar) and "radar" in sources:
         mean, share = _mean_between(radar.time, radar.speed_mps, edges)
         known = usable & (share >= _COMPLETE) & ~_silent("radar", samples, len(time))
-        sigma = _RADAR_SIGMA_MPS * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
+        sigma = limits.radar_sigma_mps * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
         values |= {"radar_m": np.where(known, mean * span, np.nan), "radar_sigma_m": sigma}
     if force:
         mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
