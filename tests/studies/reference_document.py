@@ -151,15 +151,16 @@ def _as_toml(value: object) -> str:
 
 
 def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str, str]]:
-    """Group, key, default with bounds, and the first sentence of the description of each setting."""
+    """Group, key, default with unit and bounds, and the description of each setting."""
     docs = _field_comments(type(group))
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
         if isinstance(value, Settings):
             yield from _setting_cells(f"{prefix}.{name}".strip("."), value)
             continue
-        first = re.split(r"(?<=[a-z)`\]])[.;:] ", docs.get(name, ""))[0].rstrip(".").replace("``", "`")
-        sentence, unit = re.match(r"(.*?)(?: \[([^\]]+)\])?$", first).groups()  # type: ignore[union-attr]
+        first, *rest = re.split(r"(?<=[a-z)`\]])\. ", docs.get(name, "").replace("``", "`"), maxsplit=1)
+        sentence, unit = re.match(r"(.*?)(?: \[([^\]]+)\])?$", first.rstrip(".")).groups()  # type: ignore[union-attr]
+        sentence += "".join(f". {text}" for text in rest)
         default = (
             f"`{value if isinstance(value, str) else _as_toml(value)}`" if value not in (None, "", (), {}) else "none"
         )
