@@ -124,7 +124,7 @@ def test_geoid_from_a_grid_file_of_pyproj(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "options", "error", "said"),
     [
-        (GOOD.replace("height_m", "elevation_m"), {}, InputFileError, "needs a geoid"),
+        (GOOD.replace("height_m", "elevation_m"), {}, InputFileError, "require a geoid"),
         (GOOD.replace("height_m", "elevation_m"), {"geoid": "egm9000"}, SettingsError, "'egm9000' is unknown"),
         (
             GOOD.replace("height_m", "elevation_m"),
@@ -279,7 +279,7 @@ def test_geojson_collection_and_multi_line_are_a_route(tmp_path: Path) -> None:
         (feature([[1, 50, 2], [1, "x", 3]]), "not a number"),
         (feature([[1, 50, 2], [1, None, 3]]), "not finite"),
         (feature(LINE, height_datum="levelled"), "expected 'ellipsoidal' or 'orthometric'"),
-        (feature(LINE, height_datum="orthometric"), "needs a geoid"),
+        (feature(LINE, height_datum="orthometric"), "require a geoid"),
         (feature([p[1::-1] + p[2:] for p in LINE], height_datum="ellipsoidal"), "swapped"),
         (feature(LINE, height_datum="ellipsoidal", cant_mm=[1, 2]), "2 for 3 points"),
         (feature(LINE, height_datum="ellipsoidal", cant_mm=5), "a single value for 3 points"),

@@ -37,7 +37,7 @@ _LOADERS: Final = {
 _JAPAN_M: Final = 0.02
 GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Accepted geoids.
 #: End of messages on orthometric heights without a geoid.
-GEOID_HELP: Final = f"give one (--geoid): {GEOIDS}; or a column geoid_m"
+GEOID_HELP: Final = f"specify a geoid (--geoid): {GEOIDS}; or provide a column geoid_m"
 _EGM96_NAMES: Final = ("egm96", "epsg:5773")
 #: Standard deviation of EGM96 [m], as stated by EPSG (operation 10084).
 _EGM96_M: Final = 1.0
