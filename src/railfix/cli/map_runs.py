@@ -26,9 +26,9 @@ _COLUMNS: Final[Sequence[Column]] = (
     ("chainage m", "from_m", count),
     ("epochs", "epochs", count),
     ("satellites", "satellites_median", count),
-    ("least (5 %)", "satellites_p5", count),
+    ("satellites 5 %", "satellites_p5", count),
     ("rejected %", "rejected_share", percent),
-    ("3-D off m", "reflection_p95_m", number),
+    ("3-D 95 % m", "reflection_p95_m", number),
     ("ok %", "ok_share", percent),
     ("filter %", "tracking_share", percent),
     ("level m", "level_median_m", number),
@@ -82,7 +82,11 @@ def service(
     else:
         verdict.append("the runs have no filter and no levels; fractions are of single epochs")
     show_verdict(console, verdict)
-    caption = f"Stretches of {stretch:g} m; served: fraction of epochs with a protection level within the limit"
+    caption = (
+        f"Stretches of {stretch:g} m from the stated chainage. Satellites and levels: median and percentile of the "
+        "epochs. 3-D: distance of the 3-D position from the line. Filter: fraction of epochs with a level. Served: "
+        "fraction of epochs with a level within the limit"
+    )
     table = listing("service", found, _COLUMNS, caption)
     show_table(console, table)
     if page is not None:

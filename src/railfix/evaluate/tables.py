@@ -46,6 +46,23 @@ _AVAILABLE: Final = (
 )
 
 
+#: Names of the protection levels of the filter; the others are levels of single epochs.
+_LEVEL: Final = pl.col("level").replace(
+    {
+        "train_protection_level_m": "filter, along the line",
+        "train_protection_level_ground_m": "filter, on the ground",
+        "separation_protection_level_m": "single epochs, separation",
+        "sbas_protection_level_m": "single epochs, sbas",
+        "raim_level_m": "single epochs, raim",
+    }
+)
+
+
+def _name_kind(kind: str) -> str:
+    """Return the name of a kind of protection level in captions."""
+    return "filter along the track" if kind == "train" else f"single epochs, {kind}"
+
+
 def _text(value: str) -> str:
     """Return a text unchanged; as the format of a column it makes the column right-aligned, like numbers."""
     return value
@@ -94,13 +111,13 @@ _LEVELS: Final[Sequence[Column]] = (
 _OUTAGES: Final[Sequence[Column]] = (
     ("begin", "begin_gpst", str),
     ("environment", "environment", str),
-    ("carried by", "carried_by", str),
-    ("lasting s", "duration_s", partial(number, digits=1)),
-    ("run m", "travelled_m", count),
+    ("positions by", "carried_by", str),
+    ("duration s", "duration_s", partial(number, digits=1)),
+    ("distance m", "travelled_m", count),
     ("rate %", "rate", percent),
     *((name, f"outage_{name}_m", number) for name in ("p50", "p95", "max")),
-    ("at its end", "end_error_m", signed),
-    ("sigma there", "end_sigma_m", number),
+    ("error at end", "end_error_m", signed),
+    ("sigma at end", "end_sigma_m", number),
     ("max /sigma", "largest_normalised", number),
 )
 _BRANCHES: Final[Sequence[Column]] = (
@@ -110,7 +127,7 @@ _BRANCHES: Final[Sequence[Column]] = (
     ("right %", "right_share", percent),
     ("wrong", "wrong_places", count),
     ("blocks", "blocks", count),
-    ("with a wrong one", "wrong_blocks", count),
+    ("blocks with a wrong one", "wrong_blocks", count),
 )
 _STANFORD: Final[Sequence[Column]] = (
     ("levels", "levels_of", str),
@@ -157,7 +174,10 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
     # conventional positions are the same in every table of a run
     new = (pl.col("position") != "conventional") | ~pl.col("run").is_in(again)
     overall = overall.filter(new | (pl.col("epochs_of") == "common"))
-    caption = "Errors along the line in metres, + toward its end; sigma: the stated standard deviation"
+    caption = (
+        "Errors along the line in metres, + toward its end; sigma: the stated standard deviation; epochs of both: "
+        "epochs with a position on the map and a conventional position"
+    )
     tables = [listing("figures-of-merit", _in_order(overall), [*_where(overall), *_ERRORS], caption)]
     if len(limited := overall.filter(pl.col("mean_low_m").is_not_null())):
         caption = (
@@ -206,10 +226,12 @@ def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
     if (rows := evaluation.levels) is not None and len(rows):
         columns = [*_where(rows), *_LEVELS]
         caption = "Protection levels in metres, and errors above them"
-        tables.append(listing("levels", rows.with_columns(_POSITION, _OF), columns, caption))
+        tables.append(listing("levels", rows.with_columns(_POSITION, _OF, _LEVEL), columns, caption))
     for kind, found in evaluation.integrity.items():
         overall = _pool_runs(found.stanford.filter(grouping="all"))
-        caption = f"Protection levels ({kind}) against errors: epochs in each region of the Stanford diagram. "
+        caption = (
+            f"Protection levels ({_name_kind(kind)}) against errors: epochs in each region of the Stanford diagram. "
+        )
         tables.append(_stanford(f"stanford-{kind}", overall, f"{caption}{_LEVELS_OF}; {_AVAILABLE}"))
         by = _pool_runs(found.stanford.filter(pl.col("own_limit"), grouping="environment", levels_of="usable"))
         by = by.filter(antenna="all") if "all" in by["antenna"] else by
@@ -225,7 +247,7 @@ def outages(rows: pl.DataFrame) -> Table:
     shown = rows.with_columns(
         _OF,
         pl.col("begin_gpst").dt.strftime("%H:%M:%S"),
-        pl.col("carried_by").fill_null("").replace("", "prediction"),
+        pl.col("carried_by").fill_null("").replace("", "dead reckoning"),
         rate=pl.col("positions") / pl.col("epochs"),
     )
     caption = "Stretches without satellites, with the errors of the filter along the track in metres"
@@ -290,11 +312,12 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
     both = both.filter(antenna="all") if "all" in both["antenna"] else both
     # epochs without satellites have no observations, so rates are fractions of all epochs
     counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")
+    of = "epochs and rate: of all epochs" if grouping == "signals" else "epochs and rate: of epochs with observations"
     columns: list[Column] = [*_where(both), ("group", "group", str), ("epochs", counted, count)]
     for conv, suffix in (("", ""), ("conv.\n", "_conventional")):
         columns += [(f"{conv}rate %", f"{rate}{suffix}", percent), (f"{conv}mean", f"mean_m{suffix}", signed)]
         columns += [(f"{conv}{name}", f"{name}_m{suffix}", number) for name in ("std", "p50", "p95", "max")]
-    return listing(f"figures-by-{grouping}", both.with_columns(_OF), columns, f"{caption}; errors in metres")
+    return listing(f"figures-by-{grouping}", both.with_columns(_OF), columns, f"{caption}; errors in metres; {of}")
 
 
 def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Table:
@@ -330,7 +353,7 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
         ("level m", f"{kind}_level_m", number), ("no fault / one / two m", "parts", _text),
         ("satellites", "n_used", count),
     ]  # fmt: skip
-    caption = f"Errors above the level ({kind}): {len(beyond):,}, of which {usable:,} at a usable level"
+    caption = f"Errors above the level ({_name_kind(kind)}): {len(beyond):,}, of which {usable:,} at a usable level"
     caption += f"; the {worst} largest excesses" if len(beyond) > worst else ""
     return listing(f"above-level-{kind}", shown, columns, caption)
 

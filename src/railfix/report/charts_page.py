@@ -340,7 +340,7 @@ def write_network_page(
 
     The positions must be in the reference frame of the network. Raise OutputError if the file cannot be written.
     """
-    title = f"{quality.tracks:,} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches:,} switches"
+    title = f"Network: {quality.tracks:,} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches:,} switches"
     write_whole(
         out, charts_page(title, [network_plan(network, quality, run)], _tables(network, quality, run)), what="page"
     )
@@ -350,10 +350,11 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
     beside = {end: ", ".join(network.names[t] for t, _ in others) for end, others in network.passages.items()}
     seen = np.zeros(len(network.tracks), dtype=np.int64)
     dead_ends = sum(f.kind == "dead end" for f in quality.findings)
+    parts = "is connected" if quality.parts == 1 else f"consists of {quality.parts:,} separate parts"
     blocks: list[Block] = [
         Sentence(
-            f"{quality.ends:,} ends have no connection; the network has {plural(quality.parts, 'separate part')} and "
-            f"{len(quality.findings):,} findings, including {dead_ends:,} dead ends."
+            f"{quality.ends:,} ends have no connection; the network {parts} and has "
+            f"{plural(quality.findings, 'finding')}, including {plural(dead_ends, 'dead end')}."
         )
     ]
     if run is not None:
@@ -377,7 +378,7 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
                 name="findings",
                 # a click on the link moves the plan to the finding
                 links=[f"#plan:{east:.1f},{north:.1f}" for east, north in plane],
-                head=("kind", "latitude", "longitude", "finding"),
+                head=("kind", "latitude deg", "longitude deg", "finding"),
                 rows=[(f.kind, f"{f.latitude_deg:.6f}", f"{f.longitude_deg:.6f}", f.sentence) for f in listed],
                 caption=f"Findings: {len(quality.findings):,}, including {dead_ends:,} dead ends",
                 numeric=(1, 2),

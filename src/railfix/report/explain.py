@@ -7,7 +7,7 @@ the line, linearised at the position, with the map error as a prior and one free
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -238,7 +238,7 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
     outcomes = satellites.group_by("reason_text").len().sort("len", "reason_text", descending=[True, False])
     lines.append("satellites: " + ", ".join(f"{count} {outcome}" for outcome, count in outcomes.iter_rows()))
     weighty = satellites.filter(pl.col(WITHOUT[0]).is_not_null()).sort(pl.col(WITHOUT[0]).abs(), descending=True)
-    if len(weighty):
+    if len(weighty) and abs(weighty[WITHOUT[0]][0]) >= 0.005:
         name, shift, sigma = (weighty[column][0] for column in ("satellite", *WITHOUT))
         moved = number(shift, 2, " m", sign="+")
         lines.append(
@@ -288,12 +288,28 @@ def write_explanation(explanation: Explanation, path: Path) -> Path:
     for row in explanation.satellites.drop_nulls(("elevation_deg", "azimuth_deg")).iter_rows(named=True):
         radius, azimuth = max(90.0 - row["elevation_deg"], 0.0), np.radians(row["azimuth_deg"])
         sky.append({"x": radius * np.sin(azimuth), "y": -radius * np.cos(azimuth), **row})
+    sky = [{**point, "label": label} for point, label in zip(sky, _label_points(sky), strict=True)]
     page = read_template("explain.html.j2").render(
         title=f"{explanation.antenna} antenna, {time_text(explanation.time)} GPS time",
         explanation=explanation, sky=sky, rows=explanation.satellites.to_dicts(), style=page_style(),
     )  # fmt: skip
     write_whole(path, page, what="page")
     return path
+
+
+def _label_points(sky: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """Return the start of the label of each satellite in a sky plot, where it covers the fewest others."""
+    wide, taken, labels = 9.5, [(point["x"] - 2.4, point["y"] + 1.8, 4.8) for point in sky], []
+    for point in sky:
+        x, y = point["x"], point["y"] + 1.8
+        sides = [(x + 3.4, y), (x - 3.4 - wide, y), (x - wide / 2, y - 5.0), (x - wide / 2, y + 6.5)]
+        covered = [
+            sum(a < left + across and a + wide > left and abs(b - low) < 4.5 for left, low, across in taken)
+            for a, b in sides
+        ]
+        labels.append(sides[int(np.argmin(covered))])
+        taken.append((*labels[-1], wide))
+    return labels
 
 
 def time_text(time: np.datetime64) -> str:

@@ -17,7 +17,7 @@ from railfix.evaluate.evaluation_inputs import floats
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, positions_diagram
 from railfix.evaluate.tables import level_tables, select_evaluation
 from railfix.pipeline.level_stage import prior_basis_text
-from railfix.report.charts_page import Absent, Block, Group
+from railfix.report.charts_page import Absent, Block, Group, Sentence
 from railfix.report.plots.campaign import processing_time
 from railfix.report.plots.chart import Chart, find_start
 from railfix.report.plots.errors import (
@@ -56,7 +56,7 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
     tables: list[Block] = [_assumptions(run, kind)]
     for name, of in ((run.name_in(evaluation), ""), (run.name_in(evaluation, "train"), "filter-")):
         found = level_tables(select_evaluation(evaluation, name), worst=WORST) if name else []
-        tables += [replace(table, name=f"{of}{table.name}") for table in found]
+        tables += [replace(t, name=f"{of}{t.name}") if t.rows else Sentence(f"{t.caption}.") for t in found]
     return tables
 
 

@@ -115,14 +115,14 @@ def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed
     """Return the number of errors above usable protection levels, or the normalised error if there are no levels."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
-        f"{'of the filter: ' if kind == 'train' else ''}{len(found):,}"
-        for kind, name in kinds.items()
+        f"{'filter' if kind == 'train' else 'single epochs'} {len(found):,}"
+        for kind, name in reversed(kinds.items())
         if kind in evaluation.integrity and name
         for found in [evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna)]
     ]
     if not counts:
         return f"95 % of errors within {number(passed.get('normalised_p95'), 1)} sigma"
-    return f"errors above the level at usable positions: {'; '.join(counts)}"
+    return f"errors above usable levels: {', '.join(counts)}"
 
 
 def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:

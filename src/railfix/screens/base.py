@@ -86,6 +86,7 @@ class ScreenPicture:
     limit: Floats | float  #: Broadcasts to (T, M).
     #: Values that are rejected: above the limit, below the limit, or with a magnitude above the limit ("both").
     sides: Literal["both", "above", "below"] = "both"
+    weighs: bool = False  #: Whether the screen increases the sigma of suspect values instead of rejecting them.
 
 
 class ObservationPicture(NamedTuple):

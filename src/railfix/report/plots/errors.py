@@ -340,7 +340,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
         )
     return Chart(
         name="levels-chainage" if start is None else "levels",
-        title="Protection level over chainage" if start is None else "Protection level",
+        title="Protection level of single epochs" + (" over chainage" if start is None else ""),
         caption=" ".join(caption).strip() + thinned,
         x_label="chainage of the position [m]" if start is None else "GPS time",
         y_label="protection level [m]",

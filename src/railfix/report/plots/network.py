@@ -145,10 +145,9 @@ def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]
     east, north = frame.to_plane(log.latitude_deg, log.longitude_deg).T
     on, layers, above = matched.track >= 0, [], np.inf
     for low, colour in _CLASSES:
+        words = f"from {low:g}" if above == np.inf else f"{low:g} to {above:g}" if low else f"below {above:g}"
         rows = on & (matched.probability >= low) & (matched.probability < above)
-        layers.append(
-            Points(label=f"position, track probability from {low:g}", colour=colour, x=east[rows], y=north[rows])
-        )
+        layers.append(Points(label=f"position, track probability {words}", colour=colour, x=east[rows], y=north[rows]))
         above = low
     off = ~on & np.isfinite(log.latitude_deg)
     layers.append(Points(label="position without a track", colour=BLACK, x=east[off], y=north[off], shape="ring"))

@@ -80,14 +80,22 @@ def screen_over_chainage(
     return _screen(picture, chainage_m, epoch, None)
 
 
+_WEIGHS: Final = (
+    'The screen increases the sigma of suspect values instead of rejecting them (setting verdict = "weigh").'
+)
+
+
 def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None, start: np.datetime64 | None) -> Chart:
     """Return a chart of the metric over the time since `start`, or over chainage if `start` is None."""
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
+    weighs = picture.weighs and not rejected
+    outcome = "none rejected" if weighs else f"{rejected:,} rejected ({share})"
+    kept = "tested" if weighs else "passed"
     layers: list[Layer] = []
     shown = total = 0
-    for reject, colour, label in ((False, _KEPT, "passed"), (True, RED, "rejected")):
+    for reject, colour, label in ((False, _KEPT, kept), (True, RED, "rejected")):
         parts = []
         for along, metric, rejects, _ in _blocks(picture, x, epoch):
             mask = rejects == reject
@@ -117,9 +125,11 @@ def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
             scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
     return Chart(
         name="chainage" if start is None else "time",
-        title=f"{picture.title}: {judged:,} tested, {rejected:,} rejected ({share})",
+        title=f"{picture.title}: {judged:,} tested, {outcome}",
         caption=(
-            ("" if same else "The line is the tightest limit of each epoch.") + counts_sentence(shown, total)
+            (_WEIGHS if weighs else "")
+            + ("" if same else " The line is the tightest limit of each epoch.")
+            + counts_sentence(shown, total)
         ).strip(),
         x_label="chainage [m]" if start is None else "GPS time",
         y_label=picture.label,
@@ -287,7 +297,8 @@ def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple
     for screen in SCREENS:
         if screen.name in config.screens:
             for name, picture in screen.pictures(rows, getattr(config, screen.name)):
-                yield name, replace(picture, title=f"{antenna}: {picture.title}")
+                weighs = getattr(getattr(config, screen.name), "verdict", "reject") == "weigh"
+                yield name, replace(picture, title=f"{antenna}: {picture.title}", weighs=weighs)
         if screen.name == "raim" and config.protection == "on":
             level = rows.epochs("protection_level_m")
             level = np.where(np.isfinite(level), level, np.nan)

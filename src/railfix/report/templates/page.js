@@ -6,6 +6,9 @@
   const DARK = { ink: "#e8e8e8", grid: "#343a41", axis: "#8d959e", paper: "#14181c" };
   const FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', Arial, sans-serif";
   const MARGIN = { l: 66, r: 14, t: 8, b: 50 };
+  // formats of the times along an axis, by the interval between two of them [ms]; the date is in the title of the axis
+  const CLOCKS = [[null, 1e3, "%H:%M:%S.%2f"], [1e3, 6e4, "%H:%M:%S"], [6e4, 864e5, "%H:%M"], [864e5, null, "%Y-%m-%d"]]
+    .map(([low, high, value]) => ({ dtickrange: [low, high], value }));
   const PRINTED = { wide: 700, half: 340 }; // widths on paper [px]
   const darkness = window.matchMedia("(prefers-color-scheme: dark)");
   const plots = [], skies = {};
@@ -148,17 +151,23 @@
     const row = Math.max(20, (width - MARGIN.l - MARGIN.r) / 6.6), letters = [...labels].map(label => 8 + label.length);
     this.below = MARGIN.b + 21 * letters.reduce(([rows, used], wide) => used + wide > row ? [rows + 1, wide] : [rows, used + wide], [letters.length ? 1 : 0, 0])[0];
     const height = base + this.below - MARGIN.b;
-    const axis = { gridcolor: t.grid, linecolor: t.axis, zeroline: false, showline: true, mirror: true, exponentformat: "none", separatethousands: true };
+    // A title that is longer than its axis has two lines, and the margin one line more.
+    const high = base - MARGIN.t - MARGIN.b, long = 7 * chart.y_label.length > high, middle = chart.y_label.length / 2;
+    const gaps = [...chart.y_label.matchAll(/ /g)].map(found => found.index).sort((a, b) => Math.abs(a - middle) - Math.abs(b - middle));
+    const yTitle = long && gaps.length ? chart.y_label.slice(0, gaps[0]) + "<br>" + chart.y_label.slice(gaps[0] + 1) : chart.y_label;
+    this.left = MARGIN.l + (yTitle === chart.y_label ? 0 : 17);
+    const axis = { gridcolor: t.grid, linecolor: t.axis, zeroline: false, showline: true, mirror: true, exponentformat: "none", separatethousands: true,
+      minorloglabels: "complete" };
     const x = { ...axis, title: { standoff: 4, text: chart.start === undefined ? chart.x_label : `${chart.x_label}, ${date(chart.start)}` } };
-    if (chart.start !== undefined) x.type = "date"; else if (chart.x_scale === "log") x.type = "log";
+    if (chart.start !== undefined) Object.assign(x, { type: "date", tickformatstops: CLOCKS }); else if (chart.x_scale === "log") x.type = "log";
     if (chart.x_range) x.range = abscissa(chart, chart.x_range);
-    const y = { ...axis, title: { text: chart.y_label } };
+    const y = { ...axis, title: { text: yTitle } };
     if (chart.y_scale === "log") y.type = "log";
     if (chart.y_scale === "symlog") Object.assign(y, symlogTicks(chart));
     if (chart.y_range) y.range = [...ordinate(chart, chart.y_range)];
     if (chart.equal) Object.assign(y, { scaleanchor: "x", scaleratio: 1 });
     if (names) Object.assign(y, { tickmode: "array", tickvals: names.names.map((_, i) => i), ticktext: names.names, autorange: "reversed", automargin: true });
-    return { height, width: width || undefined, margin: { ...MARGIN, b: this.below }, paper_bgcolor: t.paper,
+    return { height, width: width || undefined, margin: { ...MARGIN, l: this.left, b: this.below }, paper_bgcolor: t.paper,
       plot_bgcolor: t.paper, font: { family: FONT, size: 12, color: t.ink }, xaxis: x, yaxis: y, hovermode: "closest", dragmode: "zoom",
       barmode: "overlay", legend: { orientation: "h", x: 0, yref: "container", y: 0, yanchor: "bottom", itemsizing: "constant", tracegroupgap: 0 }, shapes: this.chosenShapes(),
       uirevision: "kept", annotations: chart.equal ? [{ text: "N\u2191", xref: "paper", yref: "paper", x: 0.99, y: 0.98, showarrow: false }] : [] };
@@ -226,12 +235,12 @@
   // Hide the labels that would overlap others at the present scale.
   Plot.prototype.thin = function () {
     this.layers.forEach((layer, k) => {
-      if (layer.kind !== "marks" || layer.words.length < 10) return;
+      if (layer.kind !== "marks" || layer.words.some(word => word.includes("\n"))) return;
       const [x0, x1] = this.range("xaxis"), [y0, y1] = this.range("yaxis"), taken = [];
-      const wide = this.div.clientWidth - MARGIN.l - MARGIN.r, high = this.div.clientHeight - MARGIN.t - this.below;
+      const wide = this.div.clientWidth - this.left - MARGIN.r, high = this.div.clientHeight - MARGIN.t - this.below;
       const text = layer.words.map((word, i) => {
         const at = (layer.x[i] - x0) / (x1 - x0) * wide, y = (layer.y[i] - y0) / (y1 - y0) * high;
-        const x = layer.place === "on" ? at - 3.5 * word.length : at + 8, end = x + 7 * word.length;
+        const x = layer.place === "on" ? at - 3.5 * word.length : at + 8, end = x + 7 * word.length + 4;
         if (at < 0 || at > wide || y < 0 || y > high || taken.some(t => x < t[1] && end > t[0] && Math.abs(y - t[2]) < 15)) return "";
         taken.push([x, end, y]);
         return word.replace(/\n/g, "<br>");
@@ -370,14 +379,18 @@
     const out = [90, 60, 30].map(r => svg("circle", { class: "grid", r }));
     out.push(svg("path", { class: "grid", d: "M-90 0H90M0-90V90" }));
     for (const [name, x, y] of [["N", 0, -95], ["E", 96, 2], ["S", 0, 99], ["W", -96, 2]]) out.push(svg("text", { x, y, "text-anchor": "middle" }, name));
-    const taken = [];
+    const at = one => { const turn = one.azimuth * Math.PI / 180, away = 90 - one.elevation; return [away * Math.sin(turn), -away * Math.cos(turn)]; };
+    // Each label has the place next to its satellite where it covers the fewest other labels and satellites.
+    const taken = satellites.map(one => { const [x, y] = at(one); return [x - 2.5, y + 2, 5]; });
     for (const one of satellites) {
-      const turn = one.azimuth * Math.PI / 180, away = 90 - one.elevation, x = away * Math.sin(turn), y = -away * Math.cos(turn);
+      const [x, y] = at(one);
       const group = svg("g", { class: one.used ? "used" : "left-out" }), name = one.name + (one.cn0 === one.cn0 ? " " + one.cn0.toFixed(0) : "");
       group.append(svg("title", {}, `${name}: ${one.reason}`));
       group.append(one.used ? svg("circle", { cx: x, cy: y, r: 2.4 }) : svg("path", { d: `M${x - 2} ${y - 2}l4 4m0-4l-4 4` }));
-      const wide = 3.1 * name.length, places = [[x + 4, y + 2], [x - 4 - wide, y + 2], [x - wide / 2, y - 4], [x - wide / 2, y + 8]];
-      const place = places.find(p => taken.every(t => p[0] > t[0] + t[2] || p[0] + wide < t[0] || Math.abs(p[1] - t[1]) > 5)) || places[0];
+      const wide = 3.3 * name.length, left = x - 4 - wide, middle = x - wide / 2, right = x + 4;
+      const places = [[right, y + 2], [left, y + 2], [middle, y - 4], [middle, y + 8], [right, y - 3], [right, y + 7], [left, y - 3], [left, y + 7], [middle, y - 9], [middle, y + 13]];
+      const covered = p => taken.filter(t => p[0] < t[0] + t[2] && p[0] + wide > t[0] && Math.abs(p[1] - t[1]) < 5.5).length + (Math.abs(middle) + wide / 2 > 106 && Math.abs(p[0] + wide / 2) + wide / 2 > 106 ? 1 : 0);
+      const place = places.reduce((best, p) => covered(p) < covered(best) ? p : best);
       taken.push([place[0], place[1], wide]);
       group.append(svg("text", { x: place[0], y: place[1] }, name));
       out.push(group);
