@@ -15,7 +15,7 @@ from railfix.cli import app
 from railfix.cli.console import join_antennas, verdict_of_evaluation
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.run.record import read_record
-from railfix.run.verdict import judge_run
+from railfix.run.verdict import AntennaVerdict, PositionFigures, judge_run
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
 pytestmark = pytest.mark.requirement("G4")
@@ -72,22 +72,22 @@ def test_each_figure_is_the_same_on_the_terminal_in_python_in_json_and_on_the_re
     desk: Desk, lines: list[str], tmp_path: Path
 ) -> None:
     """Every card of the report has the name and value of the verdict, and the terminal states the same value."""
-    record = read_record(desk.folder / "new").record
-    verdict = judge_run(record)
-    again = json.loads(json.dumps(verdict.as_dict()))
-    out = tmp_path / "report.html"
-    printed(desk, f"report {{desk}}/new --out {out}")
-    page = out.read_text(encoding="utf-8")
+    verdict = judge_run(read_record(desk.folder / "new").record)
+    printed(desk, f"report {{desk}}/new --out {tmp_path}/report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
     keys = page[page.index('<dl class="keys">') : page.index("</dl>")]
     cards = re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>(?:<dd class=\"single\">single epochs (.*?)</dd>)?", keys)
-    front = verdict.antennas[0]
-    assert cards == list(front.figures())
-    assert front.filter is not None
-    assert f"{front.level_name} {front.filter.level_p50_m:.1f} m" in lines[0]
-    assert again["antennas"][0]["filter"]["level_p50_m"] == front.filter.level_p50_m
-    assert again["antennas"][0]["single_epochs"]["level_p50_m"] == front.single_epochs.level_p50_m
-    # the filter's level and that of single epochs differ: a card that exchanged them would be seen
-    assert front.filter.level_p50_m != front.single_epochs.level_p50_m
+    again = json.loads(json.dumps(verdict.as_dict()))["antennas"][0]
+    kinds = {kind: PositionFigures(**again.pop(kind)) for kind in ("filter", "single_epochs")}
+    assert cards == list(AntennaVerdict(**again, **kinds).figures()) == list(verdict.antennas[0].figures())
+    positions, _, sigma, level = (value for _, value, _ in cards)
+    assert f"a position in {positions} epochs" in lines[0]
+    assert f"; sigma {sigma} at" in lines[0]
+    assert f"; {cards[3][0].split(',')[0]} {level} at" in lines[0]
+    passed = {kind: sum(getattr(of, kind).passed for of in verdict.antennas) for kind in kinds}
+    assert f"single epochs: {passed['single_epochs']:,} of" in lines[2]
+    assert sum(int(n) for n in re.findall(r"(\d+) epochs (?:tracking|coasting)", lines[3])) == passed["filter"]
+    assert all(value != single for name, value, single in cards if name.endswith("median"))
 
 
 def test_notes_that_do_not_fit_are_counted_and_shown_on_request(desk: Desk, lines: list[str]) -> None:

@@ -47,7 +47,7 @@ def test_errors_of_the_runs_and_the_worst_epoch(tmp_path: Path) -> None:
     assert failed.rows == [["C", "front.obs: <no log>"]]
     first = dict(zip(worst.head, worst.rows[0], strict=True))
     assert (first["run"], first["error m"], first["level m"]) == ("B", "+70.00", "20.00")
-    assert first["time, GPS"] == "2024-03-05 01:02:30.000"
+    assert first["GPS time"] == "2024-03-05 01:02:30.000"
     assert "--at '2024-03-05 01:02:30' --antenna front" in first["command to explain"]
     assert [chart.name for chart in found.charts] == ["campaign-plan", "campaign-error", "campaign-level"]
     assert any(layer.label == "error 10 m and more" and len(layer.x) == 1 for layer in found.charts[0].layers)

@@ -75,12 +75,8 @@ async def centre_page() -> str:
 def site(folder: Path) -> Path:
     """Home page of the documentation, without the pages of the interface and the gallery's results."""
     pytest.importorskip("pydata_sphinx_theme")
-    plain = [
-        "-D",
-        "extensions=myst_parser,sphinx_design,sphinx.ext.autodoc",
-        "-D",
-        "exclude_patterns=_templates,gallery,api*,auto_examples",
-    ]
+    plain = ["-D", "extensions=myst_parser,sphinx_design,sphinx.ext.autodoc"]
+    plain += ["-D", "exclude_patterns=_templates,gallery,api*,auto_examples"]
     command = [sys.executable, "-m", "sphinx", "-b", "html", "-q", *plain, "-d", str(folder / "trees")]
     subprocess.run([*command, str(ROOT / "docs"), str(folder / "site")], capture_output=True, check=True)
     return folder / "site" / "index.html"
@@ -114,6 +110,7 @@ def test_pages_can_be_read_by_everyone_at_every_width(
     assert [fault["id"] for fault in found if fault["impact"] in GRAVE] == []
     assert shown.evaluate("document.documentElement.scrollWidth") == width
     assert errors == []
+    assert width == 390 or shown.pdf().startswith(b"%PDF")
     context.close()
 
 
@@ -128,25 +125,16 @@ def test_a_fault_of_accessibility_would_be_found(pages: dict[str, Path], chromiu
     context.close()
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_pages_print(pages: dict[str, Path], chromium: Any, name: str) -> None:
-    shown = chromium.new_page()
-    shown.goto(pages[name].resolve().as_uri())
-    assert shown.pdf().startswith(b"%PDF")
-    shown.close()
-
-
-#: The first choice of an epoch, then clicks on the button for the next one: time until the window has drawn each [ms].
-DRAWN = "await new Promise(done => requestAnimationFrame(() => setTimeout(done)));"
-FIRST = f"""async plot => {{ const began = performance.now();
-    plot.dispatchEvent(new KeyboardEvent("keydown", {{ key: "Enter", bubbles: true }}));
-    {DRAWN}
-    return performance.now() - began; }}"""
-CLICKS = f"""async () => {{ const times = [], button = document.querySelector(".skyplot.docked .after");
-    for (let k = 0; k < 20; k++) {{ const began = performance.now(); button.click();
-        {DRAWN}
-        times.push(performance.now() - began); }}
-    return times; }}"""
+#: Notes the time from the end of each click and from each key until the window has drawn the panel [ms].
+WATCH = """() => { window.times = []; window.said = []; const watch = async event => { const began = event.timeStamp;
+    await new Promise(done => requestAnimationFrame(() => setTimeout(done)));
+    times.push(performance.now() - began); said.push(document.querySelector(".skyplot.docked output").textContent); };
+    addEventListener("mouseup", watch, true); addEventListener("keydown", watch, true); }"""
+#: Pixel of a point of the filter, by its fraction of the points of the chart.
+POINT = """(div, share) => { const p = div.parentNode.plot, r = div.getBoundingClientRect(), a = div._fullLayout,
+    l = p.chart.layers.find(l => l.label === "filtered along the track"), i = Math.floor(share * l.x.length),
+    t = p.traces()[p.layers.indexOf(l)];
+    return [r.left + a.margin.l + a.xaxis.c2p(t.x[i]), r.top + a.margin.t + a.yaxis.c2p(t.y[i])]; }"""
 
 
 def test_a_click_answers_within_100_ms_on_an_hour_at_10_hz(tmp_path: Path, chromium: Any) -> None:
@@ -156,11 +144,21 @@ def test_a_click_answers_within_100_ms_on_an_hour_at_10_hz(tmp_path: Path, chrom
     shown.set_default_timeout(180_000)
     shown.goto(page.resolve().as_uri())
     shown.wait_for_timeout(3_000)  # the first charts are drawn
-    first = shown.locator("figure[data-name=error-chainage] .plot").first.evaluate(FIRST)
-    shown.locator(".skyplot.docked").wait_for(state="visible")
-    shown.wait_for_timeout(3_000)  # the charts have made room for the panel
-    times = shown.evaluate(CLICKS)
-    print(json.dumps({"first ms": round(first, 1), "click ms": [round(t, 1) for t in times]}))
-    assert np.median(times) < 100.0
-    assert first < max(100.0, 3.0 * np.median(times)), "a busy machine slows all of them"
+    shown.evaluate(WATCH)
+    chart = shown.locator("figure[data-name=error-chainage] .plot").first
+    for k in range(20):
+        shown.mouse.click(*chart.evaluate(POINT, (k + 0.5) / 20))
+        shown.wait_for_timeout(3_000 if k == 0 else 700)  # the charts have made room for the panel; no double click
+    chart.focus()
+    for _ in range(20):
+        shown.keyboard.press("ArrowRight")
+        shown.wait_for_timeout(100)
+    times, said, load = shown.evaluate("[times, said, +document.getElementById('railfix-timing').dataset.load]")
+    kinds = {"first click": times[:1], "clicks": times[1:20], "keys": times[20:]}
+    found = {name: (round(float(np.median(t)), 1), round(max(t), 1)) for name, t in kinds.items()}
+    print(json.dumps({"MB": round(page.stat().st_size / 1e6, 2), "load ms": load, "median and largest ms": found}))
+    assert len(set(said)) > 30, "clicks and keys choose other epochs"
+    assert times[0] < max(100.0, 3.0 * np.median(times[1:20])), "a busy machine slows all of them"
+    assert np.median(times[1:20]) < 100.0
+    assert np.median(times[20:]) < 100.0
     shown.close()

@@ -191,7 +191,7 @@ def test_the_terminal_and_the_page_show_the_same_tables(document: str, evaluatio
     names = ["figures-of-merit", "intervals", "stanford-separation", "above-level-separation"]
     assert set(names) <= {table.name for table in tables}
     for table in tables:
-        assert f'<table data-name="{table.name}">' in document
+        assert (f'<table data-name="{table.name}">' in document) == bool(table.rows)
         for row in table.rows:
             cells = [f'{mark}">{cell}</td>' for mark, cell in zip(["n"] * len(row), row, strict=True)]
             assert [k for k in table.numeric if cells[k] not in document] == []
@@ -251,10 +251,10 @@ def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> Non
     )
     assert len(over) > 20
     assert (
-        f"Errors above the level (separation): {len(over):,}, of which {len(usable):,} at a usable level; the 20 "
-        "largest" in document
+        f"Errors above the level (single epochs, separation): {len(over):,}, of which {len(usable):,} at a usable "
+        "level; the 20 largest" in document
     )
-    listed = document.split("Errors above the level (separation)")[1].split("</table>")[0]
+    listed = document.split("Errors above the level (single epochs, separation)")[1].split("</table>")[0]
     assert listed.count("<tr>") == 1 + 20
     worst = over.select(size=(pl.col("chainage_m") - pl.col("true_m")).abs()).max().item()
     assert f"{worst:.2f}</td>" in listed.split("<tr>")[2]
@@ -320,6 +320,10 @@ def test_every_card_has_the_figure_of_the_evaluation_and_of_the_verdict(folder: 
         figures = {name: (value, single) for name, value, single in verdict.figures()}
         assert {name: figures[name] for name in cards} == {name: card[:2] for name, card in cards.items()}
         assert len(cards) == 2
+    # without a single epoch that passed, the cards have the errors of the filter
+    table = pl.read_parquet(tmp_path / "run" / "positions.parquet").with_columns(status=pl.lit("uncertain"))
+    table.write_parquet(tmp_path / "run" / "positions.parquet")
+    assert cards_of(report_page(*read_runs([tmp_path / "run"], [demo_truth()])))["largest error"][1] == "–"
 
 
 def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) -> None:
@@ -391,7 +395,7 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     ].item()
     beyond = len(evaluation.integrity["train"].beyond.filter(pl.col("usable"), antenna="front"))
     assert f"<dd>{level:.1f} m</dd>" in document
-    assert f"; of the filter: {beyond:,}</dd>" in document
+    assert f">errors above usable levels: filter {beyond:,}, single" in document
     assert "Stanford diagram, usable levels (filter along the track)" in document
     assert "filter-stanford-train" in document
 

@@ -347,7 +347,7 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
         parts=pl.concat_str(*parts, separator=" / "),
     )
     columns: list[Column] = [
-        ("time, GPS", "time_gpst", str), *_where(beyond), ("environment", "environment", str),
+        ("GPS time", "time_gpst", str), *_where(beyond), ("environment", "environment", str),
         ("set by", f"{kind}_cause", str), ("verdict", f"{kind}_status", str), ("status", "status", str),
         ("usable", "usable", str), ("chainage m", "chainage_m", count), ("error m", "error_m", signed),
         ("level m", f"{kind}_level_m", number), ("no fault / one / two m", "parts", _text),

@@ -176,7 +176,7 @@ def _worst(pieces: pl.DataFrame, quantity: str, out: Path) -> Table:
         *absent,
     )
     columns: list[Column] = [
-        ("run", "run", str), ("antenna", "antenna", str), ("time, GPS", "time_gpst", str), ("status", "status", str),
+        ("run", "run", str), ("antenna", "antenna", str), ("GPS time", "time_gpst", str), ("status", "status", str),
         ("chainage m", "chainage_m", count), ("error m", "error_m", signed), ("sigma m", "along_sigma_m", number),
         ("level m", "protection_level_m", number), ("command to explain", "command", str),
     ]  # fmt: skip
@@ -205,7 +205,8 @@ def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[s
         f"{len(done):,} of {plural(whole, 'run')} done, with {int(done['epochs'].sum() or 0):,} epochs of all antennas"
     ]
     if failed:
-        lines.append(f"{plural(failed, 'run')} failed; the first: {whole.filter(status='failed')['error'][0]}")
+        first = "" if failed == 1 else "; the first"
+        lines.append(f"{plural(failed, 'run')} failed{first}: {whole.filter(status='failed')['error'][0]}")
     if quantity:
         worst = done.sort(f"{quantity}_p95", descending=True, nulls_last=True).row(0, named=True)
         word = {"error_m": "error", "protection_level_m": "level", "along_sigma_m": "standard deviation"}[quantity]

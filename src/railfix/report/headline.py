@@ -14,6 +14,7 @@ from railfix.evaluate import Evaluation
 from railfix.evaluate.accuracy import PASSED
 from railfix.evaluate.evaluation_inputs import floats
 from railfix.report.runs import ReportedRun, get_figures
+from railfix.run.verdict import PASSED as PASSED_CHECKS
 from railfix.run.verdict import POSITIONS, judge_run
 
 
@@ -41,9 +42,11 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
     """Return the headline of one antenna of a run; the figures are errors if the run has a reference."""
     if evaluation is not None:
         passed = get_figures(evaluation, run, antenna, "constrained_ok")
-        if passed.get("errors"):
+        filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
+        if passed.get("errors") or filtered.get("errors"):
             return _with_errors(run, antenna, evaluation, passed)
-    return _without_errors(run, antenna)
+    unknown = "--reference" if evaluation is None else "no position that passed every check has a reference"
+    return _without_errors(run, antenna, f"Errors are not known without a reference ({unknown}).")
 
 
 def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> Headline:
@@ -51,17 +54,20 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
     other = get_figures(evaluation, run, antenna, "conventional")
     filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
     whose = "Single epochs have" if filtered else "The train has"
-    verdict = (
-        f"{whose} a position on the line that passed every check in {share(passed['rate'], 1)} of the epochs with "
-        f"satellite signals; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and the "
-        f"largest is {number(passed['max_m'], 1)} m (conventional positions: {number(other.get('p95_m'), 1)} m and "
-        f"{number(other.get('max_m'), 1)} m)."
-    )
+    passing = "No single-epoch position with a reference passed every check."
+    if passed.get("errors"):
+        passing = (
+            f"{whose} a position on the line that passed every check in {share(passed['rate'], 1)} of the epochs with "
+            f"satellite signals; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and "
+            f"the largest is {number(passed['max_m'], 1)} m (conventional positions: {number(other.get('p95_m'), 1)} m "
+            f"and {number(other.get('max_m'), 1)} m)."
+        )
+    verdict = passing
     if filtered:
         verdict = (
             f"The filter along the track has a position in {share(filtered['rate'], 1)} of all epochs, including those "
             f"without satellites; 95 % of its errors are below {number(filtered['p95_m'], 1)} m, and the largest is "
-            f"{number(filtered['max_m'], 1)} m. {verdict}"
+            f"{number(filtered['max_m'], 1)} m. {passing}"
         )
     texts: dict[str, Callable[[Mapping[str, Any]], str]] = {
         "median error": lambda of: number(of.get("p50_m"), 2, " m"),
@@ -93,6 +99,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
             "conventional positions at the same epochs."
         ),
         remarks=(
+            *(() if passed.get("errors") else (_count_passed(stated),)),
             *(_longest_outage(run, antenna, evaluation) if filtered else ()),
             *_larger_error(passed, other),
             *_describe_marked(run.get_errors(antenna)),
@@ -125,6 +132,15 @@ def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed
     return f"errors above usable levels: {', '.join(counts)}"
 
 
+def _count_passed(stated: Mapping[str, KeyFigure]) -> str:
+    """Return a sentence on the number of positions that passed every check."""
+    passed = stated[PASSED_CHECKS]
+    text = f"{passed.value} single epochs" if not passed.filtered else (
+        f"{passed.filtered} epochs of the filter and {passed.value} single epochs"
+    )  # fmt: skip
+    return f"{text} passed every check."
+
+
 def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:
     """Yield a sentence on the errors of the filter in the longest stretch without satellites, if there is one."""
     if evaluation.outages is not None:
@@ -141,7 +157,7 @@ def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> I
 
 def _larger_error(passed: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Return a sentence if the largest error on the map exceeds the largest error of conventional positions."""
-    if not other.get("errors") or passed["max_m"] <= other["max_m"]:
+    if not other.get("errors") or not passed.get("errors") or passed["max_m"] <= other["max_m"]:
         return []
     return [
         f"The largest error on the map, {number(passed['max_m'], 1)} m at chainage "
@@ -166,7 +182,7 @@ def _describe_marked(errors: pl.DataFrame | None) -> list[str]:
     ]
 
 
-def _without_errors(run: ReportedRun, antenna: str) -> Headline:
+def _without_errors(run: ReportedRun, antenna: str, compared: str) -> Headline:
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None or not found.leading.positions or found.leading.sigma_p95_m is None:
         text = "No epoch has a position on the line."
@@ -180,6 +196,6 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
     return Headline(
         verdict=text,
         figures=tuple(_verdict_figures(run, antenna).values()),
-        compared="Errors are not known without a reference (--reference).",
+        compared=compared,
         remarks=(),
     )

@@ -64,7 +64,7 @@ class AntennaVerdict:
         texts: dict[str, Callable[[PositionFigures], str]] = {
             POSITIONS: lambda of: f"{count(of.positions)} of {count(of.epochs)}",
             PASSED: lambda of: f"{count(of.passed)} of {count(of.epochs)}",
-            SIGMA: lambda of: number(of.sigma_p50_m, 2, " m"),
+            SIGMA: lambda of: number(of.sigma_p50_m, 1, " m"),
             f"{self.level_name}, median": lambda of: number(of.level_p50_m, 1, " m"),
         }
         for name, text in texts.items():

@@ -146,16 +146,17 @@
     const chart = this.load(), t = theme(), half = this.figure.classList.contains("half");
     const names = chart.layers.find(layer => layer.kind === "ranges"), labels = new Set(chart.layers.map(layer => layer.label).filter(Boolean));
     const base = names ? 110 + 26 * names.names.length : chart.equal ? (half ? 360 : 500) : half ? 320 : 350;
-    // The number of rows of the legend below the axis is estimated from the number of letters of its entries.
     const width = printing ? PRINTED[half ? "half" : "wide"] : this.div.clientWidth;
-    const row = Math.max(20, (width - MARGIN.l - MARGIN.r) / 6.6), letters = [...labels].map(label => 8 + label.length);
-    this.below = MARGIN.b + 21 * letters.reduce(([rows, used], wide) => used + wide > row ? [rows + 1, wide] : [rows, used + wide], [letters.length ? 1 : 0, 0])[0];
-    const height = base + this.below - MARGIN.b;
     // A title that is longer than its axis has two lines, and the margin one line more.
     const high = base - MARGIN.t - MARGIN.b, long = 7 * chart.y_label.length > high, middle = chart.y_label.length / 2;
     const gaps = [...chart.y_label.matchAll(/ /g)].map(found => found.index).sort((a, b) => Math.abs(a - middle) - Math.abs(b - middle));
     const yTitle = long && gaps.length ? chart.y_label.slice(0, gaps[0]) + "<br>" + chart.y_label.slice(gaps[0] + 1) : chart.y_label;
-    this.left = MARGIN.l + (yTitle === chart.y_label ? 0 : 17);
+    const widest = names ? Math.max(...names.names.map(name => name.length)) : 0;
+    this.left = names ? Math.max(MARGIN.l, Math.min(14 + 6.6 * widest, width / 2)) : MARGIN.l + (yTitle === chart.y_label ? 0 : 17);
+    // The number of rows of the legend below the axis is estimated from the number of letters of its entries.
+    const row = Math.max(20, (width - this.left - MARGIN.r) / 6.6), letters = [...labels].map(label => 8 + label.length);
+    this.below = MARGIN.b + 21 * letters.reduce(([rows, used], wide) => used + wide > row ? [rows + 1, wide] : [rows, used + wide], [letters.length ? 1 : 0, 0])[0];
+    const height = base + this.below - MARGIN.b;
     const axis = { gridcolor: t.grid, linecolor: t.axis, zeroline: false, showline: true, mirror: true, exponentformat: "none", separatethousands: true,
       minorloglabels: "complete" };
     const x = { ...axis, title: { standoff: 4, text: chart.start === undefined ? chart.x_label : `${chart.x_label}, ${date(chart.start)}` } };
@@ -166,11 +167,11 @@
     if (chart.y_scale === "symlog") Object.assign(y, symlogTicks(chart));
     if (chart.y_range) y.range = [...ordinate(chart, chart.y_range)];
     if (chart.equal) Object.assign(y, { scaleanchor: "x", scaleratio: 1 });
-    if (names) Object.assign(y, { tickmode: "array", tickvals: names.names.map((_, i) => i), ticktext: names.names, autorange: "reversed", automargin: true });
+    if (names) Object.assign(y, { tickmode: "array", tickvals: names.names.map((_, i) => i), ticktext: names.names, autorange: "reversed" });
     return { height, width: width || undefined, margin: { ...MARGIN, l: this.left, b: this.below }, paper_bgcolor: t.paper,
       plot_bgcolor: t.paper, font: { family: FONT, size: 12, color: t.ink }, xaxis: x, yaxis: y, hovermode: "closest", dragmode: "zoom",
       barmode: "overlay", legend: { orientation: "h", x: 0, yref: "container", y: 0, yanchor: "bottom", itemsizing: "constant", tracegroupgap: 0 }, shapes: this.chosenShapes(),
-      uirevision: "kept", annotations: chart.equal ? [{ text: "N\u2191", xref: "paper", yref: "paper", x: 0.99, y: 0.98, showarrow: false }] : [] };
+      uirevision: "kept", annotations: chart.equal ? [{ text: "N\u2191", xref: "paper", yref: "paper", x: 0.99, y: 0.98, showarrow: false, bgcolor: t.paper }] : [] };
   };
   Plot.prototype.draw = function () {
     const traces = this.traces(), drawn = Boolean(this.figure.dataset.drawn);
@@ -199,7 +200,7 @@
     });
     new ResizeObserver(() => { // the number of rows of the legend depends on the width
       const wide = this.div.clientWidth, layout = this.layout();
-      if (!printing && wide && this.div.layout.width !== wide) Plotly.relayout(this.div, { width: wide, height: layout.height, "margin.b": this.below });
+      if (!printing && wide && this.div.layout.width !== wide) Plotly.relayout(this.div, { width: wide, height: layout.height, "margin.b": this.below, "margin.l": this.left });
     }).observe(this.div);
     this.div.addEventListener("keydown", event => {
       const sky = skies[this.figure.dataset.sky], step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
