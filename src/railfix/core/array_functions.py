@@ -11,12 +11,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 
 def masked_median(values: Floats, known: Masks) -> Floats:
     """Return the median of the known values of each row, shape (T,); NaN for a row without known values."""
-    if not values.shape[1]:
-        return np.full(len(values), np.nan)
-    ordered, count = np.sort(np.where(known, values, np.inf), axis=1), known.sum(axis=1)
-    rows = np.arange(len(values))
-    low, high = ordered[rows, np.maximum(count - 1, 0) // 2], ordered[rows, np.minimum(count // 2, values.shape[1] - 1)]
-    return np.where(count > 0, 0.5 * (low + high), np.nan)
+    return medians(np.where(known, values, np.nan))
 
 
 def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
@@ -38,11 +33,17 @@ def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]
 
 def medians(values: Floats) -> Floats:
     """Return the medians along the last axis, ignoring NaN; NaN if all values are NaN."""
+    low, high = middle_values(values)
+    return np.asarray((low + high) / 2.0)
+
+
+def middle_values(values: Floats) -> tuple[Floats, Floats]:
+    """Return the lower and the upper median along the last axis, ignoring NaN; NaN if all values are NaN."""
     *shape, width = values.shape
     if not width:
-        return np.full(shape, np.nan)
+        return np.full(shape, np.nan), np.full(shape, np.nan)
     rows = values.reshape(-1, width).copy()
     rows.sort()  # NaN last
     count, row = (rows == rows).sum(axis=1), np.arange(len(rows))
     low, high = rows[row, np.maximum(count - 1, 0) // 2], rows[row, np.minimum(count // 2, width - 1)]
-    return np.asarray((low + high) / 2.0).reshape(shape)
+    return low.reshape(shape), high.reshape(shape)

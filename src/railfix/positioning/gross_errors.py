@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from railfix.core.array_functions import medians, middle_values
 from railfix.core.arrays import Floats, Integers, Masks, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
@@ -73,16 +74,8 @@ def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
     residual = normal_equations(even, np.nan_to_num(place_ecef_m)).residual_m
     value = np.where(ranges.weight > 0, residual, np.nan)
     for group in ranges.groups:
-        value[:, group] -= _median(value[:, group])[:, None]
+        value[:, group] -= np.nan_to_num(medians(value[:, group]))[:, None]
     return value
-
-
-def _median(values: Floats) -> Floats:
-    """Return the median of each row, NaN ignored, shape (T,); 0 for a row of NaN only."""
-    some = np.isfinite(values).any(axis=1)
-    middle = np.zeros(len(values))
-    middle[some] = np.nanmedian(values[some], axis=1)
-    return middle
 
 
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
@@ -97,7 +90,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     gross = np.abs(residual) > GROSS_M
     rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
     located = np.isfinite(place[:, 0])
-    agree = _median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M
+    agree = np.nan_to_num(medians(np.abs(np.where(gross, np.nan, residual)))) < AGREEING_M
     clear = (rest.space_redundancy >= _LEFT_IN_SPACE) & agree & located
     found = gross & clear[:, None]
     few = np.flatnonzero(gross.any(axis=1) & ~clear & located & (ranges.space_redundancy >= 2))
@@ -153,7 +146,7 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     place = least_absolute(ranges, start_ecef_m)
     white = np.abs(residuals_at(ranges, place)) * np.sqrt(ranges.weight)
     freedom = ranges.space_redundancy
-    spread = _median(white) * np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN
+    spread = np.nan_to_num(medians(white)) * np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN
     found = white > _DISAGREE * np.maximum(1.0, spread)[:, None]
     rest = replace(ranges, weight=np.where(found, 0.0, ranges.weight))
     enough = (rest.space_redundancy >= _LEFT_IN_SPACE) & np.isfinite(place[:, 0])
@@ -212,7 +205,7 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
         rival = np.where(others, cost, np.inf).min(axis=1)
         clear[rows] = rival - own[each, best] > _CLEAR * GROSS_M
     rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
-    agree = _median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M
+    agree = np.nan_to_num(medians(np.abs(np.where(gross, np.nan, residual)))) < AGREEING_M
     return LineScan(arc, gross, np.where(agree, rest.redundancy, 0), clear)
 
 
@@ -229,32 +222,21 @@ def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
     square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
     turn = satellite[:, None, :, 0] * place_ecef_m[..., 1, None] - satellite[:, None, :, 1] * place_ecef_m[..., 0, None]
     value = ranges.code_m[:, None] - np.sqrt(square) - EARTH_ROTATION_RATE / SPEED_OF_LIGHT * turn
-    value = np.where(used[:, None], value, np.inf)
+    value = np.where(used[:, None], value, np.nan)
     near = np.zeros(value.shape, dtype=np.bool_)
-    for middle in _medians(value):
-        near |= np.abs(value - middle) < _CLOCKS_APART_M
+    for middle in middle_values(value):
+        near |= np.abs(value - middle[..., None]) < _CLOCKS_APART_M
     for group in ranges.groups:
         some = near[..., group].any(axis=2, keepdims=True)
-        counted = np.where(near[..., group] | ~some, value[..., group], np.inf)
-        low, high = _medians(counted)
+        counted = np.where(near[..., group] | ~some, value[..., group], np.nan)
+        low, high = (middle[..., None] for middle in middle_values(counted))
         best = value[..., group] - 0.5 * (low + high)
         for clock in (low, high):
             other = value[..., group] - clock
             better = _capped_cost(other) < _capped_cost(best) - _CLEAR * GROSS_M
             best = np.where(better[..., None], other, best)
         value[..., group] = best
-    return np.asarray(np.where(used[:, None], value, np.nan))
-
-
-def _medians(value: Floats) -> tuple[Floats, Floats]:
-    """Return the lower and the upper median of the finite values along the last axis, which is kept with length 1.
-
-    Both are 0 where no value is finite.
-    """
-    ordered = np.sort(value, axis=-1)
-    n = np.isfinite(value).sum(axis=-1, keepdims=True)
-    low, high = (np.take_along_axis(ordered, np.maximum(k, 0), axis=-1) for k in ((n - 1) // 2, n // 2))
-    return np.where(n > 0, low, 0.0), np.where(n > 0, high, 0.0)
+    return np.asarray(value)
 
 
 def _capped_cost(residual_m: Floats) -> Floats:
