@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,6 +83,20 @@ def test_smoothed_places_are_those_of_one_dense_solution() -> None:
     arc, sigma = _dense(trace)
     np.testing.assert_allclose(result.arc_m, arc, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(result.sigma_m, sigma, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.requirement("E5")
+def test_a_larger_ionospheric_error_widens_the_sigma_as_in_the_filter() -> None:
+    """At the last epoch, without later measurements, the sigma is the filter's; positions do not change."""
+    case, found = ride(30, noise=1.0, seed=7), {}
+    for scale in (1.0, 3.0):
+        trace: list[Step] = []
+        epochs = replace(case.epochs, tilt_scale=np.full(30, scale))
+        filtered, _ = track(epochs, case.line, trace=trace)
+        found[scale], _ = smooth_steps(trace, TrackState(), None, LIMITS)
+        np.testing.assert_allclose(found[scale].sigma_m[-1], filtered.sigma_m[-1], rtol=1e-9)
+    np.testing.assert_array_equal(found[1.0].arc_m, found[3.0].arc_m)
+    assert (found[3.0].sigma_m > 1.5 * found[1.0].sigma_m).all()
 
 
 @pytest.mark.requirement("E5")

@@ -36,6 +36,7 @@ class Step:
     #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     splits: list[SplitHypothesis | None] | None = None  #: `Sought.splits`.
+    tilt_scale: float = 1.0  #: `GnssEpochs.tilt_scale`.
 
 
 class Recursion:
@@ -109,7 +110,8 @@ class Recursion:
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
         """Return the record of an epoch for the smoother, without hypotheses."""
-        return Step(dt=float(self.chunk.epoch["interval_s"][epoch]), satellite=state.satellite)
+        own = self.chunk.epoch[epoch]
+        return Step(dt=float(own["interval_s"]), satellite=state.satellite, tilt_scale=float(own["tilt_scale"]))
 
 
 def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:

@@ -78,7 +78,7 @@ class Smoothed:
 def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
-    """Smooth the positions of a chunk (adjoint smoother: G. J. Bierman, 1973).
+    """Return the smoothed positions of a chunk, and the information for the previous chunk (G. J. Bierman, 1973).
 
     Parameters
     ----------
@@ -89,12 +89,6 @@ def smooth_steps(
     later : BackwardInformation or None
         Information from the next chunk; None for the last chunk.
     limits : TrackingLimits
-
-    Returns
-    -------
-    Smoothed
-    BackwardInformation
-        Information for the previous chunk.
     """
     size = len(steps)
     satellite = steps[-1].satellite if size else before.satellite
@@ -112,7 +106,7 @@ def smooth_steps(
             continue
         mean, covariance = step.mean[index], step.covariance[index]
         row = covariance[ix.ARC]
-        variance = row[ix.ARC] - row @ matrix @ row
+        variance = row[ix.ARC] - row @ matrix @ row + _ionosphere_m2(step, index, vector, matrix, limits.slow_code_m)
         if covariance[ix.ARC, ix.ARC] <= constants.EXPIRED_SIGMA_M**2:
             arc[t], sigma[t] = mean[ix.ARC] + row @ vector, np.sqrt(max(variance, 0.0))
             speed[t] = mean[ix.SPEED] + covariance[ix.SPEED] @ vector
@@ -129,15 +123,19 @@ def smooth_steps(
         vector, matrix, index = move.T @ vector, move.T @ matrix @ move, parent
     place = float(before.mean[index, ix.ARC]) if len(before.mean) > index else float("nan")
     known = len(before.satellite)
-    return (
-        Smoothed(arc_m=arc, sigma_m=sigma, speed_mps=speed),
-        BackwardInformation(
-            place_m=place,
-            vector=vector[: ix.SATELLITES + known],
-            matrix=matrix[: ix.SATELLITES + known, : ix.SATELLITES + known],
-            satellite=before.satellite,
-        ),
-    )
+    return Smoothed(arc_m=arc, sigma_m=sigma, speed_mps=speed), BackwardInformation(
+        place_m=place, vector=vector[: ix.SATELLITES + known],
+        matrix=matrix[: ix.SATELLITES + known, : ix.SATELLITES + known], satellite=before.satellite,
+    )  # fmt: skip
+
+
+def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: float) -> float:
+    """Return the variance along the line by which an epoch's ionospheric error exceeds a quiet ionosphere's [m^2]."""
+    both = step.covariance[h][[ix.ARC, ix.SLOW_CODE]]
+    P = both[:, [ix.ARC, ix.SLOW_CODE]] - both @ matrix @ both.T
+    less = (1.0 - max(step.tilt_scale, 1.0) ** -2) / quiet_m**2
+    gain = P[0, 1] * less / (1.0 - less * P[1, 1])  # as `widen_slow_code` of the filter
+    return float(gain * P[0, 1] + (gain * (step.mean[h, ix.SLOW_CODE] + both[1] @ vector)) ** 2)
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
