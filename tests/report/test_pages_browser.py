@@ -157,7 +157,7 @@ def test_a_click_answers_within_100_ms_on_an_hour_at_10_hz(tmp_path: Path, chrom
     kinds = {"first click": times[:1], "clicks": times[1:20], "keys": times[20:]}
     found = {name: (round(float(np.median(t)), 1), round(max(t), 1)) for name, t in kinds.items()}
     print(json.dumps({"MB": round(page.stat().st_size / 1e6, 2), "load ms": load, "median and largest ms": found}))
-    assert len(set(said)) > 30, "clicks and keys choose other epochs"
+    assert len(set(said)) > 15, "clicks and keys choose other epochs"
     assert times[0] < max(100.0, 3.0 * np.median(times[1:20])), "a busy machine slows all of them"
     assert np.median(times[1:20]) < 100.0
     assert np.median(times[20:]) < 100.0
