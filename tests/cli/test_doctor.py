@@ -124,7 +124,7 @@ def test_networks_orbits_and_maps_without_heights_are_no_problem(desk: Path, tmp
     assert found.findings[2].facts[:3] == (
         "5 points, 228 m",
         "without heights: the heights of the log's own positions are used (--heights log)",
-        "a network of 2 tracks, of which a run finds the route",
+        "a network of 2 tracks, in which a run finds the route",
     )
     assert all("km from the position in the header" in problem for problem in found.problems)
     assert "--heights log" in found.command

@@ -34,7 +34,7 @@ def test_from_a_log_to_a_report_in_six_commands(
         doctors = command.startswith("doctor")  # it finds that there is no map
         assert done.exit_code == (5 if doctors else 0), f"{command}: {done.output}"
         told.append(" ".join(done.output.split()))
-    assert "no track map: railfix map survey makes one from runs over the line" in told[0]
+    assert "no track map: railfix map survey creates one from runs over the line" in told[0]
     assert "track map: line.csv" in told[1]
     assert (tmp_path / "report.html").stat().st_size > 100_000
     median, p95 = re.findall(r"error is ([\d.]+) m at the median, and at most ([\d.]+) m for 95 %", section)[0]

@@ -86,7 +86,7 @@ def test_slips_and_what_comes_just_before_them_are_left_out(tmp_path: Path) -> N
 
 
 def test_a_folder_without_a_measured_line_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputFileError, match=r"train.parquet.*has no measured line .*; give a folder of railfix run"):
+    with pytest.raises(InputFileError, match=r"train.parquet.*has no measured properties .*; give a folder written by"):
         read_measured(tmp_path)
     nothing = {name: [None] for name in ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")}
     start = np.array(["2024-03-05T03:10:00"], dtype="datetime64[ns]")
@@ -119,4 +119,4 @@ def test_the_command_lists_what_two_runs_measured_beside_the_map(tmp_path: Path)
     assert (curves["chainage_m"] - curves["map_chainage_m"]).abs().max() < 2.0
     said = RUNNER.invoke(app, [*command, "--overwrite", f"--run={tmp_path / 'none'}"])
     assert said.exit_code == 3
-    assert "has no measured line" in said.output
+    assert "has no measured properties" in said.output

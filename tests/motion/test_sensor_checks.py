@@ -170,7 +170,7 @@ def _turned(samples: SensorSamples, sensor: str, column: str, factor: object) ->
     [
         ("tachometer", "direction", -1, "tachometer: the direction of its pulses is opposite"),
         ("radar", "speed_mps", -1.0, "radar: the sign of its speeds is opposite"),
-        ("inertial", "force_mps2", [-1.0, -1.0, 1.0], "inertial: its force forward is opposite"),
+        ("inertial", "force_mps2", [-1.0, -1.0, 1.0], "inertial: the forward force is opposite"),
         ("inertial", "force_mps2", 1.0 / 9.80665, "inertial: its forces are in g"),
         ("inertial", "force_mps2", [1.0, 1.0, -1.0], r"force_down_mps2 is \+9.8 on average"),
         ("inertial", "force_mps2", [1.0, 1.0, 0.5], "inertial: its mean force is 4.9"),

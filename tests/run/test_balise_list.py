@@ -75,7 +75,7 @@ def test_readings_need_a_list_and_virtual_balises_levels(track: Track, tmp_path:
         load_balises(places, None, None, track, Config())
     with pytest.raises(SettingsError, match="--balise-list is given without --balises; give both"):
         load_balises(None, places, None, track, Config())
-    with pytest.raises(SettingsError, match="--virtual-balises needs the levels of the filter"):
+    with pytest.raises(SettingsError, match="--virtual-balises needs protection levels of the filter"):
         load_balises(None, None, places, track, Config(filter="off"))
     both = load_balises(places, places, places, track, Config(filter="track"))
     assert both.virtual.tolist() == [False, True]

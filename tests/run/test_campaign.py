@@ -300,7 +300,7 @@ def test_an_absolute_pattern_and_a_field_that_is_named_twice_find_the_logs(folde
     ("pattern", "words"),
     [
         ("in/{a}{b}.obs", "put a character between the two fields"),
-        ("in/**{run}", r"\*\* is not known; write a \* for each folder"),
+        ("in/**{run}", r"\*\* is not supported; write a \* for each folder"),
         ("in/{1}.obs", r"the field \{1\} has to begin with a letter"),
     ],
 )

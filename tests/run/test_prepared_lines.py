@@ -97,7 +97,7 @@ def test_a_folder_that_cannot_be_written_is_said(bench: Bench, folder: Path) -> 
     folder.write_text("a file")
     line = opened(bench)
     assert line.preparing
-    assert all("could not be kept" in note for note in line.preparing if "damaged" not in note)
+    assert all("could not be stored" in note for note in line.preparing if "damaged" not in note)
 
 
 def test_old_entries_go(bench: Bench, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,14 +50,14 @@ def test_time_tags_that_come_after_the_satellites_are_late(lag_s: float, word: s
 @pytest.mark.parametrize(
     ("low_s", "high_s", "text"),
     [
-        (-18.02, -17.98, "18.00 s early, so that no position has a level (they may be UTC, not GPS time)"),
-        (-14.1, -13.9, "14.00 s early, so that no position has a level (they may be BeiDou time, not GPS time)"),
-        (18.99, 19.03, "19.01 s late, so that no position has a level (they may be TAI, not GPS time)"),
-        (17.98, 18.02, "18.00 s late, so that no position has a level (expected GPS time)"),
-        (0.97, 1.01, "0.99 s late, so that no position has a level (expected GPS time)"),
-        (-0.25, -0.15, "0.20 s early, so that no position has a level (expected GPS time)"),
-        (-0.1, 1.5, "between -0.10 and +1.50 s off (+ late), so that no position has a level (they may drift)"),
-        (-18.4, -17.6, "between -18.40 and -17.60 s off (+ late), so that no position has a level (they may drift)"),
+        (-18.02, -17.98, "18.00 s early, so there is no protection level (they may be UTC, not GPS time)"),
+        (-14.1, -13.9, "14.00 s early, so there is no protection level (they may be BeiDou time, not GPS time)"),
+        (18.99, 19.03, "19.01 s late, so there is no protection level (they may be TAI, not GPS time)"),
+        (17.98, 18.02, "18.00 s late, so there is no protection level (expected GPS time)"),
+        (0.97, 1.01, "0.99 s late, so there is no protection level (expected GPS time)"),
+        (-0.25, -0.15, "0.20 s early, so there is no protection level (expected GPS time)"),
+        (-0.1, 1.5, "between -0.10 and +1.50 s off (+ late), so there is no protection level (they may drift)"),
+        (-18.4, -17.6, "between -18.40 and -17.60 s off (+ late), so there is no protection level (they may drift)"),
     ],
 )
 def test_an_error_of_the_time_tags_has_its_size_its_sign_and_a_guess(low_s: float, high_s: float, text: str) -> None:

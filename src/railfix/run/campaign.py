@@ -1,7 +1,8 @@
-"""Positioning of many logs by one command, which can be resumed, with one results folder per run.
+"""Positioning of the logs of many runs by one command, which can be repeated to resume after an interruption.
 
-The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables together are
-one hive-partitioned data set, which ``pl.scan_parquet(out / "runs/**/positions.parquet")`` reads.
+Each run has a results folder named by the fields of the campaign, such as ``runs/train=A/day=2024-03-05``. The tables
+of all runs therefore form one hive-partitioned data set, which ``pl.scan_parquet(out / "runs/**/positions.parquet")``
+reads.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ _FIELD: Final = re.compile(r"\{(\w+)\}")
 class Campaign(Settings):
     """Files of a campaign, given by patterns with fields in braces; paths are relative to the campaign file.
 
-    A run has the files whose fields have the same values as the fields of the run's front log. With ``nav/{day}.nav*``
-    a run has the navigation files of its day, with ``{line}/track.csv`` the track of its line. A pattern without
-    fields or ``*`` names a file of every run.
+    The files of a run are the files whose fields have the same values as the fields of the run's front log. For
+    example, ``nav/{day}.nav*`` selects the navigation files of the day of the run, and ``{line}/track.csv`` the track
+    of the line. A pattern without fields or ``*`` names one file that all runs use.
     """
 
     #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs with the same values of
@@ -49,18 +50,18 @@ class Campaign(Settings):
     track: tuple[str, ...]  #: Patterns of the files of the track, which are joined to a route in this order.
     rear: str = ""  #: Pattern of the logs of the rear antenna; may be empty.
     sp3: str = ""  #: Pattern of precise orbits; may be empty.
-    #: Patterns of files with one file per run; may be empty.
-    vehicle: str = ""
-    tachometer: str = ""
-    inertial: str = ""
-    radar: str = ""
+    vehicle: str = ""  #: Pattern of the vehicle file; may be empty.
+    tachometer: str = ""  #: Pattern of the table of tachometer pulses; may be empty.
+    inertial: str = ""  #: Pattern of the table of the inertial unit; may be empty.
+    radar: str = ""  #: Pattern of the table of radar speeds; may be empty.
     reference: str = ""  #: Pattern of the reference trajectory of a run, for the campaign's page; may be empty.
     config: Path | None = None  #: Settings file of all runs.
     options: RunOptions = RunOptions()  #: Options of all runs.
 
 
-#: Patterns of several files per run, and patterns of one file per run.
+#: Names of the patterns that may match several files per run.
 _MANY: Final = ("front", "rear", "nav", "sp3")
+#: Names of the patterns that may match only one file per run.
 _ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 
 
@@ -68,7 +69,7 @@ _ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 class CampaignRun:
     """One run of a campaign."""
 
-    fields: Mapping[str, str]  #: Values of the fields, in the order of the pattern `front`.
+    fields: Mapping[str, str]  #: Value of each field, in the order in which the fields occur in the pattern `front`.
     inputs: RunInputs
     config: Config
     options: RunOptions
@@ -77,7 +78,7 @@ class CampaignRun:
 
     @property
     def done(self) -> bool:
-        """Whether the results folder has results for the same inputs and settings."""
+        """Whether the results folder already has results for the inputs and settings of this run."""
         try:
             record = read_record(self.out)
             record.check_inputs()
@@ -91,14 +92,17 @@ class CampaignProgress(Protocol):
     """Callback for the progress of a campaign."""
 
     def __call__(self, *, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-        """Report the numbers of runs: finished, kept from an earlier call, failed, in total; and the time left [s]."""
+        """Report the numbers of finished, kept, failed and all runs, and the time left [s].
+
+        Kept runs have results from an earlier call; they are included in the finished runs.
+        """
 
 
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
-    """Read a campaign file, and find the files of each run, whose results folders are below `out`.
+    """Read a campaign file, and return its runs with their input files and their results folders below `out`.
 
     Raise InputFileError if no log matches the pattern `front`. Raise SettingsError if a setting is misspelt, `front`
-    has no field, a pattern is ambiguous or has a field that `front` lacks, or a run has several files where one is
+    has no field, a pattern is invalid or has a field that `front` lacks, or a run has several files where one is
     expected.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
@@ -154,9 +158,10 @@ def run_campaign(
 ) -> pl.DataFrame:
     """Position all logs of a campaign file, write one row per run to ``campaign.csv``, and return this table.
 
-    Runs with results for the same inputs and settings are not repeated, so that a campaign continues after an
-    interruption. The columns are the fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`,
-    `ok_rate`, `wall_s`, `reference` and `folder` (below `out`); a failed run has a row with its error.
+    Runs that already have results for the same inputs and settings are not repeated. A campaign that was interrupted is
+    continued by the same call. The columns are the fields, `status` ("done", "failed"), `error`, `epochs`,
+    `positioning_rate`, `ok_rate`, `wall_s`, `reference` and `folder` (below `out`); the row of a failed run has the
+    error message.
 
     `reading`, if it differs from the default, replaces the reading options of the campaign. `executor` has the
     interface of `concurrent.futures`; its workers must have access to the same files. `lost` are the exceptions by
@@ -207,7 +212,7 @@ def position_runs(
 def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
     """Return the result of `position_run`; if the worker process is interrupted during the run, end the process.
 
-    The incomplete results of the run have been removed before the process ends.
+    The incomplete results of the run are removed before the process ends.
     """
     try:
         return position_run(run)
@@ -219,7 +224,7 @@ def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
 
 
 def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Position a run unless its results exist; return its row of the table, and whether its results existed."""
+    """Position a run unless its results exist; return its row of ``campaign.csv``, and whether its results existed."""
     try:
         check_folder(run.out, overwrite="replace")
         if not (kept := run.done):
@@ -281,7 +286,9 @@ def _check_pattern(path: Path, name: str, pattern: str) -> None:
     if re.search(r"\}\{", pattern):
         raise SettingsError(f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}")
     if "**" in pattern:
-        raise SettingsError(f"{path}: {name} = {pattern!r}: ** is not known; write a * for each folder, such as */*")
+        raise SettingsError(
+            f"{path}: {name} = {pattern!r}: ** is not supported; write a * for each folder, such as */*"
+        )
     for field in _FIELD.findall(pattern):
         if not field.isidentifier():
             raise SettingsError(f"{path}: {name}: the field {{{field}}} has to begin with a letter")

@@ -22,14 +22,16 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Number of conventional positions after which a run is stopped if all are farther from the line than
+#: Number of conventional positions after which a run is stopped if all these positions are farther from the line than
 #: `ANOTHER_PLACE_M`.
 ENOUGH_TO_STOP: Final = 10
-#: Largest time between a log and its navigation records; records farther away are of another day.
+#: Largest time between a log and its navigation records; if the time is longer, the records are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
-#: Sensors without samples for a long time where the train is at rest, or passes no balise or ground unit.
+#: Sensors with samples only at events. They have no samples for a long time if the train is at rest, or passes no
+#: balise or ground unit.
 _OF_EVENTS: Final = ("tachometer", "ranging", "balises")
-#: Longest time from the reference time of a navigation record at which the record may be used (Galileo: 4 h).
+#: Longest time between the reference time of a navigation record and an epoch for which the record may be used
+#: (Galileo: 4 h).
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
@@ -38,7 +40,7 @@ Span = tuple[np.datetime64, np.datetime64]
 
 
 def navigation_times(navigation: Navigation) -> Datetimes:
-    """Return the reference times of all navigation records and the times of precise orbits, in order."""
+    """Return the reference times of all navigation records and the times of precise orbits, in ascending order."""
     times = [navigation.kepler.toe, navigation.glonass.toe]
     if navigation.precise is not None:
         times.append(navigation.precise.time)
@@ -53,13 +55,13 @@ def navigation_span(navigation: Navigation) -> Span | None:
 
 
 def check_each_file(navigation: Navigation, log: Log) -> None:
-    """Raise MismatchError if one of several files of a log begins more than a day from every navigation record."""
+    """Raise MismatchError if one of several files of a log begins more than a day from all navigation records."""
     times = navigation_times(navigation)
     for path, first in log.first_epochs() if len(times) else ():
         if np.abs(times - first).min() > ANOTHER_DAY:
             raise MismatchError(
-                f"{path}: begins at {str(first)[:16]} (GPS time), more than a day from every navigation record; give "
-                "the navigation file of that day, too"
+                f"{path}: begins at {str(first)[:16]} (GPS time), more than a day from all navigation records; add "
+                "the navigation file of that day"
             )
 
 
@@ -83,7 +85,7 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
             continue
         if span is None:
             files = ", ".join(navigation.sources) or "the navigation files"
-            raise MismatchError(f"{files}: no record of any satellite of the {name} log; give its navigation file")
+            raise MismatchError(f"{files}: no record of any satellite in the {name} log; give its navigation file")
         if spans_apart(of_log, span, reach=reach):
             raise MismatchError(
                 f"{', '.join(navigation.sources)}: navigation records of {_period(*span)} do not cover the {name} "
@@ -94,8 +96,8 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
 def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
     """Raise MismatchError if all conventional positions are farther than `ANOTHER_PLACE_M` from the line.
 
-    With "all", which is used during a run, this must be true of every antenna, with `ENOUGH_TO_STOP` positions of each.
-    With "any", which is used at the end, one position of one antenna suffices.
+    With "all", which is used during a run, every antenna must have at least `ENOUGH_TO_STOP` positions, all of them far
+    from the line. With "any", which is used at the end of a run, one antenna with at least one position suffices.
     """
     enough = ENOUGH_TO_STOP if antennas == "all" else 1
     elsewhere = [
@@ -131,9 +133,10 @@ def check_sbas_time(corrections: MessageCorrections | None, tally: Tally) -> Non
 
 
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
-    """Return a note on each sensor of events (pulses, ranges, balises) without a sample in the time of the logs.
+    """Return a note on each event sensor (pulses, ranges, balises) without a sample during the logs.
 
-    MismatchError: another sensor has no sample in this time, or a sensor of events none within a day.
+    Raise MismatchError if another sensor has no sample during the logs, or an event sensor has no sample within a day
+    before or after the logs.
     """
     spans, notes = list(_spans(tally).values()), []
     for name, samples in sensors.tables.items():
@@ -152,7 +155,7 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
 
 
 def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajectory]) -> None:
-    """Raise MismatchError if a base station is too far from the line, or has no epoch recent enough for a log."""
+    """Raise MismatchError if a base station is too far from the line, or has no epoch during or just before a log."""
     distance = min(np.linalg.norm(own.ecef_m - base.ecef_m, axis=1).min() for own in trajectories.values()) / 1e3
     if distance > LONGEST_KM:
         raise MismatchError(
@@ -176,10 +179,10 @@ def check_whole_run(
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
-    """Return notes on sensors without a sample in the time of the logs.
+    """Check the inputs and results of a whole run, and return notes on sensors without a sample during the logs.
 
-    `causes` has the likely cause by antenna, for the message. MismatchError: the inputs of the whole run do not match.
-    NoPositionError: the run has no position.
+    `causes` has the likely cause of missing positions by antenna, for the error message. Raise MismatchError if the
+    inputs do not match each other. Raise NoPositionError if the run has no position.
     """
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)

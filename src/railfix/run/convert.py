@@ -1,7 +1,8 @@
 """Conversion of receiver logs to RINEX, and of the positions of a run to ROS 2 messages and EGNSS MATE tables.
 
 The message definitions in an MCAP file are from sensor_msgs and from https://github.com/EGNSS-MATE/emate_ros (MIT,
-commit 9067868 of 16 April 2024, for ROS 1); a third message, railfix_msgs/Row, contains a row of the table.
+commit 9067868 of 16 April 2024, for ROS 1); a third message, railfix_msgs/Row, contains one row of the table of
+positions.
 """
 
 from __future__ import annotations
@@ -44,11 +45,12 @@ def convert_logs(
     reading: LogReading | None = None,
     overwrite: Overwrite = "refuse",
 ) -> list[str]:
-    """Write the logs of one receiver as RINEX files, and return lines on the written files and the skipped items.
+    """Write the logs of one receiver as RINEX files, and return lines of text on the written files and skipped items.
 
     `out` receives the observations, `nav_out` the ephemerides; None omits the file. `rinex` selects version 3.04 or
-    4.02. Raise InputFileError if a log cannot be read, or contains no data for a file. Raise OutputError if both files
-    are the same, or a file exists already, is an input, or cannot be written.
+    4.02. Raise InputFileError if a log cannot be read, or the logs contain no data for one of the RINEX files. Raise
+    OutputError if `out` and `nav_out` are the same file, or if one of them exists already, is an input, or cannot be
+    written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
         raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")
@@ -120,8 +122,9 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
 
     Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix), ``/ANTENNA/row`` (all columns) and, for the
     filter only, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time stamps are UTC. Absent numbers are NaN, and
-    absent texts are empty. `description`, on the kind of positions and the frame of the coordinates, is added to the
-    file. Raise NoPositionError if no row has coordinates. Raise SettingsError if mcap-ros2-support is not installed.
+    absent texts are empty. `description` is a text on the kind of positions and the frame of the coordinates, which is
+    stored in the file. Raise NoPositionError if no row has coordinates. Raise SettingsError if mcap-ros2-support is not
+    installed.
     """
     with needs_extra():
         from mcap_ros2.writer import Writer
@@ -172,7 +175,7 @@ def _fix(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
-    """Return the values of an emate_msgs/FusionResultTrack message, whose x axis points to rising chainage."""
+    """Return the values of an emate_msgs/FusionResultTrack message, whose x axis points toward rising chainage."""
     nan = float("nan")
     on_network = bool(row.get("track"))
     return {
@@ -195,8 +198,8 @@ def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Tra
     """Return the EGNSS MATE tables R_TRACK and R_ETCS_TPR of the first antenna of a run.
 
     `train` and `passings` are tables of the run. The last relevant balise group (LRBG) of a row is the group that was
-    read last according to the passings; it is empty before the first reading. The sections of the track are the track
-    edges.
+    read last according to `passings`; it is empty before the first reading. Each section of the track is one track edge
+    of the tables.
     """
     rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
     chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()
@@ -258,7 +261,7 @@ def _metres(values: np.ndarray) -> pl.Series:
 
 
 def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
-    """Return the balise read last before each row, with its chainage; before the first reading, null and NaN."""
+    """Return the last balise read before each row, and its chainage; null and NaN before the first reading."""
     empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
     read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
     times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))

@@ -47,13 +47,12 @@ class FileFinding:
 
     path: Path
     kind: Kind
-    facts: tuple[str, ...]  #: Phrases on the content for the user.
+    facts: tuple[str, ...]  #: Short descriptions of the content, shown to the user.
     span: Span | None = None  #: First and last time of the content, GPS time; None if unknown.
     place_ecef_m: Floats | None = None  #: A position in the file, ECEF, shape (3,) [m]; None if unknown.
-    ephemerides: Span | None = (
-        None  #: First and last reference time of the ephemerides in the file; None if there are none.
-    )
-    options: tuple[str, ...] = ()  #: Options that a command needs to read the file.
+    #: First and last reference time of the ephemerides in the file; None if there are none.
+    ephemerides: Span | None = None
+    options: tuple[str, ...] = ()  #: Command-line options that are needed to read the file.
     problems: tuple[str, ...] = ()  #: Sentences on faults of the file itself.
 
 
@@ -63,7 +62,7 @@ class Diagnosis:
 
     findings: tuple[FileFinding, ...]
     problems: tuple[str, ...]  #: Sentences on faults, mismatches and missing files.
-    command: str  #: Command to run; "" if a file for it is missing.
+    command: str  #: Command that positions the logs; "" if a file needed for the command is missing.
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain values for JSON."""
@@ -87,8 +86,8 @@ class Diagnosis:
 def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
     """Examine each file, and compare the files with each other.
 
-    `date` is a time within half a week of logs that do not state the week. Raise InputFileError if a file is missing, a
-    folder, or given twice.
+    `date` is a time within half a week of the logs, needed for logs that do not state the week. Raise InputFileError if
+    a file is missing, a folder, or given twice.
     """
     for path in paths:
         if path.is_dir():
@@ -103,9 +102,10 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
 
 
 def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Read a file as each kind that its content suggests until a reader accepts it, and return its properties.
+    """Return the properties of a file.
 
-    If no reader accepts it, the first error is the problem of the file.
+    The file is read as each kind that its content suggests, until a reader accepts it. If no reader accepts the file,
+    the first error is returned as its problem.
     """
     errors: list[str] = []
     kinds = _find_kinds(path)
@@ -114,7 +114,7 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
             return _DATED[kind](path, date) if kind in _DATED else _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
-            if "--date" in str(error):  # the kind is right, but the date is missing
+            if "--date" in str(error):  # the reader is right, but requires the date
                 return FileFinding(path=path, kind=kind, facts=(), problems=(errors[-1],))
     kind = "unknown" if len(kinds) > 1 else kinds[0]
     return FileFinding(path=path, kind=kind, facts=(), problems=(errors[0],))
@@ -262,7 +262,7 @@ def _track(path: Path) -> FileFinding:
     else:
         network = connect_network(segments, [path])
         points, length = sum(len(part.height_m) for part in segments), float(network.length_m.sum())
-        facts.append(f"a network of {len(network.tracks)} tracks, of which a run finds the route")
+        facts.append(f"a network of {len(network.tracks)} tracks, in which a run finds the route")
     middle = segments[len(segments) // 2]
     row = len(middle.height_m) // 2
     place = ecef_from_geodetic(middle.latitude_deg[row], middle.longitude_deg[row], middle.height_m[row])
@@ -326,7 +326,7 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: Kinds of input for which a file may be used, by the kind of its content.
+#: Kinds of input for which a file can be used, by file kind.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "observations": ("observations",),
     "navigation": ("navigation",),
@@ -337,12 +337,13 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
 }
-#: Readers by kind of file; the readers in `_DATED` have a date as second argument.
+#: Readers with two arguments, the path and the date of the log, by kind of input.
 _DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
     "positions": _positions,
 }
+#: Readers with the path as the only argument, by kind of input.
 _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "track": _track,
     "orbits": _orbits,
@@ -376,7 +377,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
     if not navigation and logs:
         problems.append("no navigation file: give the broadcast ephemerides of the day")
     if not tracks and logs:
-        problems.append("no track map: railfix map survey makes one from runs over the line")
+        problems.append("no track map: railfix map survey creates one from runs over the line")
     if len(logs) > 2:
         problems.append("there are more than two logs: give the files of one run")
     for log in readable:
@@ -384,7 +385,8 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
         spans = [finding.ephemerides for finding in navigation if finding.ephemerides is not None]
         if spans and all(spans_apart(log.span, span, reach=RECORD_REACH) for span in spans):
             problems.append(
-                f"{log.path}: no ephemeris covers its time; give the navigation file of {str(log.span[0])[:10]}"
+                f"{log.path}: no ephemeris covers the time of the log; give the navigation file of "
+                f"{str(log.span[0])[:10]}"
             )
         for other in tracks:
             if log.place_ecef_m is not None and other.place_ecef_m is not None:
@@ -413,7 +415,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
 
 
 def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str:
-    """Return the command of a run with the files; "" if a file for it is missing."""
+    """Return the command that positions the logs with these files; "" if a file needed for the command is missing."""
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     logs = [log for log in logs if log.span is not None]
     tracks = [track for track in tracks if track.place_ecef_m is not None]

@@ -58,7 +58,7 @@ class RunSummary:
 
     tally: Tally  #: Counts of all epochs and observations.
     record: Mapping[str, Any]  #: Content of ``run.json``.
-    verdict: Verdict  #: Verdict of the run for the terminal, the report and JSON.
+    verdict: Verdict  #: Verdict on the run for the terminal, the report and JSON.
     files: Mapping[str, Path]  #: Paths of the written files by name.
     wall_s: float  #: Elapsed time of the run [s].
 
@@ -85,9 +85,9 @@ def run_files(
 ) -> RunSummary:
     """Position the logs of one run along its line and write the results into the folder `out`.
 
-    `config` has all settings; `asked` has the explicitly given settings, which are recorded in ``run.json``.
-    Notes are issued as `RailfixWarning`. Raise a RailfixError (`railfix.core.errors`) and leave `out` unchanged if the
-    run fails.
+    `config` has all settings; `asked` has only the explicitly given settings, which are recorded in ``run.json``. Notes
+    are issued as `RailfixWarning`. Raise a RailfixError (`railfix.core.errors`) and leave `out` unchanged if the run
+    fails.
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
@@ -152,7 +152,7 @@ def run_files(
 
 
 def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
-    """Return the verdict on a run; raise NoPositionError if it has no usable position."""
+    """Return the verdict on a run; raise NoPositionError if the run has no usable position."""
     verdict = judge_run(record)
     if not any(antenna.is_usable for antenna in verdict.antennas):
         of_map = [note for note in notes if ": the map " in note]
@@ -224,8 +224,8 @@ def _position(
 ) -> Tally:
     """Position the logs chunk by chunk and return the counts.
 
-    Five stages run in parallel on consecutive chunks: reading, screens, single epochs, filter, and writing (by
-    `beside`). `others` are the samples of the on-board sensors and the log of the base station.
+    Five stages run in parallel on consecutive chunks: reading, screens, single epochs, filter, and writing (in the
+    executor `beside`). `others` are the samples of the on-board sensors and the log of the base station.
     """
     tolerance_s = processor.config.antenna_pair.tag_tolerance_s
     tally = Tally(
@@ -261,7 +261,7 @@ def _screen_chunks(
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
 ) -> Iterator[Chunk]:
-    """Yield the chunks after the screens; each includes the sensor samples and base-station epochs up to its end."""
+    """Yield the screened chunks, each with the sensor samples and base-station epochs up to the end of the chunk."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
@@ -306,7 +306,7 @@ def _notes_of_sensors(
     return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
-#: Last clause of a note on positions off the map whose cause was not found.
+#: Last clause of a note on positions off the map if their cause was not found.
 _TRACK: Final = "check whether this is the right track"
 #: Maximum number of excluded satellites that a note names.
 _NAMED: Final = 3
@@ -324,7 +324,7 @@ def collect_notes(
     """Return the notes of a run without repetitions.
 
     `causes` has the likely cause for each antenna without a position on the line. There is a note on the offset of the
-    map if its test statistic exceeds `note_statistic`.
+    map if the test statistic of the offset exceeds `note_statistic`.
     """
     notes = [
         *line.notes,
@@ -390,7 +390,7 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     which = "off (+ late)" if drifting else "early" if middle < 0.0 else "late"
     scale = next((text for off, text in _SCALES.items() if not drifting and abs(middle - off) < _STEADY_S), None)
     guess = "they may drift" if drifting else f"they may be {scale}, not GPS time" if scale else "expected GPS time"
-    return f"the time tags are {size} {which}, so that no position has a level ({guess})"
+    return f"the time tags are {size} {which}, so there is no protection level ({guess})"
 
 
 #: Largest spread of a constant time-tag error [s].
@@ -409,7 +409,7 @@ def _describe_detectable(detectable_m: Floats) -> str:
 
 
 def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
-    """Yield notes on missing protection levels, the basis of their priors, and a prior that the run contradicts."""
+    """Yield notes on missing protection levels, the basis of the fault priors, and a prior that the run contradicts."""
     if not any(antenna.level_status for antenna in tally.antennas.values()):
         return
     for name, of_antenna in tally.antennas.items():
@@ -422,7 +422,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
     risk = get_risk_budget(config)
     yield (
         f"protection level: {prior_basis_text(level_facts(config))} (railfix error-model measures priors; "
-        "risk.local_prior, risk.side_prior and risk.priors state them)"
+        "the settings risk.local_prior, risk.side_prior and risk.priors state them)"
     )
     if "raim" not in config.screens:
         return
@@ -434,9 +434,9 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
     prior = risk.local_prior + max(risk.satellite_prior.values())
     if faults > 3.0 * np.sqrt(excluded) and faults > prior * (used + excluded):
         yield (
-            f"protection level: it assumes a fault probability of at most {prior:g} per range, but RAIM has excluded "
-            f"{excluded} of {used + excluded}, {faults:.0f} more than false alarms "
-            f"({faults / (used + excluded):.2g} per range); see risk.local_prior"
+            f"protection level: the assumed fault probability is at most {prior:g} per range, but RAIM has excluded "
+            f"{excluded} of {used + excluded} ranges. That is {faults:.0f} more than the expected number of false "
+            f"alarms, or {faults / (used + excluded):.2g} per range; see risk.local_prior"
         )
 
 

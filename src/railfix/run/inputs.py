@@ -25,7 +25,7 @@ from railfix.track.frames import MapMotion
 from railfix.track.route import MapReading
 from railfix.track.vehicle import Reference
 
-#: Value of `RunInputs.heights` for the heights of the log's own positions.
+#: Value of `RunInputs.heights` by which the heights of the log's own positions are used.
 OF_LOG = Path("log")
 Antenna = Literal["front", "rear"]
 
@@ -35,7 +35,7 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
-#: Texts of options shared by several commands.
+#: Help texts of options that several commands share.
 NAVIGATION: Final = (
     "Navigation file: RINEX, or a receiver's log; may be repeated. Without this option, the ephemerides in the "
     "receiver's log itself "
@@ -54,8 +54,8 @@ BALISE_LIST: Final = (
     "measured from the beginning of that track)."
 )
 VIRTUAL_BALISES: Final = (
-    "Points on the line whose passing times are reported with bounds: a list in the format of --balise-list. "
-    "Requires protection levels."
+    "List of virtual balises, in the format of --balise-list: points on the line whose passing times are reported "
+    "with bounds. Requires protection levels."
 )
 
 
@@ -96,7 +96,7 @@ class InputFiles(Settings):
             _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Start computing the `fingerprint` of every file in `pool`, with paths as recorded in the results `folder`."""
+        """Submit the `fingerprint` of each file to the executor `pool`; paths are recorded relative to `folder`."""
         return [
             pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
         ]
@@ -106,7 +106,7 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run, described by their options; files without an option here are named by the settings."""
+    """Input files of a run that are given by command-line options; the settings name further files."""
 
     own_navigation = ("front", "rear")
     front: tuple[Path, ...] = input_option(
@@ -117,8 +117,8 @@ class RunInputs(InputFiles):
     nav: tuple[Path, ...] = input_option(NAVIGATION, ())
     track: tuple[Path, ...] = input_option(TRACK, (), metavar="TRACK")
     mate: Path | None = input_option(
-        "Folder with EGNSS MATE tables, instead of --front, --track and the sensors; one of these options, if given "
-        "too, replaces the table.",
+        "Folder with EGNSS MATE tables, used instead of --front, --track and the sensor options; if one of these "
+        "options is given, its file replaces the table.",
         None,
         metavar="FOLDER",
     )
@@ -184,7 +184,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Return the checked inputs with the files of the settings, and the settings with the logs for "stream"."""
+        """Check the inputs, add the files that settings name, and replace "stream" in the settings; return both."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -248,7 +248,7 @@ def record_path(path: Path, folder: Path) -> str:
 
 
 def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
-    """Return the present path of a recorded input, whose relative path refers to the results folder."""
+    """Return the present path of a recorded input; a relative recorded path refers to the results folder."""
     path = folder / str(entry["path"])
     plain = Path(os.path.normpath(path))
     return plain if plain.exists() or not path.exists() else path
@@ -304,7 +304,7 @@ class TrackReading(Settings):
         lt=2100.0,
     )
     plate: str | None = option(
-        "Tectonic plate whose motion takes the track's coordinates from their epoch to the time of the log.",
+        "Tectonic plate whose motion converts the track's coordinates from their epoch to the time of the log.",
         None,
         metavar="NAME",
     )

@@ -1,4 +1,4 @@
-"""3-D positions of logs without a track map, survey of a map from several runs, and measured features (P2 2.3)."""
+"""3-D positions of logs without a map, survey of a map from several runs, and features measured by runs (P2, 2.3)."""
 
 from __future__ import annotations
 
@@ -123,13 +123,15 @@ def solution_text(located: Located) -> str:
 
 #: Number of epochs that are positioned together.
 _CHUNK_EPOCHS: Final = 3000
-#: Number of epochs that `likely_cause` tests, and distance in plan within which a position is on the line [m].
+#: Number of epochs that `likely_cause` tests.
 _EPOCHS: Final = 5
+#: Distance in plan from the line within which a position counts as on the line [m].
 _ON_LINE_M: Final = 150.0
-#: Height difference from the line above which range errors do not explain it [m].
+#: Height difference between positions and line that is too large to be caused by range errors [m].
 _HEIGHT_M: Final = 30.0
-#: GPS time minus UTC since 2017, and GPS time minus BeiDou time [s].
+#: GPS time minus UTC since 2017 [s].
 _LEAP_S: Final = 18
+#: GPS time minus BeiDou time [s].
 _BEIDOU_S: Final = 14
 #: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
@@ -152,12 +154,12 @@ def likely_cause(observations: Observations, received: Received, config: Config,
         offset = _offset_m(shifted, received, config, line)
         if offset is not None and offset[0] < _ON_LINE_M:
             return (
-                f"with time tags {_duration(abs(shift_s))} {'later' if shift_s > 0 else 'earlier'} its positions lie "
-                "on the line; the tags may be UTC or local time, or the time system in its header may be wrong"
+                f"with time tags {_duration(abs(shift_s))} {'later' if shift_s > 0 else 'earlier'} the positions lie "
+                "on the line; the tags may be UTC or local time, or the time system in the log's header may be wrong"
             )
     if as_tagged is None:
         return ""
-    return f"its positions lie {as_tagged[0]:,.0f} m from the line; check whether this is the right track"
+    return f"the positions lie {as_tagged[0]:,.0f} m from the line; check whether this is the right track"
 
 
 def _shifts_s() -> Iterator[int]:
@@ -183,7 +185,7 @@ def _offset_m(
     arc, _ = line.nearest(place[None])
     height = float(geodetic_from_ecef(place)[2])
     of_line = float(geodetic_from_ecef(line.at_arc(arc)[0])[2])
-    # offset in plan: the position is moved to the height of the line, which may be wrong
+    # The heights of the line may be wrong. The offset in plan is therefore computed at the height of the line.
     level = place * (1.0 + (of_line - height) / float(np.linalg.norm(place)))
     return float(line.nearest(level[None])[1][0]), height - of_line, of_line
 
@@ -193,7 +195,7 @@ def _cause_in_height(above_m: float, of_line_m: float) -> str:
     height = of_line_m + above_m
     feet = abs(of_line_m * _FEET - height) < abs(above_m) / 4.0
     hint = "the heights of the map may be in feet" if feet else "check the height datum of the map"
-    return f"its positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line; {hint}"
+    return f"the positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line; {hint}"
 
 
 def _duration(seconds: int) -> str:
@@ -223,8 +225,8 @@ def survey_files(
 ) -> Surveyed:
     """Survey a line from files of positions and logs of observations.
 
-    Raise InputFileError if a file is missing, given twice, or of another kind, or a log lacks navigation files. Raise
-    MismatchError if the runs lie far apart, or have no line in common.
+    Raise InputFileError if a file is missing, given twice, or not a log of positions or observations, or if a log lacks
+    navigation files. Raise MismatchError if the runs lie far apart, or have no line in common.
     """
     for path in (*paths, *nav):
         if not path.is_file():
@@ -287,24 +289,25 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
 #: Columns of ``train.parquet`` with measured properties of the line: chainage [m], gradient [permille] and curvature
 #: [1/m].
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
-#: Minimum change of a feature in standard deviations, and minimum number of values in a mean.
+#: Minimum change of gradient or curvature at a feature, in standard deviations.
 _SIGMAS: Final = 5.0
+#: Minimum number of values of which a mean is computed.
 _LEAST_VALUES: Final = 3
-#: Number of iterations in which the window is centred on a change.
+#: Number of iterations by which `centre_features` centres a window on a change.
 _CENTRED: Final = 5
-#: Time before and after a wheel slip in which values are omitted, because a slip affects the gradient before it is
-#: detected.
+#: Time before and after a detected wheel slip within which measured values are omitted. The time before is needed
+#: because a slip affects the gradient before the slip is detected.
 _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
 
 
 def read_measured(folder: Path) -> pl.DataFrame:
     """Read the properties of the line that a run has measured, in order of chainage.
 
-    If the run has two antennas, the rows of the first are returned. Raise InputFileError if the folder has no results
-    of the filter, or the run had no tachometer and inertial unit.
+    If the run has two antennas, the rows of the first antenna are returned. Raise InputFileError if the folder has no
+    results of the filter, or the run had no tachometer or no inertial unit.
     """
     path = folder / "train.parquet"
-    with reading_table(path, "has no measured line ({}); give a folder of railfix run"):
+    with reading_table(path, "has no measured properties of the line ({}); give a folder written by railfix run"):
         table = pl.read_parquet(path, columns=["time_gpst", "antenna", "motion", *_COLUMNS])
     table = table.filter(pl.col("antenna") == pl.col("antenna").first())
     time = table["time_gpst"].to_numpy().astype("datetime64[ns]")
@@ -323,9 +326,9 @@ def read_measured(folder: Path) -> pl.DataFrame:
 class MeasuredFeature:
     """Feature detected in the combined values of all runs."""
 
-    feature: Feature  #: The feature; its `arc_m` is a chainage.
+    feature: Feature  #: The feature, in which `arc_m` is a chainage.
     places_m: Floats  #: Chainage of the feature in each run whose values alone suffice to detect it, shape (R,) [m].
-    map_m: float  #: Chainage of the same feature of the map [m]; NaN if the map has none.
+    map_m: float  #: Chainage of the same feature in the map [m]; NaN if the map has no such feature.
 
 
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
@@ -371,9 +374,9 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
 
 
 def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
-    """Return features moved to the centre of their change.
+    """Return features, each moved to the centre of the change of gradient or curvature.
 
-    On a long transition, noise shifts the detected position, but hardly the centre.
+    On a long transition, noise shifts the detected position, but hardly affects the centre of the change.
     """
     lag = max(round(BASE_M / STEP_M), 1)
     found = []

@@ -8,7 +8,8 @@ from typing import Any, Final
 from railfix.core.errors import InputFileError
 from railfix.io.mate import mate_table
 
-#: Input of a run by the name of its table; if both tables of the track exist, the first is used.
+#: Field of `RunInputs` by the name of the EGNSS MATE table. If both tables of the track exist, the one listed first is
+#: used.
 _INPUTS: Final = {
     "S_GNSS_SAT": "front", "S_DM_TRACKPOINT": "track", "S_DM_TRACK_SEGMENT_POSITION": "track", "S_IMU": "inertial",
     "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "balise_list",

@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 _PREFIX: Final = ".railfix-"
 _LOCK: Final = ".lock"
-#: Name of the folder of complete files inside a staging folder; one rename creates the folder with all files.
+#: Name of the folder inside a staging folder that has the complete files; a single rename creates it with all files.
 READY: Final = "ready"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Staging:
-    """Hidden folder inside a results folder, and the locked, open file with the identifier of the process."""
+    """Hidden folder inside a results folder, and its lock file, which is open and has the identifier of the process."""
 
     path: Path
     lock: IO[str]
@@ -147,10 +147,10 @@ _LOOK_S: Final = 0.1
 
 
 class ParquetFile:
-    """Parquet file to which tables of one schema are appended; the memory used does not grow with their number.
+    """Parquet file to which tables of one schema are appended; the memory used does not grow with the number of tables.
 
-    polars writes a file from one query. The source of that query runs in a thread and waits for the next table; at most
-    one table is queued.
+    polars writes a file from one query. The source of the query runs in a thread and waits for each table that is
+    appended; at most one table is queued.
     """
 
     def __init__(self, path: Path, schema: pl.Schema) -> None:
@@ -226,9 +226,9 @@ class OutputFolder:
     """Output folder of a command, which receives all files at once or none; it is created if it does not exist.
 
     In the block of this context manager, files are written to a hidden staging folder, from which `commit` moves them
-    to the output folder. If the block ends with an error, the written files are removed, and the output folder too if
-    it was created. Remains of a killed process are removed by the next `OutputFolder` at the same path. With "replace",
-    existing files of the same names are replaced by `commit`; `inputs` are never overwritten.
+    to the output folder. If the block ends with an error, the written files are removed, and the output folder is
+    removed, too, if it was created. Remains of a killed process are removed by the next `OutputFolder` at the same
+    path. With "replace", existing files of the same names are replaced by `commit`; `inputs` are never overwritten.
 
     Raise OutputError if the folder cannot be created or written, is not empty (with "refuse"), is being written by
     another process, or a file would overwrite an input.
@@ -289,7 +289,7 @@ class OutputFolder:
 
     @property
     def staging(self) -> Path:
-        """Path of the staging folder; only its files that `stage` has registered are results."""
+        """Path of the staging folder; only files registered by `stage` become results."""
         return self._staging.path
 
     def stage(self, name: str) -> Path:
@@ -336,7 +336,7 @@ class OutputFolder:
             del self._parquet[name]
 
     def change(self, name: str, transform: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
-        """Apply a function to blocks of rows of a table, in order, and write its Parquet and CSV files again."""
+        """Apply a function to consecutive blocks of rows of a table, and rewrite its Parquet and CSV files."""
         import polars as pl
 
         file = f"{name}.parquet"

@@ -1,8 +1,9 @@
 """Cache of prepared lines on disk: tracks as read from their files, and antenna trajectories.
 
 Reading a line of 2000 km and computing the trajectories of two antennas takes seconds. The result depends only on the
-files, the settings and the version of railfix, so that long lines are stored in a cache folder. The cache folder is the
-platform's (``~/.cache/railfix`` on Linux) or the folder named by `VARIABLE`, and may be deleted at any time.
+files, the settings and the version of railfix. Long lines are therefore stored in a cache folder, which may be deleted
+at any time. This is the platform's cache folder (``~/.cache/railfix`` on Linux), or the folder named by the environment
+variable `VARIABLE`.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class PreparedLines:
         self._folder = cache_folder() if use else None
 
     def track(self, key: str) -> Track | None:
-        """Return the cached track with a key (`compute_key`); None if there is none."""
+        """Return the track cached under a key (`compute_key`); None if the cache does not have it."""
         found = self._load(key)
         if found is None:
             return None
@@ -78,7 +79,7 @@ class PreparedLines:
             self._keep(key, {**plain, "provenance": asdict(track.provenance)}, arrays)
 
     def path(self, key: str) -> Trajectory | None:
-        """Return the cached trajectory with a key (`compute_key`); None if there is none."""
+        """Return the trajectory cached under a key (`compute_key`); None if the cache does not have it."""
         found = self._load(key)
         if found is None:
             return None
@@ -126,7 +127,7 @@ class PreparedLines:
                 old.unlink(missing_ok=True)
         except (OSError, OutputError) as error:
             reason = error.strerror or str(error) if isinstance(error, OSError) else str(error)
-            self.notes.append(f"{self._folder}: the prepared line could not be kept ({reason}); set {VARIABLE}")
+            self.notes.append(f"{self._folder}: the prepared line could not be stored ({reason}); set {VARIABLE}")
 
 
 def compute_key(kind: str, *parts: object) -> str:
@@ -147,7 +148,7 @@ def compute_key(kind: str, *parts: object) -> str:
 
 @cache
 def _code() -> list[tuple[str, int, int]]:
-    """Return name, size and modification time of each source file that affects a prepared line, as part of the key."""
+    """Return name, size and modification time of each source file that affects a cached line, for the cache key."""
     files = sorted(Path(railfix.track.__file__).parent.glob("*.py"))
     return [(file.name, (state := file.stat()).st_size, state.st_mtime_ns) for file in files]
 
@@ -159,7 +160,7 @@ def track_key(track: Track) -> str:
 
 
 def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the fields that are not arrays, and the arrays; both without the provenance."""
+    """Return the fields of an object that are not arrays, and the fields that are; both without the provenance."""
     values = {item.name: getattr(value, item.name) for item in fields(value) if item.name != "provenance"}
     arrays = {name: array for name, array in values.items() if isinstance(array, np.ndarray)}
     return {name: v for name, v in values.items() if name not in arrays}, arrays

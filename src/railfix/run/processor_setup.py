@@ -31,7 +31,7 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings with the fault priors, and the stretches without a protection level, of their error model.
+    """Return settings completed by their error model: fault priors, and stretches of line without a protection level.
 
     The settings remain unchanged if they have no error model, if a fault prior is given explicitly, or if the error
     model has no bounds of fault priors. Stretches without a protection level that are given explicitly are kept.
@@ -47,10 +47,12 @@ def with_measured_priors(config: Config) -> Config:
 
 
 def sbas_corrections(config: Config) -> SbasState | None:
-    """Return SBAS corrections from the files that the settings name, or before the first message; None without SBAS.
+    """Return the SBAS corrections of recorded messages, or the state before the first message; None without SBAS.
 
-    In recorded messages the GEO is chosen if the settings request the best. InputFileError: a file is missing or
-    malformed. SettingsError: no message of the requested GEO, or no GEO is requested for messages as they arrive.
+    The settings name the files with the recorded messages; with ``sbas = "stream"``, messages arrive during the run. If
+    the settings request the best GEO, it is chosen from the recorded messages. Raise InputFileError if a file is
+    missing or malformed. Raise SettingsError if there is no message of the requested GEO, or if the best GEO is
+    requested for a stream.
     """
     if not config.sbas:
         return None
@@ -122,7 +124,7 @@ def parse_position(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station, whose position is `place` (LAT,LON,HEIGHT) or the position in the header of the log.
+    """Log of a base station at the position `place` (LAT,LON,HEIGHT), or else at the position in the header.
 
     Raise InputFileError if the log has no epoch, or neither `place` nor the header gives the position.
     """

@@ -34,9 +34,9 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Limits within which protection levels of the filter are counted [m].
+#: Limits [m] for which the record has the number of the filter's protection levels within the limit.
 WITHIN_M: Final = (20, 50)
-#: Figures of an antenna without rows in the tables.
+#: Statistics of an antenna without rows in the tables.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 
@@ -106,11 +106,11 @@ def _figures(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, An
 
 @dataclass(frozen=True, kw_only=True)
 class RunProvenance:
-    """Inputs of a run that are recorded."""
+    """Input files, settings and software versions of a run for the record."""
 
     files: Sequence[Mapping[str, Any]]  #: Input files with size and hash (`fingerprint`).
     packages: Mapping[str, str]  #: Result of `package_versions`.
-    asked: Mapping[str, Any]  #: Settings as given explicitly.
+    asked: Mapping[str, Any]  #: Settings that were given explicitly.
     config: Config  #: All settings that were used.
     options: RunOptions  #: Options that do not change the positions.
     line: Mapping[str, Any]  #: Properties of the track map, the vehicle and the trajectories.
@@ -242,7 +242,7 @@ class RunRecord:
                 )
 
     def input_paths(self, kind: str) -> list[Path]:
-        """Return the present paths of the inputs of one kind, in the recorded order; see `input_path`."""
+        """Return the present paths (`input_path`) of the inputs of one kind, such as "front", in the recorded order."""
         return [input_path(entry, self.path) for entry in self.entries if entry["input"] == kind]
 
     @property
@@ -273,7 +273,7 @@ def read_record(folder: Path) -> RunRecord:
 def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFrame:
     """Read all or the selected columns of a table that a run wrote.
 
-    Raise InputFileError if it is not a Parquet file.
+    Raise InputFileError if the file is not a Parquet file.
     """
     with reading_table(path):
         if columns is None:
@@ -282,8 +282,9 @@ def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFr
 
 
 Facts = Mapping[str, Any]
-#: Names of statistics in the record, by their labels in the tables.
+#: Keys of the statistics of the standard deviation in the record, by label in the tables.
 _OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
+#: Keys of the statistics of the protection level in the record, by label in the tables.
 _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
@@ -354,7 +355,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield rows with the number of epochs with too few satellites due to each reason, and due to that reason alone."""
+    """Yield a row for each reason: numbers of epochs with too few satellites due to the reason, and due to it alone."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):

@@ -35,12 +35,14 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: Distance within which tracks of the route are candidates for a position on the route [m], and bound of the relative
-#: difference between lengths in plan and along the line, which extends that distance.
+#: Distance along the route within which a track of the route counts as near a position on the route [m].
 _REACH_M: Final = 50.0
+#: Bound of the relative difference between lengths in plan and lengths along the line; `_REACH_M` is increased by this
+#: fraction of the length of the route.
 _LENGTHS_DIFFER: Final = 1e-3
-#: Minimum probability at which another track is written to the table, and at which it is reported in the notes.
+#: Minimum probability at which a track outside the route is written to the table.
 _LEAST_WRITTEN: Final = 1e-4
+#: Minimum probability at which a track outside the route is reported in the notes.
 _LEAST_NAMED: Final = 0.01
 #: Number of alternatives reported in the notes; all are in ``run.json``.
 _NAMED: Final = 8
@@ -54,14 +56,14 @@ NONE: Final = "none"
 #: Additional columns of positions on a network.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track": "track of the network on which the position lies; it is part of the route found from the log",
-    "track_chainage_m": "distance in plan of the antenna along `track` from the first point of the track",
+    "track_chainage_m": "distance in plan along `track` from the first point of the track to the antenna",
     "track_probability": "probability, given the whole log, that the train is on the route at this position; "
     "`tracks.csv` has the alternatives",
     "unmapped_probability": "probability, given the whole log, that the train is on a track that is not in the map",
-    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from "
-    "`track`; positive to the right",
-    "unconstrained_up_m": "height of the 3-D position without the map above `track`, less the antenna height if the "
-    "vehicle is known",
+    "unconstrained_offset_m": "offset in plan, from `track`, of the 3-D position computed without the map at the "
+    "nearest second; positive to the right",
+    "unconstrained_up_m": "height above `track` of the 3-D position computed without the map, minus the antenna height "
+    "if the vehicle is known",
 }
 #: Columns of the table of tracks near each position.
 TRACK_COLUMNS: Final[dict[str, str]] = {
@@ -73,7 +75,8 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "chainage_m": "distance in plan along the track from its first point to the point nearest to the position",
     "kilometrage_m": "kilometrage at the point of `chainage_m` as marked on the line, if the map has it",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
-    "unconstrained_offset_m": "offset from the track, in plan, of the position without the map; positive to the right",
+    "unconstrained_offset_m": "offset in plan, from the track, of the 3-D position computed without the map; positive "
+    "to the right",
 }
 
 
@@ -82,7 +85,7 @@ class Alternative:
     """Stretch of a log on which a track outside the route is possible."""
 
     track: str  #: Name of the alternative track.
-    instead_of: str  #: Name of the track of the route.
+    instead_of: str  #: Name of the track of the route on this stretch.
     first: np.datetime64  #: First epoch, GPS time.
     last: np.datetime64
     probability: float  #: Largest probability of the alternative track.
@@ -128,10 +131,11 @@ class RouteOfLog:
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
         """Return whether the probability that the train is not on the route exceeds `risk` at each time, shape (T,).
 
-        The probability of the route is the sum over its tracks within `_REACH_M` of the chainage, since a parallel part
-        of the route is another track at that position. The smaller of the values at the matched positions before and
-        after the time is used, since the track may change between these positions. An unmapped track counts only by its
-        probability in excess of `_UNMAPPED_LIMIT`; protection levels include the rest (`with_unmapped`).
+        The probability of the route is the sum over the tracks of the route within `_REACH_M` of the chainage. A more
+        distant part of the route that runs parallel is a wrong track at this chainage. Of the values at the matched
+        positions before and after the time, the smaller is used, because the train may change tracks between these
+        positions. The probability of an unmapped track counts only in excess of `_UNMAPPED_LIMIT`, because protection
+        levels include the rest (`with_unmapped`).
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
@@ -142,9 +146,10 @@ class RouteOfLog:
         return np.asarray(np.fmin(*known) < 1.0 - risk)
 
     def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
-        """Return the probability of the route's tracks near chainages [m] at matched positions, by index, shape (T,).
+        """Return the probability of the route's tracks near given chainages [m], shape (T,).
 
-        If a chainage is NaN, all tracks of the route are included.
+        `epoch` has the index of the matched position for each chainage. If a chainage is NaN, all tracks of the route
+        are included.
         """
         lengths = self.network.length_m[list(self.tracks)]
         end = np.cumsum(lengths)
@@ -214,8 +219,8 @@ class RouteOfLog:
         """Notes on the route and its alternatives, one sentence each."""
         low = float(self.probability.min())
         first = (
-            f"route found from the log: {', '.join(self.names)}; chainage rises in this order; its probability is "
-            f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has all nearby tracks)"
+            f"route found from the log: {', '.join(self.names)}; chainage rises in this order; the probability of the "
+            f"route is {self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv: all nearby tracks)"
         )
         if self.left_out:
             first += f"; {left_out_note(self.network, self.left_out)}"
@@ -287,9 +292,10 @@ class RouteOfLog:
         return positions, long[order]
 
     def _unconstrained(self, epoch: Indices, track: Indices) -> tuple[pl.Series, pl.Series]:
-        """Return the offset and height [m] of matched positions, by index, from given tracks, shape (n,).
+        """Return the offsets and heights [m] of the matched positions `epoch` relative to the tracks `track`, shape
+        (n,).
 
-        The values are null if the track is not among the candidates of the position.
+        Both arguments are indices. A value is null if the track is not among the candidates of the position.
         """
         near = self.matched.candidates
         same = (near.track[epoch] == track[:, None]) & (track >= 0)[:, None]
@@ -317,7 +323,7 @@ class BaseObservations(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class LogPositions:
-    """Conventional positions of a log once per second, from which its route through a network is found."""
+    """Conventional positions of a log once per second, from which the route through a network is found."""
 
     path: str  #: Name of the log in messages.
     parts: Callable[[], Iterable[Observations]]  #: Returns the pieces of the log in order of time.
@@ -333,7 +339,7 @@ class LogPositions:
     def positions(self) -> PositionLog:
         """Positions with quality 5 (single), or 4 (DGPS) with a base station.
 
-        Raise NoPositionError if there is none.
+        Raise NoPositionError if the log has no position.
         """
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         base, state, located = self.open_base(), BaseState(), []

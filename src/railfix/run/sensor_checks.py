@@ -27,18 +27,23 @@ from railfix.tracking import Line
 _CELL_S: Final = 4.0
 #: Minimum speed for a check of signs [m/s].
 _MOVING_MPS: Final = 1.0
-#: Minimum number of cells for a check, and minimum variation of the compared force [m/s2], speed [m/s] and turn rate
-#: [rad/s].
+#: Minimum number of cells for a check.
 _LEAST_CELLS: Final = 15
+#: Minimum variation of the expected force for a comparison [m/s2].
 _LEAST_FORCE_MPS2: Final = 0.08
+#: Minimum variation of the expected speed for a comparison [m/s].
 _LEAST_SPEED_MPS: Final = 1.0
+#: Minimum variation of the expected turn rate for a comparison [rad/s].
 _LEAST_RATE_RADPS: Final = 0.003
-#: Slope of measured over expected values below which the sign is reversed, and above which a rate is in degrees.
+#: Slope of measured over expected values below which the sign of a sensor is reversed.
 _REVERSED: Final = -0.3
+#: Slope of measured over expected turn rates above which the sensor's rates are in degrees per second.
 _IN_DEGREES: Final = 10.0
-#: Largest tested and smallest reported lag [s], and minimum ratio of the unexplained variances without and with a lag.
+#: Largest tested lag of the time tags [s].
 _LONGEST_LAG_S: Final = 20.0
+#: Smallest reported lag of the time tags [s].
 _LEAST_LAG_S: Final = 2.0
+#: Minimum ratio of the unexplained variance without a lag to the unexplained variance with the lag.
 _LESS_ALIKE: Final = 2.0
 #: Largest difference of the mean force from gravity, as a fraction of gravity.
 _GRAVITY_SHARE: Final = 0.12
@@ -49,12 +54,10 @@ class PositionMotion:
     """Motion of an antenna from its positions, averaged over M cells of time; NaN if a neighbouring cell is empty."""
 
     time: Datetimes  #: Shape (M,).
-    #: Speed and acceleration toward rising chainage, gradient of the line (rise over horizontal length), and turn rate
-    #: of the line's heading, positive to the right; shape (M,).
-    speed_mps: Floats
-    acceleration_mps2: Floats
-    gradient: Floats
-    heading_rate_radps: Floats
+    speed_mps: Floats  #: Speed toward rising chainage, shape (M,).
+    acceleration_mps2: Floats  #: Acceleration toward rising chainage, shape (M,).
+    gradient: Floats  #: Gradient of the line (rise over horizontal length), shape (M,).
+    heading_rate_radps: Floats  #: Turn rate of the line's heading, positive to the right, shape (M,).
 
 
 def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
@@ -107,7 +110,7 @@ def sign_notes(
         slope = _slope(_centre(expected), _centre(force(time)), _LEAST_FORCE_MPS2)
         if slope < _REVERSED:
             yield (
-                "inertial: its force forward is opposite to the acceleration from satellites; the unit is mounted "
+                "inertial: the forward force is opposite to the acceleration from satellites; the unit is mounted "
                 "backwards, or facing in the vehicle file is wrong"
             )
         yaw = _means(inertial.time, inertial.rate_radps[:, 2], time)
@@ -126,8 +129,8 @@ def _of_speeds(
 ) -> Iterator[str]:
     """Check the time tags and the sign of a speed sensor, and yield sentences on errors.
 
-    `forward` are the expected speeds at `time`, `speeds` returns the measured speeds. `directed` begins the clause on a
-    wrong sign; without it the sign is not checked.
+    `forward` are the expected speeds at `time`, `speeds` returns the measured speeds. `directed` is the beginning of a
+    sentence on a wrong sign; if it is None, the sign is not checked.
     """
     lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
     if lag:
@@ -177,7 +180,7 @@ def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
 
 
 def _centre(values: Floats) -> Floats:
-    """Return values less their mean, so that a bias or misalignment of the unit does not affect the comparison."""
+    """Return values minus their mean, so that a bias or misalignment of the sensor does not affect the comparison."""
     known = np.isfinite(values)
     return values - (values[known].mean() if known.any() else 0.0)
 
@@ -200,7 +203,9 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
-    """Return the slope of measured over expected values; NaN for too few values or an expected rms below `least`."""
+    """Return the slope of measured over expected values; NaN for too few values, or if the expected rms is below
+    `least`.
+    """
     known = np.isfinite(expected) & np.isfinite(measured)
     x, y = expected[known], measured[known]
     if len(x) < _LEAST_CELLS or np.sqrt(np.mean(x * x)) < least:
@@ -210,20 +215,23 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
 
 #: Interval of the compared wheel speeds [ns].
 _STEP_NS: Final = 500_000_000
-#: Largest time between a sample and the satellite speeds before and after it [s].
+#: Largest time between a sensor speed and the Doppler speeds before and after it [s].
 _NEAR_S: Final = 1.5
-#: Smallest scale error and smallest lag [s] that are reported.
+#: Smallest reported scale error.
 _SCALE: Final = 0.01
+#: Smallest reported lag of speeds [s].
 _LAG_S: Final = 0.3
-#: Scale error above which a wrong number of pulses per turn is suggested too, as wear does not explain it.
+#: Scale error too large to be caused by wheel wear; above it, the note suggests a wrong number of pulses per turn.
 _OTHER_TEETH: Final = 0.1
-#: Comparison of ranges with satellite positions: largest time between two positions [s], minimum distance between them
-#: [m], largest distance of the unit [m], minimum cosine of the angle between its direction and the track, and minimum
-#: number of ranges on each side.
+#: Largest time between the satellite positions before and after a range that is compared with them [s].
 _BETWEEN_S: Final = 3.0
+#: Minimum distance between these two satellite positions [m].
 _MOVED_M: Final = 1.0
+#: Largest distance of a ground unit whose ranges are compared with satellite positions [m].
 _FAR_M: Final = 500.0
+#: Minimum cosine of the angle between the track and the direction to the ground unit.
 _AHEAD: Final = 0.7
+#: Minimum number of ranges to ground units ahead, or behind, for a comparison.
 _LEAST_RANGES: Final = 10
 #: Smallest reported difference between ranges and satellite positions [m]: twice the code error over minutes.
 _RANGE_M: Final = 3.0
@@ -233,8 +241,9 @@ _RANGE_M: Final = 3.0
 class SensorChecks:
     """Satellite positions and speeds of one antenna, collected for the checks of the on-board sensors."""
 
-    #: Doppler speeds (`doppler_speeds`) and single-epoch positions that passed every check, one frame per chunk.
+    #: Doppler speeds (`doppler_speeds`), one frame per chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
+    #: Single-epoch positions that passed every check, one frame per chunk.
     places: list[pl.DataFrame] = field(default_factory=list)
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
@@ -301,7 +310,7 @@ def range_notes(
     sides = [longer[(distance < _FAR_M) & (side * ahead > _AHEAD)] for side in (1.0, -1.0)]
     seen = [float(np.median(side)) for side in sides if len(side) >= _LEAST_RANGES]
     if not seen:
-        yield "ranging: too few ranges with satellite positions; the positions of its units are not checked"
+        yield "ranging: too few ranges at times of satellite positions; the positions of ground units are not checked"
         return
     if len(seen) == 2:
         moved, excess = (seen[1] - seen[0]) / 2.0, (seen[1] + seen[0]) / 2.0
@@ -311,7 +320,7 @@ def range_notes(
         fits = limits.range_ahead_m + trajectory.front_sign * moved
         which = "ahead of" if moved > 0 else "behind"
         yield (
-            f"ranging: range positions are {abs(moved):.1f} m {which} satellite positions in rising chainage; "
+            f"ranging: positions from ranges are {abs(moved):.1f} m {which} satellite positions in rising chainage; "
             f"sensors.range_ahead_m = {fits:.1f} would fit, or the units' surveyed positions are displaced"
         )
     if abs(excess) > _RANGE_M:
@@ -336,7 +345,7 @@ def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
 def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
     """Return a sentence on each speed sensor with a wrong unit, a lag, or a scale error.
 
-    `speeds` are the satellite speeds of one antenna (`doppler_speeds`), `tachometer` the settings of the wheel.
+    `speeds` are the Doppler speeds of one antenna (`doppler_speeds`), `tachometer` the settings of the tachometer.
     """
     right_time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
     right = speeds["speed_mps"].to_numpy()
@@ -354,13 +363,13 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
         fits = f"sensors.tachometer.wheel_diameter_m = {real:.3f}"
         if found is not None and abs(found.ratio - 1.0) > _OTHER_TEETH:
             fits = f"sensors.tachometer.pulses_per_turn = {found.ratio * tachometer.pulses_per_turn:.0f} or {fits}"
-        scale = f"its distance differs by {{:+.1f}} % from the satellite distance; {fits} would fit"
+        scale = f"its distance differs by {{:+.1f}} % from the distance measured by satellites; {fits} would fit"
         notes += _sentences("tachometer", found, scale)
     return tuple(notes)
 
 
 def _check(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
-    """Compare sensor speeds with satellite speeds (`right_mps`); None if too few have a common time."""
+    """Compare sensor speeds with Doppler speeds (`right_mps`); return None if too few speeds have a common time."""
     if len(right_time) < 2 or not len(time):
         return None
     after = np.clip(np.searchsorted(right_time, time), 1, len(right_time) - 1)

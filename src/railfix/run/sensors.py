@@ -62,9 +62,9 @@ def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
     """Read the surveyed ground units of two-way ranges; None without ranges.
 
-    `ranging` is the table of the ranges or their stream. Raise InputFileError if `units` is not a table of ground
-    units. Raise MismatchError if `units` lacks the unit of a range. Raise SettingsError if only one of `units` and
-    `ranging` is given.
+    `ranging` is the table or the stream of the ranges. Raise InputFileError if `units` is not a table of ground units.
+    Raise MismatchError if `units` lacks the unit of a range. Raise SettingsError if only one of `units` and `ranging`
+    is given.
     """
     if ranging is None and units is not None:
         raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
@@ -91,7 +91,7 @@ def read_units(path: Path) -> GroundUnits:
 
 
 def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
-    """Read a table ``balise,chainage_m`` and, if known, ``track,sigma_m`` of balises, or of virtual balises.
+    """Read a table of balises or virtual balises with columns ``balise,chainage_m`` and, if known, ``track,sigma_m``.
 
     In a row with the name of a track, the chainage is measured from the beginning of that track. Balises on tracks that
     are not part of the line, or beyond the ends of the line, are omitted.
@@ -123,7 +123,7 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
 
 
 def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
-    """Return the start and end chainage [m] of each track by source, name or file, and of the whole line by None."""
+    """Return the start and end chainages [m] of each track, by source, name or file, and of the line, by None."""
     spans: dict[str | None, tuple[float, float]] = {None: (0.0, float(track.chainage_m[-1]))}
     for source, (begin, end) in zip(track.sections, section_spans(track), strict=True):
         file, _, name = source.removesuffix(")").partition(" (")
@@ -142,7 +142,7 @@ def load_balises(
     """
     if virtual is not None and (config.filter == "off" or config.tracking.level == "off"):
         raise SettingsError(
-            "--virtual-balises needs the levels of the filter; leave out --filter off, tracking.level=off"
+            "--virtual-balises needs protection levels of the filter; leave out --filter off, tracking.level=off"
         )
     if (readings is None) != (places is None):
         given, lacking = ("--balises", "--balise-list") if places is None else ("--balise-list", "--balises")

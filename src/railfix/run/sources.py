@@ -56,8 +56,8 @@ class OpenedLine:
     frame: FrameShift | None = None
     #: Route through a network of tracks that was found from the log; None if the files are a single route.
     route: RouteOfLog | None = None
-    #: Whether the track equals its files: it is not a route of a network, has no heights from another source, and was
-    #: not transformed to another frame.
+    #: Whether the track is exactly as in its files, that is, it is not a route of a network, has no heights from
+    #: another source, and was not transformed to another frame.
     from_file: bool = True
     preparing: tuple[str, ...] = ()  #: Notes on the cache of prepared lines.
 
@@ -68,7 +68,8 @@ class OpenedLine:
         notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ()), *self.preparing]
         if turns := [turn for turn in self.turns_m.values() if np.isfinite(turn)]:
             notes.append(
-                f"the line is closed with a length of {turns[0]:.1f} m: chainages that differ by this are one position"
+                f"the line is closed with a length of {turns[0]:.1f} m: chainages that differ by this length are the "
+                "same position"
             )
         return tuple(dict.fromkeys([*(self.route.notes if self.route else ()), *notes]))
 
@@ -122,8 +123,8 @@ def open_line(
 
     With a time `at`, the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
     otherwise the coordinates remain in the frame of the map. A single file whose tracks do not join to one route is a
-    network, in which the route is found from `log`. If `heights` is `OF_LOG`, the positions of `log` are the heights of
-    a map without heights. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
+    network, in which the route is found from `log`. If `heights` is `OF_LOG`, the heights of a map without heights are
+    taken from the positions of `log`. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -225,11 +226,10 @@ class Log:
     paths: tuple[Path, ...]
     chunk_epochs: int  #: Maximum number of epochs of a piece.
     reading: LogReading = field(default_factory=LogReading)
-    #: Time of the first epoch that is read, and time before which epochs are read, GPS time; None without a limit.
-    start: datetime | None = None
-    end: datetime | None = None
+    start: datetime | None = None  #: GPS time from which epochs are read; None without a limit.
+    end: datetime | None = None  #: GPS time before which epochs are read; None without a limit.
     share: float = 0.0  #: Fraction of the files that has been read, 0 to 1.
-    problems: list[str] = field(default_factory=list)  #: Sentences on broken and skipped parts.
+    problems: list[str] = field(default_factory=list)  #: Sentences on malformed and skipped parts of the log.
     skipped: Counter[str] = field(default_factory=Counter)  #: Numbers of skipped items by kind.
 
     def parts(self) -> Generator[Observations]:
@@ -305,7 +305,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
 
 
 def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """Yield the items of an iterator, whose next item is computed in a separate thread; the items must not be None."""
+    """Yield the items of an iterator while a separate thread computes the next item; the items must not be None."""
     with ThreadPoolExecutor(max_workers=1) as reader:
         coming = reader.submit(next, items, None)
         while (item := coming.result()) is not None:

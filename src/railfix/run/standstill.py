@@ -27,7 +27,7 @@ from railfix.ranges.atmosphere import thin_shell_obliquity
 _SHARE: Final = 0.9
 #: Standard deviation of satellite and atmospheric errors that remain with a base station at most 10 km away [m].
 _BESIDE_BASE_M: Final = 0.05
-#: Largest horizontal distance between the median positions of the thirds of the log of an antenna at rest [m].
+#: Distance in plan between the median positions of the thirds of a log up to which an antenna counts as at rest [m].
 _AT_REST_M: Final = 8.0
 #: Change of a double difference between epochs that indicates a cycle slip [wavelengths].
 _SLIP: Final = 0.25
@@ -39,17 +39,16 @@ _LOST, _HALF_CYCLE = 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillCodes:
-    """Code residuals of one antenna at rest with respect to an origin: T epochs, K satellites."""
+    """Code residuals of one antenna at rest, computed for the position `origin_ecef_m`: T epochs, K satellites."""
 
     time: Datetimes  #: Shape (T,).
-    #: Measured minus computed codes, less their mean over the satellites of each clock group, shape (T, K); NaN where
-    #: a satellite was not used.
+    #: Measured minus computed codes, reduced by the mean over the satellites of each clock group, shape (T, K); NaN
+    #: where a satellite was not used.
     residual_m: Floats
     system: Strings  #: Clock group of each satellite, shape (K,).
-    #: Mean directions of the satellites, and standard deviation of satellite and atmospheric errors; shape (K,).
-    azimuth_deg: Floats
-    elevation_deg: Floats
-    common_m: Floats
+    azimuth_deg: Floats  #: Mean azimuth of each satellite, shape (K,).
+    elevation_deg: Floats  #: Mean elevation of each satellite, shape (K,).
+    common_m: Floats  #: Standard deviation of satellite and atmospheric errors, shape (K,).
     receivers: int  #: Factor of the variance of receiver errors: 2 if a base station's codes are subtracted, else 1.
     origin_ecef_m: Floats  #: Shape (3,).
     phases: StandstillPhases | None = None  #: Carrier phases; None without a base station.
@@ -77,12 +76,12 @@ def standstill_codes(
     base: tuple[Observations, Floats] | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
-    """Return code residuals, and with a base station also phases, of an antenna at rest with respect to an origin.
+    """Return the code residuals of an antenna at rest and, with a base station, its carrier phases.
 
-    The default origin is the median position of the antenna. `base` has the observations of a base station and its
-    position, ECEF, shape (3,) [m]. Raise NoPositionError if the log has fewer than two positions. Raise MismatchError
-    if the antenna moves, no satellite is observed over the whole log, or the log has no epoch or signal in common with
-    the base station.
+    The residuals are computed for the position `origin_ecef_m`, by default the median position of the antenna. `base`
+    has the observations of a base station and its position, ECEF, shape (3,) [m]. Raise NoPositionError if the log has
+    fewer than two positions. Raise MismatchError if the antenna moves, no satellite is observed over the whole log, or
+    the log has no epoch or signal in common with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = ranges_without_map(obs, received, config, book)
@@ -226,18 +225,19 @@ def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
     return slice(int(known[bounds[longest]]), int(known[bounds[longest + 1] - 1]) + 1)
 
 
-#: One receiver: log, corrected ranges, ECEF position, and indices of the epochs and channels to use.
+#: Data of one receiver: log, corrected ranges, ECEF position, and indices of the epochs and channels to use.
 _Side = tuple[Observations, RangesWithoutMap, Floats, Indices, Indices]
 
 
 def _phases(train: _Side, base: _Side) -> StandstillPhases:
-    """Return the single differences of the phases without GLONASS, whose wavelengths differ between satellites."""
+    """Return single differences of phases; GLONASS is omitted, because its wavelengths differ between satellites."""
     sides, lost = [], []
     for obs, seen, place, epochs, columns in (train, base):
         channel = seen.corrected.channels.columns[columns]
         wavelength = SPEED_OF_LIGHT / seen.corrected.channels.frequency_hz[columns]
         rows = np.ix_(epochs, columns)
-        # corrections as for the codes; the ionospheric delay, of opposite sign for phases, cancels in the difference
+        # The corrections are those of the codes. The ionospheric delay has the opposite sign for phases, but cancels in
+        # the difference.
         corrections = seen.ranges.code_m[rows] - obs.code_m[np.ix_(epochs, channel)]
         lock = obs.loss_of_lock[np.ix_(epochs, channel)]
         phase = obs.phase_cycles[np.ix_(epochs, channel)] * wavelength + corrections

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
-#: Suspicions of interference with which a map offset is still attributed to the map.
+#: Results of the interference checks with which an offset from the map is still attributed to the map.
 _MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
@@ -56,8 +56,8 @@ class MapOffsetFound:
     time: np.datetime64  #: End of the window.
     across_m: float  #: Offset to the right of the line [m].
     up_m: float  #: Offset above the line [m].
-    across_sigma_m: float  #: Standard deviations of the offsets [m].
-    up_sigma_m: float
+    across_sigma_m: float  #: Standard deviation of `across_m` [m].
+    up_sigma_m: float  #: Standard deviation of `up_m` [m].
     statistic: float  #: Test statistic of the offset (`railfix.integrity`).
 
     @property
@@ -79,24 +79,23 @@ class AntennaTally:
 
     min_satellites: int = 3  #: Minimum number of satellites per epoch.
     judged: dict[str, bool] = field(default_factory=dict)  #: Whether each screen has tested any observation.
-    #: Numbers of epochs, of epochs with at least one pseudorange, and of epochs with coordinates.
-    epochs: int = 0
-    observed: int = 0
-    positioned: int = 0
-    #: Numbers of pseudoranges, and of used pseudoranges.
-    observations: int = 0
-    used: int = 0
+    epochs: int = 0  #: Number of epochs.
+    observed: int = 0  #: Number of epochs with at least one pseudorange.
+    positioned: int = 0  #: Number of epochs with coordinates.
+    observations: int = 0  #: Number of pseudoranges.
+    used: int = 0  #: Number of pseudoranges used for positions.
 
     status: Counter[str] = field(default_factory=Counter)  #: Epochs by status.
     status_positioned: Counter[str] = field(default_factory=Counter)  #: Epochs with coordinates by status.
-    #: Epochs with too few satellites by the first reason, in the order of the bits, after which too few satellites
-    #: remain. `not_observed` means that too few satellites were observed; `used` means that enough satellites remained,
-    #: but their clocks left no range for the position.
+    #: Number of epochs with too few satellites, by the first rejection reason, in the order of the bits, after which
+    #: too few satellites remain. `not_observed` means that too few satellites were observed; `used` means that enough
+    #: satellites remained, but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
-    #: Epochs with too few satellites by each reason without which enough satellites would remain.
+    #: Number of epochs with too few satellites, by each rejection reason without which enough satellites would remain.
     short_only: Counter[str] = field(default_factory=Counter)
-    #: Observations by the first rejection reason, and observations with a single rejection reason by this reason.
+    #: Number of rejected observations by their first rejection reason.
     first_reason: Counter[str] = field(default_factory=Counter)
+    #: Number of observations with a single rejection reason, by this reason.
     only_reason: Counter[str] = field(default_factory=Counter)
     satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
     #: Observations by satellite without a valid navigation record.
@@ -109,14 +108,15 @@ class AntennaTally:
     conventional_nearest_m: float = float("nan")
     #: Epochs by status of the protection level; empty if protection levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
-    #: Epochs without a protection level because simultaneous faults of more satellites than can be left out exceed the
-    #: risk, or because too many satellites are excluded.
+    #: Number of epochs without a protection level because simultaneous faults of more satellites than can be excluded
+    #: are more probable than the risk allows, or because too many satellites are excluded.
     without_budget: int = 0
     #: Map offset with the largest test statistic; None before there were enough positions.
     map_offset: MapOffsetFound | None = None
-    #: By satellite, the number of epochs at which its codes were excluded as persistently wrong, and the first of these
-    #: epochs: `left_out` by the filter, `lasting` by single epochs.
+    #: By satellite, the number of epochs at which the filter excluded the satellite's codes as persistently wrong, and
+    #: the first of these epochs.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    #: As `left_out`, for codes excluded by single-epoch positioning.
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     #: By sign of interference, the number of epochs with this sign, and the first of these epochs.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
@@ -275,7 +275,8 @@ class Tally:
 
     min_satellites: int = 3  #: Minimum number of satellites per epoch.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    notes: dict[str, None] = field(default_factory=dict)  #: Notes as keys, in the order of arrival.
+    #: The notes are the keys, in the order in which they were added.
+    notes: dict[str, None] = field(default_factory=dict)
     #: For each chunk, its first epoch, its number of epochs of all antennas, and the elapsed time of positioning [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
     order: AntennaOrder | None = None  #: Test whether front and rear antenna are exchanged; None with one antenna.
@@ -319,9 +320,9 @@ class Tally:
 def _count_left_out(
     counts: dict[str, tuple[int, np.datetime64]], left_out: Masks, satellite: Strings, time: Datetimes
 ) -> None:
-    """Add to `counts` the number of epochs with a set flag in `left_out`, shape (T, K), by the name of the column.
+    """Add to `counts` the number of epochs with a set flag in each column of `left_out`, shape (T, K).
 
-    The first such epoch of each name is kept.
+    The names of the columns are in `satellite`. The first of these epochs is kept for each name.
     """
     for k in np.flatnonzero(left_out.any(axis=0)).tolist():
         name, first = str(satellite[k]), time[int(np.argmax(left_out[:, k]))]

@@ -26,17 +26,17 @@ _PROMISED: Final = ("tracking", "coasting")
 class PositionFigures:
     """Figures of the filtered or single-epoch positions of an antenna; None if a figure does not exist."""
 
-    epochs: int  #: Number of all epochs for the filter along the track, of epochs with observations for single epochs.
+    epochs: int  #: For the filter, the number of all epochs; for single epochs, the number of epochs with observations.
     positions: int  #: Number of epochs with a position.
     passed: int  #: Number of epochs with status `ok`, or, for the filter, `tracking` or `coasting`.
     statuses: Mapping[str, int]  #: Number of epochs of each occurring status, the most frequent first.
-    chainage_first_m: float | None  #: Smallest and largest chainage [m].
-    chainage_last_m: float | None
-    sigma_p50_m: float | None  #: Median, 95th percentile and largest standard deviation along the line [m].
-    sigma_p95_m: float | None
-    sigma_max_m: float | None
-    level_p50_m: float | None  #: Median and 95th percentile of the finite protection levels [m].
-    level_p95_m: float | None
+    chainage_first_m: float | None  #: Smallest chainage [m].
+    chainage_last_m: float | None  #: Largest chainage [m].
+    sigma_p50_m: float | None  #: Median standard deviation along the line [m].
+    sigma_p95_m: float | None  #: 95th percentile of the standard deviation along the line [m].
+    sigma_max_m: float | None  #: Largest standard deviation along the line [m].
+    level_p50_m: float | None  #: Median of the finite protection levels [m].
+    level_p95_m: float | None  #: 95th percentile of the finite protection levels [m].
 
 
 @dataclass(frozen=True, kw_only=True)

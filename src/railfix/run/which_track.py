@@ -39,8 +39,9 @@ from railfix.track.network_read import read_network
 
 #: Largest distance moved, due to wheel creep and coupler slack, for which the train counts as not moved [m].
 _SAME_PLACE_M: Final = 1.0
-#: Error bound of the distance moved: a fraction of the distance plus a constant [m].
+#: Part of the odometer's error bound that is proportional to the distance moved, as a fraction of this distance.
 _ODOMETER_SHARE: Final = 0.05
+#: Constant part of the odometer's error bound [m].
 _ODOMETER_M: Final = 10.0
 #: Distance of the code position from the most likely track, in standard deviations, above which a note is issued.
 _NOTED_MISFIT: Final = 2.5
@@ -64,7 +65,7 @@ def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path)
 def prior_of_last_place(
     path: Path, network: Network, *, moved_m: float, missed_move: float, unmapped: float
 ) -> TrackPrior:
-    """Return the prior of tracks from the file of `write_last_place` and the distance moved since then [m].
+    """Return the prior of tracks from the file written by `write_last_place` and the distance moved since then [m].
 
     `missed_move` is the probability that the train was moved to any track without being noticed; `unmapped` is the
     prior of an unmapped track in that case. Raise InputFileError if the file has no probabilities of tracks of this
@@ -95,7 +96,7 @@ def prior_of_last_place(
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
-    """Return the names of the tracks within a distance of any point of a track, with reversals allowed."""
+    """Return the names of the tracks that can be reached from a track within a distance, with reversals allowed."""
     near = nx.multi_source_dijkstra_path_length(
         network.graph.to_undirected(as_view=True), {4 * track + k for k in range(4)}, cutoff=within_m
     )
@@ -123,9 +124,11 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     return weights
 
 
-#: Distance from the train within which a track is a hypothesis, and within which points of a track are used [m].
+#: Distance from the train within which a track is a hypothesis [m].
 _NEAR_M: Final = 60.0
+#: Distance from the train within which the points of such a track are used [m].
 _POINTS_M: Final = 400.0
+#: Maximum number of tracks that are hypotheses.
 _MOST_TRACKS: Final = 64
 
 
@@ -237,14 +240,15 @@ class WhichTrackInputs(InputFiles):
     nav: tuple[Path, ...] = input_option(NAVIGATION, (), metavar="NAV")
     map: tuple[Path, ...] = input_option("Map files with the tracks of the yard or station.", metavar="MAP")
     last: Path | None = input_option(
-        "Probabilities of the tracks at the end of the last standstill, a file written by --save-last.", None
+        "File written by --save-last, with the probabilities of the tracks at the end of the last standstill.", None
     )
 
 
 class WhichTrackOptions(Settings):
     """Options of `railfix which-track`.
 
-    With `same_frame`, the position of the train, which is relative to the base station, is in the frame of the map too.
+    With `same_frame`, the base station's position is in the frame of the map. The position of the train is then in this
+    frame, too, because it is computed relative to the base station.
     """
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
@@ -332,7 +336,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if last.misfit_sigmas[best] > _NOTED_MISFIT:
         notes.append(
             f"the code position lies {last.misfit_sigmas[best]:.1f} standard deviations from {last.names[best]}, the "
-            "most likely track, and there is no decision beyond 4; check whether the map is displaced or lacks a track"
+            "most likely track; beyond 4, no decision is made. Check whether the map is displaced or lacks a track"
         )
     return replace(decision, notes=tuple(notes))
 

@@ -33,9 +33,10 @@ _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points at which the curve is integrated [m]; the spline between the points is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-_ROUNDS: Final = 8  #: Rounds of the integration; each reduces the error by the factor (length / Earth radius).
+_ROUNDS: Final = 8  #: Number of rounds of the integration; each multiplies the error by (length / Earth radius).
 
-#: Pattern of the simulated test line: length [m], radius (right positive) [m] and cant [m] at its end.
+#: Elements of the simulated test line: length [m], and radius (right positive) [m] and cant [m] at the end of the
+#: element.
 PATTERN: Final = (
     (90.0, np.inf, 0.0),
     (40.0, -160.0, 0.090),
@@ -47,7 +48,7 @@ PATTERN: Final = (
     (35.0, np.inf, 0.0),
     (226.0, np.inf, 0.0),
 )
-#: Gradient at points of the pattern: chainage [m] and gradient [permille]; linear between the points.
+#: Gradient at points of the pattern: chainage [m] and gradient [permille]. Between the points, the gradient is linear.
 GRADIENT: Final = (
     (0.0, 0.0), (60.0, 0.0), (100.0, -4.0), (180.0, -4.0), (240.0, 10.0), (380.0, 10.0), (450.0, 2.5),
     (560.0, 2.5), (620.0, -6.0), (700.0, -6.0), (756.0, 0.0),
@@ -219,7 +220,7 @@ def _integrate(line: Alignment) -> tuple[Floats, Floats]:
     lat0, lon0 = np.radians([settings.latitude_deg, settings.longitude_deg])
 
     def total(rate: Floats) -> tuple[Floats, Floats]:
-        """Return the integral of a rate that is given at the Gauss points, at the edges and at the Gauss points."""
+        """Integrate a rate given at the Gauss points; return the integrals at the edges and at the Gauss points."""
         at_edges = np.concatenate([[0.0], np.cumsum(rate.mean(axis=1) * step)])
         slope = (rate[:, 1] - rate[:, 0]) / (offset[1] - offset[0])
         start = rate[:, 0] - slope * offset[0]

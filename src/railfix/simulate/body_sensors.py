@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
 
 _STEP_S: Final = 0.01  #: Spacing of the instants between which the wheel's acceleration is constant [s].
-#: Time step of the search for phases of acceleration and braking [s], and their minimum acceleration [m/s^2].
-_LOOK_S: Final = 0.1
-_HARD_MPS2: Final = 0.05
+_LOOK_S: Final = 0.1  #: Time step of the search for phases of acceleration and braking [s].
+_HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in these phases [m/s^2].
 #: Streams of random numbers: phase and jitter, slips, teeth, lost and doubled pulses.
 _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
@@ -57,7 +56,8 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # Drawn for every phase, so that the slips of a phase do not depend on the slips of other phases.
+        # These numbers are drawn for every phase, so that the slips of a phase do not depend on the slips of other
+        # phases.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
             continue
@@ -174,11 +174,12 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
     return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
 
 
-_HALF_S: Final = 0.02  #: Longest half interval of the differences in time [s].
+_HALF_S: Final = 0.02  #: Upper limit of half the interval of the differences in time [s].
 _BLOCK: Final = 50_000  #: Number of samples computed in one step.
 #: Lever arm from which the attitude is computed, so long that rounding of positions is negligible [m].
 _LEVER_M: Final = 10.0
-#: Normal gravity of WGS 84 at the equator [m/s^2], Somigliana's constant, flattening, m, semi-major axis [m].
+#: Constants of WGS 84: normal gravity at the equator [m/s^2], Somigliana's constant, flattening, ratio m of centrifugal
+#: acceleration to gravity, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
 _ECCENTRICITY_2: Final = 6.694_379_990_14e-3
 #: Streams of random numbers: noise, bias drifts, bias walk, vibration.

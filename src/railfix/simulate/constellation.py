@@ -2,7 +2,7 @@
 
 Orbits have the semi-major axis, eccentricity and inclination of the real constellations; one QZSS satellite is near the
 zenith at the start of the run. All records of a satellite describe the same orbit and clock to within a millimetre.
-Signals are computed from the newest transmitted record, which receivers use, too.
+Signals are computed from the newest transmitted record, as in a receiver.
 
 `links` computes the states at every instant; `SatelliteTable` computes the states of all satellites at nodes, and
 interpolates them.
@@ -26,7 +26,8 @@ from railfix.io.rinex import read_navigation
 from railfix.io.rinex.navigation_records import glonass_records
 from railfix.simulate.scenario import Scenario
 
-#: Health of an unhealthy satellite: all data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou).
+#: Health word of an unhealthy satellite, by constellation: all data bad (GPS, QZSS), E1-B and E5b out of service
+#: (Galileo), SatH1 (BeiDou).
 _ILL_HEALTH: Final = {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}
 #: Largest time from the reference time at which a record is valid [s], as in `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
@@ -277,11 +278,9 @@ def _digits(value: float) -> str:
     return f"{value:.12E}"
 
 
-#: Longest piece of `SatelliteTable` [s], number of nodes per piece, and approximate flight time from which the
-#: light-time equation is solved [s].
-_PIECE_S: Final = 60.0
-_NODES: Final = 7
-_FLIGHT_S: Final = 0.08
+_PIECE_S: Final = 60.0  #: Longest piece of `SatelliteTable` [s].
+_NODES: Final = 7  #: Number of nodes per piece of `SatelliteTable`.
+_FLIGHT_S: Final = 0.08  #: Approximate flight time with which the iteration of the light-time equation begins [s].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,14 +309,14 @@ def record_state(
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
-    """Return the row of the newest record of a satellite that was transmitted before each time, else its first row."""
+    """Return the row of the newest record of a satellite transmitted before each time, or of its first record."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Return the signals of a satellite that a receiver receives `late_s` before T time tags.
+    """Return the signals that a receiver receives from a satellite `late_s` before T time tags.
 
     The light-time equation is solved by iteration.
     """

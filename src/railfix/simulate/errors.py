@@ -29,7 +29,8 @@ from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, Sat
 _NODES_A_TIME: Final = 32  #: Number of nodes per correlation time.
 #: Minimum number of nodes before the start of the run.
 _BEFORE: Final = 3
-#: Margins before and after the run [s], because clock biases shift instants beyond its start and end.
+#: Margins before and after the run [s]. They are needed because clock biases shift instants beyond the start and the
+#: end of the run.
 _ROOM_S: Final = (0.1, 1.0)
 
 
@@ -277,7 +278,7 @@ class CommonErrors:
         return error
 
     def path_m(self, time_s: Floats, sight: Floats, elevation_deg: Floats) -> Floats:
-        """Return the sum of the range errors by orbit, clock and troposphere, shape (T, S) [m].
+        """Return the sum of the range errors due to orbit, clock and troposphere, shape (T, S) [m].
 
         `sight` are the unit vectors from receiver to satellite, shape (T, S, 3).
         """

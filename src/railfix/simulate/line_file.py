@@ -33,9 +33,8 @@ from railfix.simulate.settings import (
 )
 from railfix.track import Track, read_track
 
-#: Default lengths of the pattern of P1's test line, and of a generated line [m].
-PATTERN_LENGTH_M: Final = 756.0
-GENERATED_LENGTH_M: Final = 36_000.0
+PATTERN_LENGTH_M: Final = 756.0  #: Default length of the pattern of P1's test line [m].
+GENERATED_LENGTH_M: Final = 36_000.0  #: Default length of a generated line [m].
 LONGEST_LINE_M: Final = 1e7  #: Largest length of a line and of an element [m].
 
 
@@ -109,9 +108,9 @@ class LineFile(ScenarioSettings):
     path: str  #: Path for `railfix.track.read_track`; in a scenario file, relative to the file's folder.
     from_m: NotNegative = 0.0  #: Chainage of the file at which the line begins.
     to_m: float = Field(default=math.inf, allow_inf_nan=True)  #: Chainage of the file at which the line ends.
-    crs: str = ""  #: Option of `read_track`; empty if the file states it.
-    height_datum: str = ""  #: Option of `read_track`; empty if the file states it.
-    geoid: str = ""  #: Option of `read_track`; empty if not needed.
+    crs: str = ""  #: CRS of the file, an option of `read_track`; empty if the file states the CRS.
+    height_datum: str = ""  #: Height datum of the file, an option of `read_track`; empty if the file states the datum.
+    geoid: str = ""  #: Geoid of orthometric heights, an option of `read_track`; empty if no geoid is needed.
 
     _forward = field_validator("to_m")(beyond_start)
 
@@ -405,6 +404,6 @@ def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: F
 
 
 def _fill_gaps(point: Floats, values: Floats) -> Floats:
-    """Return values in which NaN is interpolated linearly over chainage, and at the ends replaced by the next value."""
+    """Return values in which NaN is interpolated linearly over chainage; at the ends, the nearest value is used."""
     known = np.isfinite(values)
     return np.interp(point, point[known], values[known])

@@ -69,7 +69,7 @@ class Motion:
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
     """Return a motion whose jerk is limited by averaging over a time T.
 
-    The speed becomes ``(s(t) - s(t - T)) / T`` with the chainage s, a delay of T / 2 on average.
+    The speed becomes ``(s(t) - s(t - T)) / T`` with the chainage s, so that the motion is delayed by T / 2 on average.
     """
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3
@@ -102,13 +102,13 @@ def _breakpoints(start_s: Floats, duration_s: float) -> Floats:
 
 
 def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> Floats:
-    """Return the acceleration just after breakpoints less the acceleration `duration_s` earlier [m/s^2]."""
+    """Return the acceleration just after breakpoints minus the acceleration `duration_s` earlier [m/s^2]."""
     after = time_s + 1e-9
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
 
 _STEP_M: Final = 2.0  #: Spacing of the positions at which a run curve evaluates the speed limits [m].
-_RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelset less the gauge [m].
+_RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelset minus the gauge [m].
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
@@ -185,8 +185,8 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
     """Return the motion from one standstill to the next, shape (4, P).
 
     The rows are time since the start, chainage, speed and acceleration. The square of the speed at a position is at
-    most the square of each speed limit plus ``2 a`` times the distance to this limit, with the acceleration for limits
-    behind and the deceleration for limits ahead.
+    most the square of each speed limit plus ``2 a`` times the distance to this limit, where ``a`` is the acceleration
+    for limits behind the position, and the deceleration for limits ahead.
     """
     cells = max(2, int(np.ceil(abs(last_m - first_m) / _STEP_M)))
     way = np.linspace(0.0, abs(last_m - first_m), cells + 1)

@@ -31,8 +31,9 @@ class CarriedNoise:
         self._cn0 = _FirstOrder((*key, 1), channels, interval_s / settings.cn0_wander_time_s)
 
     def code(self, white: Floats) -> Floats:
-        """Return code noise of standard deviation 1, shape (T, M); `white` is white noise for its uncorrelated part,
-        (T, M).
+        """Return code noise of standard deviation 1, shape (T, M).
+
+        `white` is the white noise of which the uncorrelated part is formed, shape (T, M).
         """
         share = self._settings.code_correlated_share
         if share == 0.0:
@@ -70,7 +71,7 @@ class CodeSmoothing:
         self._state = np.full(channels, np.nan)
 
     def next(self, error_m: Floats, lost: Masks) -> Floats:
-        """Return the filtered errors of the next epochs, shape (T, M); unchanged where the signal is lost."""
+        """Return the filtered errors of the next epochs, shape (T, M); errors of lost signals are not filtered."""
         if self._keep == 0.0:
             return error_m
         smoothed, keep = error_m.copy(), self._keep
@@ -242,7 +243,7 @@ class ReceiverClocks:
         return -0.61 * bias, 0.83 * drift
 
     def bias_s(self, receiver: str, tag_s: Floats) -> Floats:
-        """Return the clock bias (time tag minus GPS time) at tags counted from the start, shape (T,) [s]."""
+        """Return the clock bias (time tag minus GPS time) at time tags counted from the start, shape (T,) [s]."""
         bias, drift = self._line(receiver)
         value = bias + drift * tag_s
         walk = self._walk(receiver)
@@ -252,7 +253,7 @@ class ReceiverClocks:
         return value - np.rint(value * 1e3) * 1e-3 if steps else value
 
     def rate_mps(self, receiver: str, tag_s: Floats) -> Floats:
-        """Return the clock drift at tags counted from the start, without millisecond steps, shape (T,) [m/s]."""
+        """Return the clock drift, without millisecond steps, at time tags counted from the start, shape (T,) [m/s]."""
         even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self._line(receiver)[1])
         walk = self._walk(receiver)
         return even if walk is None else even + walk.rate(tag_s)[:, 0]

@@ -122,10 +122,12 @@ def _list_effects(scenario: Scenario) -> str:
         ))  # fmt: skip
         place = {"ahead": ranging.along_m, "right": right, "above": above}
         given = " ".join(f"--set sensors.range_{name}_m={metres:g}" for name, metres in place.items() if metres)
-        parts.append(f"The position of the vehicle's ranging unit, for `railfix run`: `{given}`.")
+        parts.append(f"Give `railfix run` the position of the vehicle's ranging unit with `{given}`.")
     balises = None if scenario.sensors is None else scenario.sensors.balises
     if balises is not None and balises.along_m:
-        parts.append(f"The balises' reader, for `railfix run`: `--set sensors.balise.ahead_m={balises.along_m:g}`.")
+        parts.append(
+            f"Give `railfix run` the balise reader's position with `--set sensors.balise.ahead_m={balises.along_m:g}`."
+        )
     if scenario.multipath:
         parts.append("Disturbances given from Python, which are not in the settings below.")
     return " ".join(parts)
@@ -153,7 +155,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
     The columns are `time_gpst` (time tag), `antenna`, `chainage_m` (centreline point abeam the antenna, in the chainage
     of the track map), `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage),
     `acceleration_mps2` (along the line, positive toward rising chainage) and `environment` (kind of section, "open"
-    outside all sections). The values refer to the true instant, which is the time tag less the receiver clock bias.
+    outside all sections). The values refer to the true instant, which is the time tag minus the receiver clock bias.
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)
@@ -201,7 +203,7 @@ def write_run(
     overwrite: Overwrite = "refuse",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run, write its files, which appear together when all are written, and return their paths by name.
+    """Simulate a run, write its files, and return their paths by name.
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx if plain)
@@ -217,11 +219,12 @@ def write_run(
     README.md                    contents and settings of the run
     ============================ ===================================================
 
-    With `packing` "plain", no file is compressed, and the tables of sensors are CSV files. `command` is the command
-    that the README names. `progress` is called with the receiver and the number of epochs written since the last call.
-    The names of the paths are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``,
-    the names of reference stations and sensor tables, ``scenario`` and ``readme``. Raise SettingsError if the scenario
-    is invalid, and OutputError if a file cannot be written.
+    The files appear in the folder together, when all are complete. With `packing` "plain", no file is compressed, and
+    the tables of sensors are CSV files. `command` is the command that the README names. `progress` is called with the
+    name of the receiver and the number of epochs written since the last call. The names of the paths are ``front``,
+    ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the names of reference stations and
+    sensor tables, ``scenario`` and ``readme``. Raise SettingsError if the scenario is invalid, and OutputError if a
+    file cannot be written.
     """
     check_type(scenario, Scenario, "scenario")
     simulation = Simulation(scenario)

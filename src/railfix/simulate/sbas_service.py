@@ -29,7 +29,7 @@ LongTerm = tuple[int, int, tuple[float, float, float], float]
 #: Resolution of corrections and delays [m].
 STEP_M: Final = 0.125
 NO_DELAY: Final = 15  #: GIVEI of a grid point that is not monitored.
-#: Fields of type 10 in their order, with their lengths in bits.
+#: Fields of message type 10 in order, with the length of each field in bits.
 DEGRADATION: Final = {
     "brrc": 10, "cltc_lsb": 10, "cltc_v1": 10, "iltc_v1": 9, "cltc_v0": 10, "iltc_v0": 9, "cgeo_lsb": 10,
     "cgeo_v": 10, "igeo": 9, "cer": 6, "ciono_step": 10, "iiono": 9, "ciono_ramp": 10, "rss_udre": 1,
@@ -141,9 +141,10 @@ def grid_delay(
     return message(26, second, (band, 4), (block, 4), *pairs, (iodi, 2))
 
 
-#: Numbers of slots of a message of types 2 to 5, satellites of type 25, and grid points of type 26.
+#: Numbers per message: slots in types 2 to 5, satellites in type 25, and grid points in type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-_MIXED: Final = 6  #: Number of slots of type 24, which replaces the last fast message if at most this many remain.
+#: Number of slots in message type 24, which replaces the last fast message if at most this many slots remain.
+_MIXED: Final = 6
 #: Largest fast correction, orbit correction and grid delay that the fields can represent [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
 FAST_PERIOD_S: Final = 6  #: Interval between two fast corrections of a satellite [s].
@@ -176,7 +177,7 @@ class Service:
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:
-        """Return the fast corrections of `satellites` [m]: clock less group-delay errors of L1 C/A, plus noise."""
+        """Return the fast corrections of `satellites` [m]: clock minus group-delay errors of L1 C/A, plus noise."""
         clock = self._errors.clock_error_m(self._instant(second))[0]
         noise = self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(self.satellites))
         return np.asarray(np.clip(clock - self._group_delay_m + noise, -_LARGEST_FAST_M, _LARGEST_FAST_M))

@@ -106,7 +106,7 @@ def parameters(
     )
 
 
-#: Covariance that is sent: 1.03 to 1.06 times the sigma of the DFREI along a line of sight.
+#: Covariance that is sent. Along a line of sight, its sigma is 1.03 to 1.06 times the sigma of the DFREI.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
 _LARGEST_M: Final = 63.9  #: Largest clock correction that the field can represent [m].
 _GROWTH_MPS: Final = 0.002  #: Degradation rate of the corrections [m/s].
@@ -142,7 +142,7 @@ class SimulatedDfmc(Service):
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 35 and 36 as functions of the second and of an issue, which has no effect."""
+        """Return the messages of types 35 and 36 as functions of the second and of an issue, which is not used."""
 
         def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
             return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)

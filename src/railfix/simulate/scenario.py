@@ -29,7 +29,7 @@ from railfix.simulate.settings import (
 )
 
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle, in the order in which their files are written.
-#: Names of files of a run, which a reference station must not have.
+#: Names of the files of a run, which are not allowed as names of reference stations.
 _FILES: Final = (*ANTENNAS, "nav", "track", "vehicle", "truth", "sections", "scenario", "readme", "sbas")
 LONGEST_S: Final = 8.64e6  #: Largest duration of a run, 100 days [s].
 
@@ -147,8 +147,8 @@ class ReceiverSettings(ScenarioSettings):
 
     #: Number of signals of a satellite, each with code, phase, Doppler and C/N0.
     signals_per_satellite: Literal[1, 2] = 1
-    #: Second signals: "L2" stands for L2C, E5b and B3I, "L5" for L5, E5a and B2a, with B1C and B-CNAV1 instead of B1I
-    #: and D1.
+    #: Second signals. "L2" stands for L2C, E5b and B3I. "L5" stands for L5, E5a and B2a; BeiDou satellites then have
+    #: B1C instead of B1I, and B-CNAV1 records instead of D1 records.
     second: Literal["L2", "L5"] = "L2"
     code_sigma_m: NotNegative = 0.5  #: Standard deviation of the code noise at 45 dB-Hz in the zenith.
     phase_sigma_m: NotNegative = 0.002  #: Standard deviation of the carrier-phase noise.

@@ -76,7 +76,7 @@ def _gps_time(value: Any) -> np.datetime64:
 
 
 def _toml_time(time: np.datetime64) -> datetime | str:
-    """Return a time as a TOML time if its resolution of microseconds suffices, else as text."""
+    """Return a time as a TOML time if it is a whole number of microseconds, otherwise as text."""
     rounded = datetime.fromisoformat(str(time.astype("datetime64[us]")))
     return rounded if np.datetime64(rounded) == time else str(time)
 
@@ -100,8 +100,8 @@ class ScenarioSettings(Settings):
 class Interval(ScenarioSettings):
     """Time interval within a run."""
 
-    start_s: Finite  #: Time after the start of the run.
-    #: Time after the start of the run; None for the end of the run.
+    start_s: Finite  #: Start of the interval, as time after the start of the run.
+    #: End of the interval, as time after the start of the run; None for the end of the run.
     end_s: Annotated[float, Field(allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
@@ -167,7 +167,7 @@ class InterSystemSettings(ScenarioSettings):
 
     offset_m: Finite = 0.0  #: Inter-system bias at the start of the run.
     drift_mps: Finite = 0.0  #: Drift of the inter-system bias.
-    #: Bias of the rear receiver less the bias of the front receiver, with common and with separate clocks.
+    #: Bias of the rear receiver minus the bias of the front receiver, with common and with separate clocks.
     rear_difference_m: Finite = 0.0
 
 
@@ -180,8 +180,8 @@ class NoiseSettings(ScenarioSettings):
     #: Standard deviation of the Gauss-Markov variation of C/N0, independent for each channel.
     cn0_wander_sigma_db: NotNegative = 0.0
     cn0_wander_time_s: Positive = 10.0  #: Correlation time of the C/N0 variation.
-    #: Observables whose noise depends on C/N0: only codes, or also phase and Doppler, by the same law (10 times the
-    #: noise at a C/N0 20 dB lower; the sigmas of `ReceiverSettings` refer to 45 dB-Hz).
+    #: Observables whose noise depends on C/N0: only codes, or also phase and Doppler. If C/N0 is 20 dB lower, their
+    #: noise is 10 times as large; the sigmas of `ReceiverSettings` refer to 45 dB-Hz.
     weak_signals: Literal["code", "all"] = "code"
 
 

@@ -36,9 +36,8 @@ CN0_STEP_DBHZ: Final = 0.25  #: Resolution of the reported C/N0 [dB-Hz].
 CHUNK_EPOCHS: Final = 2000  #: Number of epochs of a chunk.
 _LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are sought [s].
 _RATE_S: Final = 0.005  #: Half the interval of the differences from which range rates are computed [s].
-#: C/N0 to which the sigmas of `ReceiverSettings` refer, and C/N0 above which the noise is constant [dB-Hz].
-_SIGMA_AT_DBHZ: Final = 45.0
-_BEST_DBHZ: Final = 50.0
+_SIGMA_AT_DBHZ: Final = 45.0  #: C/N0 to which the sigmas of `ReceiverSettings` refer [dB-Hz].
+_BEST_DBHZ: Final = 50.0  #: C/N0 above which the noise is constant [dB-Hz].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +188,7 @@ class _Instant:
 
     elevation_deg: Floats
     azimuth_deg: Floats
-    path_m: Floats  #: Range plus tropospheric delay and `path_error_m`, less satellite clock.
+    path_m: Floats  #: Range plus tropospheric delay and `path_error_m`, minus the satellite clock.
     ionosphere_m: Floats  #: Ionospheric delay on L1, including `ionosphere_error_m`.
     path_error_m: Floats  #: Sum of the errors of orbit, satellite clock and troposphere.
     ionosphere_error_m: Floats  #: Error of the ionospheric delay on L1.
@@ -230,7 +229,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
     """Return the geometry by satellite, the delays at the epochs, and the rates of path and ionosphere [m/s].
 
-    The rates are differences over 10 ms.
+    The rates are computed from differences over 10 ms.
     """
     late = simulation.clocks.bias_s(antenna, tags := seconds(time - simulation.scenario.start))
     truth, speed = simulation.truth(antenna, tags - late)

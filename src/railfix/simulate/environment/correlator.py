@@ -20,9 +20,9 @@ from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSet
 
 Singles = NDArray[np.float32]
 
-#: Number of iterations; three suffice for errors of a few hundredths of a chip, but a wide spacing requires more.
+#: Number of iterations with a narrow correlator; three suffice for errors of a few hundredths of a chip.
 _ROUNDS_NARROW: Final = 3
-_ROUNDS_WIDE: Final = 12
+_ROUNDS_WIDE: Final = 12  #: Number of iterations with a wide correlator.
 _NARROW_CHIPS: Final = 0.2  #: Largest early-late spacing of a narrow correlator [chips].
 
 
@@ -111,7 +111,8 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
         away = np.abs(x)
         triangle = _triangle(x)
         carrier, quadrature = (real * triangle).sum(axis=0), (imaginary * triangle).sum(axis=0)
-        # Part of each path in phase with the sum: the square of the path is constant, its other products oscillate.
+        # Component of each path in phase with the sum of the paths. The product of a path with itself is constant; the
+        # products of different paths oscillate.
         in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
         near = away < half
         # Early minus late of a path at x is -2 x near the zero, then a plateau, which falls to 0 beyond a chip.

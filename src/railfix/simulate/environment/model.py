@@ -50,7 +50,10 @@ _LEAST_WEIGHT: Final = 0.005  #: Weight below which the obstruction by a conduct
 
 @dataclass(frozen=True, kw_only=True)
 class Conductor:
-    """Straight conductor for each of N rays, in axes (p, q) perpendicular to the conductor, from the antenna."""
+    """Straight conductor for each of N rays.
+
+    The coordinates are relative to the antenna; the axes p and q are perpendicular to the conductor.
+    """
 
     p: Floats  #: Coordinate p of the conductor, shape (N,) [m].
     q: Floats  #: Coordinate q of the conductor, shape (N,) [m].
@@ -207,8 +210,8 @@ _LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation for which signals are com
 class Environment:
     """Multipath and blockage along a line.
 
-    `clear_cn0_dbhz` is the C/N0 of an unobstructed signal at the horizon, and its increase to the zenith. Structures
-    and, with `EnvironmentSettings.shares`, sections are drawn from the seed.
+    `clear_cn0_dbhz` has the C/N0 of an unobstructed signal at the horizon, and the increase of C/N0 from the horizon to
+    the zenith. Structures and, with `EnvironmentSettings.shares`, sections are drawn from the seed.
     """
 
     def __init__(

@@ -104,11 +104,11 @@ SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arra
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """n structures that do not overlap on a side: first on the left, then on the right, each side by chainage."""
+    """n structures, first on the left, then on the right side, in order of chainage, without overlap on a side."""
 
     start_m: Floats  #: Chainage of the start, shape (n,).
     end_m: Floats  #: Chainage of the end, shape (n,).
-    border_m: Floats  #: `side * reach_m` + chainage from which the structure is the nearest, shape (n,).
+    border_m: Floats  #: `side * reach_m` plus the chainage from which the structure is the nearest, shape (n,).
     reach_m: float  #: Length that is larger than all chainages.
     value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 

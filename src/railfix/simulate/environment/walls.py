@@ -333,7 +333,7 @@ def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats
 
 
 def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Floats:
-    """Return the amplitude factor of the direct signal by equipment on the roof of the vehicle, shape (N,)."""
+    """Return the factor by which equipment on the roof reduces the amplitude of the direct signal, shape (N,)."""
     amplitude = np.ones(len(rays.x))
     for part in equipment:
         along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)
