@@ -39,11 +39,11 @@ def bent_line(length_m: float = 3000.0, *, turn_deg: float = 60.0) -> Trajectory
     return Trajectory.from_antenna_path(Track.from_ecef(points))
 
 
-def corner_line(length_m: float = 1200.0) -> Trajectory:
-    """A level line that turns by 90 degrees within 10 m every 600 m, points every 5 m; a square from 2400 m on."""
+def corner_line(length_m: float = 1200.0, *, turn_m: float = 10.0) -> Trajectory:
+    """A level line that turns by 90 degrees within `turn_m` every 600 m, points every 5 m; a square from 2400 m on."""
     s = np.arange(0.0, length_m, 5.0)
     corners = np.arange(600.0, length_m, 600.0)
-    bearing = np.radians(30.0 + 90.0 * np.clip((s[:, None] - corners) / 10.0, 0.0, 1.0).sum(axis=1))
+    bearing = np.radians(30.0 + 90.0 * np.clip((s[:, None] - corners) / turn_m, 0.0, 1.0).sum(axis=1))
     east, north = (np.concatenate([[0.0], np.cumsum(f(bearing) * 5.0)]) for f in (np.sin, np.cos))
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
     return Trajectory.from_antenna_path(

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import binomtest
 
 from plain_kernels import given, kernel_state, plain
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.constants import BRANCH_FLOOR, CODE_COMMON_M, MAP_BRANCH_M
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackingLimits, TrackState, track
-from tracking_cases import LATITUDE, LONGITUDE, part, ride
+from tracking_cases import LATITUDE, LONGITUDE, corner_line, part, ride
 
 LAP_M = 800.0
 
@@ -41,14 +44,8 @@ def test_laps_within_the_error_of_the_map_are_not_told_apart_with_certainty() ->
         shift = random.normal() * axes[:, 1]
         sight = case.epochs.sat_ecef_m - np.asarray(case.line.at(case.arc_m)[0])[:, None]
         sight /= np.linalg.norm(sight, axis=2, keepdims=True)
-        epochs = part(case.epochs, slice(0, 40))
-        epochs = type(epochs)(
-            **{
-                **{name: getattr(epochs, name) for name in epochs.__dataclass_fields__},
-                "code_m": epochs.code_m - (sight * shift[:, None]).sum(axis=2),
-            }
-        )
-        found, _ = track(epochs, case.line)
+        code = case.epochs.code_m - (sight * shift[:, None]).sum(axis=2)
+        found, _ = track(replace(case.epochs, code_m=code), case.line)
         stated.append(float(found.probability[-1]))
         right.append(bool(abs(found.arc_m[-1] - case.arc_m[-1]) < 0.25 * LAP_M))
     stated_of, right_of = np.array(stated), np.array(right)
@@ -68,6 +65,35 @@ def test_every_lap_is_a_hypothesis_at_the_start() -> None:
         laps = np.round((state.mean[:, 0] - case.arc_m[0]) / LAP_M, 1)
         assert any(abs(lap) < 0.05 for lap in laps), start
         assert len(state.mean) == 3
+
+
+@pytest.mark.requirement("C6")
+def test_a_wrong_position_on_the_right_lap_does_not_decide_for_the_other_lap() -> None:
+    """A code 16 m short puts the filter 10 m back; the right position, on both laps, is improbable until a bend."""
+    line, steady = corner_line(4700.0, turn_m=30.0), lambda t: np.full(len(t), 10.0)
+    case = ride(45, trajectory=line, start_m=2750.0, noise=1.0, speed_mps=steady)
+    code = case.epochs.code_m - 16.0 * (case.epochs.satellite == "G04")
+    code[20:] = np.nan
+    code[:, [2, 6, 7, 8, 9]] = np.nan
+    epochs, both = replace(case.epochs, code_m=code), [ix.ARC, ix.PREVIOUS_ARC]
+    _, state = track(part(epochs, slice(0, 20)), case.line)
+    lap = [int(np.argmin(np.abs(state.mean[:, ix.ARC] - case.arc_m[19])))] * 3
+    back = case.arc_m[19] - state.mean[lap[0], ix.ARC]
+    assert back == pytest.approx(10.0, abs=1.0)
+    state.mean, state.covariance, state.hypothesis = state.mean[lap], state.covariance[lap], state.hypothesis[lap]
+    state.mean[:, both] += np.array([[0.0], [back], [back - 2400.0]])
+    state.covariance[1:, np.ix_(both, both)[0], both] += 10.0**2
+    state.hypothesis["log_probability"] = np.log([0.8, 0.1, 0.1])
+    found, _ = track(part(epochs, slice(20, 45)), case.line, state)
+    assert (found.probability[-10:] < 0.6).all()
+
+
+@pytest.mark.requirement("C6")
+def test_positions_merge_within_the_smaller_standard_deviation() -> None:
+    limits = TrackingLimits()
+    for apart_m, sigma_m, left in ((12.0, (5.0, 8.0), 2), (4.9, (5.0, 8.0), 1), (1.9, (0.1, 9.0), 1)):
+        state = kernel_state([0.0, apart_m], sigma_m, np.log([0.8, 0.2]), limits)
+        assert len(plain("tracking.hypotheses").prune(given(limits).parameters[0], state)) == left, apart_m
 
 
 PLACES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [18.0, 0.0, 0.0], [300.0, 0.0, 0.0]])

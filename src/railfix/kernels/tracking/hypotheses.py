@@ -107,14 +107,16 @@ def prune(parameters: Record, state: State) -> Indices:
 
 @inner
 def _merge_twins(state: State, ranked: Indices) -> tuple[Indices, Floats]:
-    """Return the hypotheses, and their probabilities, without those within the standard deviations of a more probable
-    hypothesis.
+    """Return the hypotheses, and their probabilities, without those that a more probable hypothesis represents.
+
+    A hypothesis represents positions within the smaller of both standard deviations. It cannot move farther at a bend:
+    if the right position were merged into a wrong position, the bend would contradict the lap of both positions.
     """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     for k in ranked:
-        twin, sigma = -1, math.sqrt(state.P[k, ix.ARC, ix.ARC])
+        twin, variance = -1, state.P[k, ix.ARC, ix.ARC]
         for j in range(size):
-            reach = max(2.0, sigma + math.sqrt(state.P[kept[j], ix.ARC, ix.ARC]))
+            reach = max(2.0, math.sqrt(min(variance, state.P[kept[j], ix.ARC, ix.ARC])))
             if abs(state.x[k, ix.ARC] - state.x[kept[j], ix.ARC]) < reach:
                 twin = j
                 break
