@@ -164,15 +164,8 @@ def test_emergency_braking_is_followed() -> None:
         noise=1.0,
         speed_mps=lambda t: np.where(t < 60.0, np.minimum(0.5 * t, 15.0), np.maximum(15.0 - 3.0 * (t - 60.0), 0.0)),
     )
-    few = replace(
-        case.epochs,
-        **{
-            n: np.where(
-                (np.arange(10) < 3) | (np.arange(len(case.epochs)) < 20)[:, None], getattr(case.epochs, n), np.nan
-            )
-            for n in ("code_m", "phase_m", "rate_mps")
-        },
-    )
+    seen, names = (np.arange(10) < 3) | (np.arange(len(case.epochs)) < 20)[:, None], ("code_m", "phase_m", "rate_mps")
+    few = replace(case.epochs, **{n: np.where(seen, getattr(case.epochs, n), np.nan) for n in names})
     found, _ = track(case.epochs, case.line)
     by_wheel, _ = track(few, case.line, sensors=wheel(case))
     for result in (found, by_wheel):
@@ -292,9 +285,8 @@ def test_no_input_raises(garbage: str, level: str) -> None:
             "rate_mps",
         )
         values = {name: getattr(epochs, name)[:, none] for name in (*per_channel, "cn0_dbhz")}
-        epochs = replace(
-            epochs, satellite=epochs.satellite[none], signal=epochs.signal[none], clock=epochs.clock[none], **values
-        )
+        names = {n: getattr(epochs, n)[none] for n in ("satellite", "signal", "clock")}
+        epochs = replace(epochs, **names, **values)
     elif garbage == "nothing measured":
         epochs = without_epochs(epochs, np.ones(40, dtype=bool))
     elif garbage == "wild codes":

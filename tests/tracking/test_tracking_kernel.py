@@ -411,9 +411,8 @@ def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
     nothing = without_epochs(part(case.epochs, slice(50, 60)), np.ones(10, dtype=bool))
     own, banks = [], []
     for log_variance in (0.0, 5.0):
-        _, after = track(
-            nothing, case.line, copy_with(state, monitors=Monitors(map_log_variance=log_variance)), levels=True
-        )
+        before = copy_with(state, monitors=Monitors(map_log_variance=log_variance))
+        _, after = track(nothing, case.line, before, levels=True)
         assert len(after.bank.without) > 10
         own.append(after.covariance[0, ix.ARC, ix.ARC])
         banks.append(after.bank.covariance[:, ix.ARC, ix.ARC])

@@ -180,9 +180,7 @@ def test_a_level_beyond_a_kilometre_is_none_and_the_place_stays(monkeypatch: pyt
 
     def diverged(*inputs: object, **named: object) -> tuple[Tracked, TrackState]:
         place, after = track(*inputs, **named)  # type: ignore[arg-type]
-        far = {
-            name: np.full(5, 990.0 if name == "ground_level_m" else 1500.0) for name in ("level_m", "ground_level_m")
-        }
+        far = {"level_m": np.full(5, 1500.0), "ground_level_m": np.full(5, 990.0)}
         return replace(place, status=np.full(5, TrackStatus.TRACKING, dtype=np.int8), **far), after
 
     monkeypatch.setattr(levels_of, "track", diverged)

@@ -100,15 +100,9 @@ PLACES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [18.0, 0.0, 0.0], [300.0, 0
 
 
 def judged(
-    log_probability: np.ndarray,
-    log_code: np.ndarray,
-    motion: np.ndarray,
-    code: np.ndarray,
-    places: np.ndarray,
-    branch_s: float,
-    branch_m: float,
-    dt: float = 1.0,
-) -> tuple[np.ndarray, np.ndarray]:
+    log_probability: np.ndarray, log_code: np.ndarray, motion: np.ndarray, code: np.ndarray, places: np.ndarray,
+    branch_s: float, branch_m: float, dt: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Probabilities after an epoch's evidence for branches at places, and the part of them by codes."""
     limits = TrackingLimits()
     state = kernel_state(
