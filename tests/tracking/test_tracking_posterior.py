@@ -88,14 +88,6 @@ def test_a_wrong_position_on_the_right_lap_does_not_decide_for_the_other_lap() -
     assert (found.probability[-10:] < 0.6).all()
 
 
-@pytest.mark.requirement("C6")
-def test_positions_merge_within_the_smaller_standard_deviation() -> None:
-    limits = TrackingLimits()
-    for apart_m, sigma_m, left in ((12.0, (5.0, 8.0), 2), (4.9, (5.0, 8.0), 1), (1.9, (0.1, 9.0), 1)):
-        state = kernel_state([0.0, apart_m], sigma_m, np.log([0.8, 0.2]), limits)
-        assert len(plain("tracking.hypotheses").prune(given(limits).parameters[0], state)) == left, apart_m
-
-
 PLACES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [18.0, 0.0, 0.0], [300.0, 0.0, 0.0]])
 
 

@@ -43,15 +43,9 @@ class Recursion:
     """Kernel inputs of a chunk; `start_state` is the state before the chunk, after `prepare_chunk`."""
 
     def __init__(
-        self,
-        chunk: Chunk,
-        line: Line,
-        sensors: SensorEpochs,
-        limits: TrackingLimits,
-        start_state: TrackState,
-        *,
+        self, chunk: Chunk, line: Line, sensors: SensorEpochs, limits: TrackingLimits, start_state: TrackState, *,
         levels: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         from railfix.kernels.tracking.recursion import advance  # imports numba, which runs without a filter do not need
 
         self.kernel = advance

@@ -83,14 +83,9 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
 
 
 def begin(
-    arc_m: Floats,
-    satellites: int,
-    line: Line,
-    limits: TrackingLimits,
-    *,
-    sigma_m: float = constants.START_SIGMA_M,
+    arc_m: Floats, satellites: int, line: Line, limits: TrackingLimits, *, sigma_m: float = constants.START_SIGMA_M,
     known: tuple[Floats, Floats] | None = None,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Return means (H, N) and covariances (H, N, N) of new hypotheses at positions `arc_m`, shape (H,).
 
     `satellites` is the number of satellite errors in the state. `known` are mean (N,) and covariance (N, N) of a lost

@@ -10,7 +10,8 @@ from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
-from railfix.kernels.tracking.layout import Record, Records, State
+from railfix.kernels.tracking.layout import Given, Record, Records, State
+from railfix.kernels.tracking.line import write_point
 
 
 @inner
@@ -82,7 +83,7 @@ def find_leading(hypothesis: Records, count: int) -> int:
 
 
 @inner
-def prune(parameters: Record, state: State) -> Indices:
+def prune(given: Given, state: State) -> Indices:
     """Sort the hypotheses, merge duplicates and drop improbable ones; return the previous indices of the remaining
     hypotheses.
 
@@ -91,8 +92,8 @@ def prune(parameters: Record, state: State) -> Indices:
     count = state.monitors[0].hypotheses
     order = np.argsort(-state.hypothesis["log_probability"][:count], kind="mergesort")
     leading = find_leading(state.hypothesis, count)
-    kept, log_probability = _merge_twins(state, np.concatenate((np.array([leading]), order[order != leading])))
-    size = min(len(kept), parameters.most_hypotheses)
+    kept, log_probability = _merge_twins(given, state, np.concatenate((np.array([leading]), order[order != leading])))
+    size = min(len(kept), given.parameters[0].most_hypotheses)
     kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
     if abs(state.x[kept[0], ix.ARC] - state.hypothesis[kept[0]].origin_m) >= constants.DECIDED_TRAVEL_M:
         likely = log_probability > math.log(constants.LEAST_PROBABILITY)
@@ -106,18 +107,24 @@ def prune(parameters: Record, state: State) -> Indices:
 
 
 @inner
-def _merge_twins(state: State, ranked: Indices) -> tuple[Indices, Floats]:
-    """Return the hypotheses, and their probabilities, without those that a more probable hypothesis represents.
+def _merge_twins(given: Given, state: State, ranked: Indices) -> tuple[Indices, Floats]:
+    """Return the hypotheses, and their probabilities, without those within the standard deviations of a more probable
+    hypothesis; the smaller one counts for positions that another lap has too.
 
-    A hypothesis represents positions within the smaller of both standard deviations. It cannot move farther at a bend:
-    if the right position were merged into a wrong position, the bend would contradict the lap of both positions.
+    If such a position were merged into a wrong position of its lap, the next bend would contradict this lap alone.
     """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
+    arc, points, axes = state.x[: len(ranked), ix.ARC], np.empty((len(ranked), 3)), np.empty((3, 3))
+    for h in range(len(ranked)):
+        write_point(given.vertex, given.line[0], arc[h], points[h], axes)
     for k in ranked:
-        twin, variance = -1, state.P[k, ix.ARC, ix.ARC]
+        twin, sigma = -1, math.sqrt(state.P[k, ix.ARC, ix.ARC])
+        alike = ((points - points[k]) ** 2).sum(axis=1) < (constants.ALIKE * given.parameters[0].map_branch_m) ** 2
+        alike = alike & (np.abs(arc - arc[k]) > given.parameters[0].start_separation_m)
         for j in range(size):
-            reach = max(2.0, math.sqrt(min(variance, state.P[kept[j], ix.ARC, ix.ARC])))
-            if abs(state.x[k, ix.ARC] - state.x[kept[j], ix.ARC]) < reach:
+            other = math.sqrt(state.P[kept[j], ix.ARC, ix.ARC])
+            reach = max(2.0, min(sigma, other) if alike.any() else sigma + other)
+            if abs(arc[k] - arc[kept[j]]) < reach:
                 twin = j
                 break
         own = state.hypothesis[k].log_probability

@@ -230,7 +230,7 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
 @inner
 def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> None:
     """Update direction, time and distance on the branches, and prune the hypotheses."""
-    monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
+    monitors, dt = state.monitors[0], given.epoch[t].interval_s
     speed = state.x[leading, ix.SPEED]
     if abs(speed) > constants.DIRECTION_MPS:
         monitors.direction = math.copysign(1.0, speed)
@@ -240,7 +240,7 @@ def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> N
         one = state.hypothesis[h]
         one.log_least = min(one.log_least + constants.LEAST_RISE * dt, one.log_probability)
     if monitors.hypotheses > 1:
-        kept = prune(parameters, state)
+        kept = prune(given, state)
         if len(trace.kept):
             trace.kept[: len(kept)] = kept
     if monitors.branch_s > constants.TAKEOVER_AFTER_S and state.hypothesis[0].log_least < constants.TAKEOVER:
