@@ -22,6 +22,7 @@ HARMLESS = {(kind, "empty") for kind in COMMANDS if kind.endswith(".toml")} | {
 }
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
+POINT = r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$"  # of a map
 
 
 @pytest.fixture
@@ -102,19 +103,18 @@ def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name:
     assert after == before
 
 
-def feet(match: re.Match[str]) -> str:
-    """Return a point of a map with its height in feet."""
-    return f"{match[1]}{float(match[2]) / 0.3048:.4f}{match[3]}"
+def heights(scale: float, added_m: float) -> Any:
+    return lambda point: f"{point[1]}{float(point[2]) * scale + added_m:.4f}{point[3]}"
 
 
 @pytest.mark.requirement("G4")
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (("line.csv", r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$", feet), "the heights of the map may be in feet"),
+        (("line.csv", POINT, heights(1.0 / 0.3048, 0.0)), "the heights of the map may be in feet"),
+        (("line.csv", POINT, heights(1.0, -36.0)), "give --height-datum orthometric --geoid egm96"),
         (("front.obs", "GPS(?= +TIME OF FIRST)", "GLO"), "with time tags 18 s earlier"),
     ],
-    ids=["heights_in_feet", "time_tags_of_glonass"],
 )
 def test_a_run_off_the_line_names_the_likely_cause(desk: Desk, edit: tuple[Any, ...], words: str) -> None:
     text = edited(desk.folder, *edit)
@@ -124,4 +124,4 @@ def test_a_run_off_the_line_names_the_likely_cause(desk: Desk, edit: tuple[Any, 
     command = "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --out {out}"
     result = RUNNER.invoke(app, desk.words(command))
     assert result.exit_code == 7, result.output
-    assert re.search(f"likely cause: .*{re.escape(words)}", result.output)
+    assert re.search(f"no position can be used; likely cause: .*{re.escape(words)}", result.output)

@@ -19,6 +19,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.report.explain import FILTER_STATUS, SINGLE_STATUS, explain_epoch
 from railfix.run import RunOptions, run_files
+from railfix.run.inputs import TrackReading
 from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
@@ -31,11 +32,14 @@ pytestmark = pytest.mark.requirement("G4")
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty seconds of the demonstration."""
+    """Twenty seconds of the demonstration, on a map with heights above the geoid, which only the options name."""
     out = tmp_path_factory.mktemp("explained") / "results"
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
-    options = RunOptions(observations="write", end=first + timedelta(seconds=20))
-    run_files(demo_inputs(), parse_config({"filter": "track"}), out=out, options=options)
+    points = pl.read_csv(demo_inputs().track[0], comment_prefix="#").rename({"height_m": "elevation_m"})
+    points.with_columns(pl.col("elevation_m") - 36.415).write_csv(out.parent / "line.csv")
+    options = RunOptions(observations="write", end=first + timedelta(seconds=20), track=TrackReading(geoid="egm96"))
+    inputs = demo_inputs().model_copy(update={"track": (out.parent / "line.csv",)})
+    run_files(inputs, parse_config({"filter": "track"}), out=out, options=options)
     return out
 
 

@@ -11,14 +11,15 @@ import signal
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, ClassVar, Final, NoReturn
 
 import typer
-from typer.core import TyperCommand, TyperGroup, TyperOption
+from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from railfix.core.errors import InputFileError, OutputError, RailfixError, RailfixWarning, SettingsError
 from railfix.core.extras import needs_extra
@@ -35,6 +36,11 @@ _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 class Command(TyperCommand):
     """Command that rejects repeated options and switches with a value, and reports all missing options together."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        for param in self.params:
+            _simplify_help(param)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; repeated options, switches with a value and missing options are usage errors."""
@@ -71,6 +77,35 @@ class Command(TyperCommand):
         for before, after in pairwise(args):
             if before == name and after.lower() in _YES_NO:
                 ctx.fail(f"{name} is a switch and has no value; leave {after} out")
+
+
+#: Longest line of choices in the column of types of a help page; typer cuts words in a longer one at 80 columns.
+_CHOICES_WIDTH: Final = 20
+
+
+def _simplify_help(param: Any) -> None:
+    """Show an argument and a switch without their Python types, and long lists of choices in several lines."""
+    show = getattr(param, "display_type_rich", None)  # typer before 0.29 shows no types
+    if show is None:
+        return
+    if isinstance(param, TyperArgument):
+        name = param.metavar or param.human_readable_name
+        param._usage_display_name = lambda: name if param.required else f"[{name}]"  # type: ignore[method-assign]
+    hidden = isinstance(param, TyperArgument) or getattr(param, "is_flag", False)
+    param.display_type_rich = (lambda **_: None) if hidden else partial(_wrap_choices, show)
+
+
+def _wrap_choices(show: Callable[..., str | None], **context: Any) -> str | None:
+    """Return the type of an option; lines of choices end at a bar and have at most `_CHOICES_WIDTH` characters."""
+    text = show(**context)
+    if text is None or "|" not in text:
+        return text
+    lines = [""]
+    for choice in re.findall(r"[^|]+\|?", text):
+        if lines[-1] and len(lines[-1]) + len(choice) > _CHOICES_WIDTH:
+            lines.append("")
+        lines[-1] += choice
+    return "\n".join(lines)
 
 
 class Commands(TyperGroup):

@@ -76,6 +76,11 @@ class RunFolder(RunRecord):
         return dict(self._line.get("track") or {})
 
     @property
+    def track_options(self) -> Mapping[str, Any]:
+        """Options with which the run read its track, such as ``height_datum``; empty if not recorded."""
+        return dict((self.record.get("options") or {}).get("track") or {})
+
+    @property
     def tracks(self) -> list[Path]:
         """Files of the track: ``track.csv`` of the folder if the run changed the track, otherwise the input files."""
         name = self.track_facts.get("file")

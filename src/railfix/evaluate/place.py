@@ -7,7 +7,6 @@ of the line (P1 3.3).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -352,26 +351,32 @@ def find_trajectory(
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
     """Return the sets of options (CRS, height datum, geoid) with which the track is to be read, in order of preference.
 
-    If options are given, they are the only set. Otherwise the track is read first without options, then with the
-    options in ``run.json``.
+    If options are given, they are the only set. Otherwise the track is read with the options in ``run.json``, then
+    without options; without options first if the run wrote the track that it used.
     """
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):
         return [given]
-    facts = run.track_facts
-    recorded = tuple(facts.get(name) or None for name in ("crs", "height_datum_asked", "geoid"))
-    return [given, (recorded[0], recorded[1], recorded[2])]
+    facts, options = run.track_facts, run.track_options
+    recorded = (
+        options.get("crs") or facts.get("crs") or None,
+        options.get("height_datum") or facts.get("height_datum_asked") or None,
+        options.get("geoid") or None,
+    )
+    return [given, recorded] if facts.get("file") else [recorded, given]
 
 
 def read_run_track(run: RunFolder) -> Track:
     """Read the track that the run used; raise InputFileError if ``run.json`` names no track or a file is missing."""
     if not run.tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
-    *first, last = _readings(run, TrackFiles())
-    for crs, datum, geoid in first:
-        with suppress(RailfixError):
+    faults: list[RailfixError] = []
+    for crs, datum, geoid in _readings(run, TrackFiles()):
+        try:
             return read_track(run.tracks, crs=crs, height_datum=datum, geoid=geoid)
-    return read_track(run.tracks, crs=last[0], height_datum=last[1], geoid=last[2])
+        except RailfixError as error:
+            faults.append(error)
+    raise faults[0]
 
 
 def _trajectory(run: RunFolder, antenna: str, track: Track, vehicles: Sequence[Path]) -> Trajectory:

@@ -23,8 +23,9 @@ from railfix.core.staged_files import write_whole
 from railfix.core.tables import number, reading_table
 from railfix.core.timescale import gps_time
 from railfix.evaluate.evaluation_inputs import RunFolder, read_run
+from railfix.evaluate.place import read_run_track
 from railfix.report.charts_page import page_style, read_template
-from railfix.track import Trajectory, read_track
+from railfix.track import Trajectory
 
 #: Explanation of each status of a single epoch.
 SINGLE_STATUS: Final[Mapping[str, str]] = {
@@ -154,7 +155,7 @@ def _nearest(times: Any, at: str) -> int:
 
 def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
     """Return the ECEF unit vectors along, across and above the nearest section of the line as rows, shape (3, 3)."""
-    line = Trajectory.from_antenna_path(read_track(folder.tracks))
+    line = Trajectory.from_antenna_path(read_run_track(folder))
     arc, _ = line.nearest(np.array([[single[name] for name in ("x_m", "y_m", "z_m")]]))
     along, across, _ = line.get_axes(line.segment_at(arc)[0])[0]
     return np.stack([along, across, np.cross(across, along)])

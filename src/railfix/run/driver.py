@@ -142,7 +142,7 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
-        verdict = _judge(record, notes)
+        verdict = _judge(record)
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
@@ -151,12 +151,11 @@ def run_files(
     return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
-def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
+def _judge(record: Mapping[str, Any]) -> Verdict:
     """Return the verdict on a run; raise NoPositionError if the run has no usable position."""
     verdict = judge_run(record)
     if not any(antenna.is_usable for antenna in verdict.antennas):
-        of_map = [note for note in notes if ": the map " in note]
-        raise NoPositionError(f"no position can be used: {'; '.join([*verdict.lines(), *of_map])}")
+        raise NoPositionError(verdict.failure())
     return verdict
 
 

@@ -29,6 +29,7 @@ from railfix.pipeline.without_map import Located, NoPosition, locate, survey_run
 from railfix.run.checks import check_each_file
 from railfix.run.inputs import NAVIGATION, InputFiles, LogReading, input_option
 from railfix.run.sources import Log
+from railfix.track.heights import egm96_heights
 from railfix.track.survey.line import Survey, survey_line
 from railfix.track.survey.runs import SurveyLimits, SurveyRun, run_of_log
 from railfix.track.track import ANOTHER_PLACE_M
@@ -136,6 +137,9 @@ _BEIDOU_S: Final = 14
 #: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
+#: Largest error of a height offset that is compared with a cause [m], and smallest height of the geoid compared [m].
+_CAUSE_M: Final = 15.0
+_GEOID_M: Final = 10.0
 
 
 def likely_cause(observations: Observations, received: Received, config: Config, line: Trajectory) -> str:
@@ -148,7 +152,7 @@ def likely_cause(observations: Observations, received: Received, config: Config,
     few = observations[: step * _EPOCHS : step]
     as_tagged = _offset_m(few, received, config, line)
     if as_tagged is not None and as_tagged[0] < _ON_LINE_M:
-        return _cause_in_height(*as_tagged[1:]) if abs(as_tagged[1]) > _HEIGHT_M else ""
+        return _cause_in_height(*as_tagged[1:])
     for shift_s in _shifts_s():
         shifted = replace(few, time=few.time + np.timedelta64(shift_s, "s"))
         offset = _offset_m(shifted, received, config, line)
@@ -173,8 +177,8 @@ def _shifts_s() -> Iterator[int]:
 
 def _offset_m(
     observations: Observations, received: Received, config: Config, line: Trajectory
-) -> tuple[float, float, float] | None:
-    """Return the offset of the median position from the line in plan and height, and the height of the line [m].
+) -> tuple[float, float, float, float] | None:
+    """Return the median position's offset from the line in plan and height, the line's height, and the geoid's [m].
 
     The result is None if no epoch has a position.
     """
@@ -183,19 +187,35 @@ def _offset_m(
         return None
     place = np.nanmedian(ecef, axis=0)
     arc, _ = line.nearest(place[None])
-    height = float(geodetic_from_ecef(place)[2])
+    latitude, longitude, height = (float(value) for value in geodetic_from_ecef(place))
+    geoid = float(egm96_heights(np.array([latitude]), np.array([longitude]))[0])
     of_line = float(geodetic_from_ecef(line.at_arc(arc)[0])[2])
     # The heights of the line may be wrong. The offset in plan is therefore computed at the height of the line.
     level = place * (1.0 + (of_line - height) / float(np.linalg.norm(place)))
-    return float(line.nearest(level[None])[1][0]), height - of_line, of_line
+    return float(line.nearest(level[None])[1][0]), height - of_line, of_line, geoid
 
 
-def _cause_in_height(above_m: float, of_line_m: float) -> str:
-    """Return a clause on a height offset from the line, and on the unit or datum that may explain it."""
-    height = of_line_m + above_m
-    feet = abs(of_line_m * _FEET - height) < abs(above_m) / 4.0
-    hint = "the heights of the map may be in feet" if feet else "check the height datum of the map"
-    return f"the positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line; {hint}"
+def _cause_in_height(above_m: float, of_line_m: float, geoid_m: float) -> str:
+    """Return a clause on a height offset from the line, and on the unit or datum that may explain it; "" if small."""
+    apart = f"the positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line"
+    if abs(of_line_m * _FEET - of_line_m - above_m) < min(abs(above_m) / 4.0, _CAUSE_M) and abs(above_m) > _HEIGHT_M:
+        return f"{apart}; the heights of the map may be in feet"
+    for offset_m, advice in ((geoid_m, _AS_ORTHOMETRIC), (-geoid_m, _AS_ELLIPSOIDAL)):
+        if abs(geoid_m) > _GEOID_M and abs(above_m - offset_m) < min(abs(geoid_m) / 2.0, _CAUSE_M):
+            side = "above" if geoid_m > 0.0 else "below"
+            return f"{apart}, and the geoid {abs(geoid_m):.0f} m {side} the ellipsoid; {advice}"
+    return f"{apart}; check the datum and the unit of the map's heights" if abs(above_m) > _HEIGHT_M else ""
+
+
+#: Advice for a map whose heights were read in the other datum.
+_AS_ORTHOMETRIC: Final = (
+    "the heights of the map seem to be above the geoid, not the ellipsoid: give --height-datum orthometric --geoid "
+    "egm96, or in a CSV file name their column elevation_m and give --geoid egm96"
+)
+_AS_ELLIPSOIDAL: Final = (
+    "the heights of the map seem to be above the ellipsoid already: give --height-datum ellipsoidal, or in a CSV file "
+    "name their column height_m"
+)
 
 
 def _duration(seconds: int) -> str:

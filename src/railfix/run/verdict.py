@@ -85,12 +85,23 @@ class Verdict:
 
     def lines(self) -> list[str]:
         """Return sentences: one per antenna, one on the checks, one on the filter, and one on the likely cause."""
+        return [*self._figure_lines(), *self._cause_lines()]
+
+    def failure(self) -> str:
+        """Return the message on a run without any usable position: the cause, or notes on the map, then the figures."""
+        of_map = [note for note in self.notes if ": the map " in note]
+        return "; ".join(["no position can be used", *(self._cause_lines() or of_map), *self._figure_lines()])
+
+    def _cause_lines(self) -> list[str]:
+        return [f"likely cause: {cause}" for cause in self.causes[:1]]
+
+    def _figure_lines(self) -> list[str]:
         lines = [_describe(antenna) for antenna in self.antennas]
         lines.append(_describe_checks([antenna.single_epochs for antenna in self.antennas]))
         filtered = [antenna.filter for antenna in self.antennas if antenna.filter is not None]
         if filtered:
             lines.append(_describe_filter(filtered))
-        return [*lines, *(f"likely cause: {cause}" for cause in self.causes[:1])]
+        return lines
 
 
 def judge_run(record: Mapping[str, Any]) -> Verdict:

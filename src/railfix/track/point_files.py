@@ -363,9 +363,9 @@ def _datum(table: NamedColumns, asked: str | None) -> str:
     datum = "ellipsoidal" if "height_m" in table else "orthometric"
     for source, stated in (("height_datum", asked), ("the line '# height_datum'", table.metadata.get("height_datum"))):
         if stated is not None and stated != datum:
-            column = "height_m" if datum == "ellipsoidal" else "elevation_m"
+            column, other = ("height_m", "elevation_m") if datum == "ellipsoidal" else ("elevation_m", "height_m")
             what = f"{source} is {stated!r}, but the column {column} is {datum}"
-            raise table.header_error(f"{what}; rename the column or drop the setting")
+            raise table.header_error(f"{what}; name the column {other}, or drop the setting")
     return datum
 
 
