@@ -69,7 +69,14 @@ def campaign(
         config = "settings.toml"
         reference = "logs/{train}/{day}/truth.csv"
 
-    `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too.
+    `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too. The options of
+    `railfix run` stand in tables; for a KML map and logs with broken lines, for example:
+
+        [options.track]
+        height_datum = "orthometric"
+        geoid = "egm96"
+        [options.logs]
+        broken_lines = "count"
 
     The files of `railfix run` are written into a folder per run, such as `DIR/runs/train=A/day=2024-03-05/`; together
     these folders are one hive-partitioned data set. `campaign.csv` has one row per run; a run that fails has its error

@@ -190,7 +190,8 @@ def heights_of_file(
     used, model = own_height_datum(reading.crs, reading.height_datum or datum, reading.geoid, path=path)
     if used is None:
         raise SettingsError(
-            f"{path}: the height datum is missing; give height_datum (--height-datum): ellipsoidal or orthometric"
+            f"{path}: the height datum is missing; give --height-datum ellipsoidal, or --height-datum orthometric with "
+            "--geoid egm96 (in a campaign file: height_datum and geoid under [options.track])"
         )
     if used == "ellipsoidal":
         geoid_m = None
