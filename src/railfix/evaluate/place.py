@@ -358,11 +358,9 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
     if any(given):
         return [given]
     facts, options = run.track_facts, run.track_options
-    recorded = (
-        options.get("crs") or facts.get("crs") or None,
-        options.get("height_datum") or facts.get("height_datum_asked") or None,
-        options.get("geoid") or None,
-    )
+    # records of earlier versions have no options, only the names that the track states
+    source = options or {"crs": facts.get("crs"), "height_datum": facts.get("height_datum_asked")}
+    recorded = (source.get("crs") or None, source.get("height_datum") or None, source.get("geoid") or None)
     return [given, recorded] if facts.get("file") else [recorded, given]
 
 
