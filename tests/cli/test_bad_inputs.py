@@ -22,7 +22,6 @@ HARMLESS = {(kind, "empty") for kind in COMMANDS if kind.endswith(".toml")} | {
 }
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
-POINT = r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$"  # of a map
 
 
 @pytest.fixture
@@ -111,8 +110,8 @@ def heights(scale: float, added_m: float) -> Any:
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (("line.csv", POINT, heights(1.0 / 0.3048, 0.0)), "the heights of the map may be in feet"),
-        (("line.csv", POINT, heights(1.0, -36.0)), "give --height-datum orthometric --geoid egm96"),
+        (("line.csv", r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$", heights(1 / 0.3048, 0)), "of the map may be in feet"),
+        (("line.csv", r"^([\d.]+,[\d.]+,)([\d.]+)(.*)$", heights(1, -36)), "give --height-datum orthometric"),
         (("front.obs", "GPS(?= +TIME OF FIRST)", "GLO"), "with time tags 18 s earlier"),
     ],
 )

@@ -19,7 +19,6 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.report.explain import FILTER_STATUS, SINGLE_STATUS, explain_epoch
 from railfix.run import RunOptions, run_files
-from railfix.run.inputs import TrackReading
 from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
@@ -37,7 +36,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
     points = pl.read_csv(demo_inputs().track[0], comment_prefix="#").rename({"height_m": "elevation_m"})
     points.with_columns(pl.col("elevation_m") - 36.415).write_csv(out.parent / "line.csv")
-    options = RunOptions(observations="write", end=first + timedelta(seconds=20), track=TrackReading(geoid="egm96"))
+    options = RunOptions(observations="write", end=first + timedelta(seconds=20), track={"geoid": "egm96"})
     inputs = demo_inputs().model_copy(update={"track": (out.parent / "line.csv",)})
     run_files(inputs, parse_config({"filter": "track"}), out=out, options=options)
     return out
