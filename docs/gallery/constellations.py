@@ -2,9 +2,9 @@
 Fewer constellations
 ====================
 
-A position along the line requires two satellites fewer than a 3-D position. This example positions the demonstration
-with four choices of constellations and compares rates, errors and protection levels of single epochs and of the
-filter.
+A position along the line requires two satellites fewer than a 3-D position. This example computes positions of the
+demonstration with four choices of constellations. It compares the rates, errors and protection levels of single epochs
+and of the filter.
 """
 
 import polars as pl

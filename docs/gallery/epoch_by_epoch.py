@@ -3,8 +3,8 @@ Positions as the epochs arrive
 ==============================
 
 ``EpochProcessor.process`` returns a state, which is passed to the next call. A log can therefore be divided at any
-epoch, down to single epochs as a receiver sends them; the positions are the same as for the whole log.
-:doc:`Live positions </live>` are computed in this way from the streams of receivers.
+epoch, down to single epochs as a receiver sends them. The positions are the same as for the whole log. :doc:`Live
+positions </live>` are computed in this way from the streams of receivers.
 """
 
 from time import perf_counter

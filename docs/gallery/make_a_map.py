@@ -43,8 +43,8 @@ for finding in railfix.check_track(made).findings:
     print(finding)
 
 # %%
-# The numbers are the distances of the points of the new map from the antenna's path, as computed from the map of the
-# demonstration.
+# The printed numbers are the distances between the points of the new map and the antenna's path, which is computed
+# from the map of the demonstration.
 
 vehicle = railfix.read_vehicle(files["vehicle"])
 shipped = railfix.antenna_trajectory(railfix.read_track(files["track"]), vehicle, "front")

@@ -33,30 +33,30 @@ plots.plot_plan(positions, level_m=positions["protection_level_m"].to_numpy())
 
 
 # %%
-# Errors of positions on the line and of conventional positions, over time.
+# The chart shows the errors of positions on the line and of conventional positions over time.
 
 plots.plot_error_over_time(errors)
 
 
 # %%
-# Protection level over chainage, with the alarm limit.
+# The chart shows the protection level over chainage, with the alarm limit.
 
 plots.plot_levels_over_chainage(positions, railfix.Config().alarm_limit_m)
 
 
 # %%
-# Satellites used and rejected over time.
+# The chart shows the numbers of used and rejected satellites over time.
 
 plots.plot_satellites_over_time(positions)
 
 
 # %%
-# C/N0 over elevation of one signal, with its mean.
+# The chart shows the C/N0 of one signal over elevation, with the mean C/N0.
 
 plots.draw_chart(plots.cn0_over_elevation(observations)[0])
 
 
 # %%
-# Smallest, mean and largest error.
+# The chart shows the smallest, mean and largest error.
 
 plots.plot_error_ranges({"front": errors})

@@ -16,7 +16,7 @@ data = railfix.to_xarray(result["front"], result.fusion["front"])
 data
 
 # %%
-# The residual is the corrected pseudorange less the range computed from the position on the line and the receiver
+# The residual is the corrected pseudorange minus the range computed from the position on the line and the receiver
 # clock. Reflected signals arrive late, so the residuals of low satellites have a larger spread, and are mostly
 # positive.
 
@@ -27,14 +27,14 @@ ax.set(xlabel="elevation [deg]", ylabel="residual [m]", ylim=(-15, 25))
 figure.show()
 
 # %%
-# Root mean square by satellite and signal:
+# Root mean square of the residuals by satellite and signal:
 
 rms_m = np.sqrt((data.residual_m.where(used) ** 2).mean("time"))
 table = rms_m.to_series().set_axis(data.satellite.values + " " + data.signal.values).dropna()
 table.sort_values(ascending=False).head(8).round(2)
 
 # %%
-# The satellite with the largest spread, over chainage on the outward run:
+# The residuals of the satellite with the largest spread, over chainage on the outward run:
 
 channel = int(np.nanargmax(rms_m.values))
 outward = slice(0, int(np.nanargmax(data.filter_chainage_m.values)))

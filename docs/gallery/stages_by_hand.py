@@ -41,8 +41,8 @@ def positions_by_hand(log, navigation, line, systems):
 # %%
 # To add your own screen, insert a line that sets the rejected codes to NaN. ``SbasSource``, ``DfmcSource`` or
 # ``BaseStationSource`` can replace ``BroadcastSource``; precise orbits are part of the navigation data. ``fix_on_line``
-# calls ``find_section`` and ``position_on_line``. Inter-system biases are estimated over all epochs so far; for this,
-# pass ``state`` to the next call, as with ``zi`` of ``scipy.signal.lfilter``.
+# calls ``find_section`` and ``position_on_line``. Inter-system biases are estimated over all epochs so far. To process
+# a log in several calls, pass ``state`` to the next call, as with ``zi`` of ``scipy.signal.lfilter``.
 #
 # Faults and protection level
 # ---------------------------

@@ -40,8 +40,8 @@ plots.plot_screen_over_time(screens["elevation"].picture, screens["elevation"].t
 
 
 # %%
-# **Doppler.** The change of a pseudorange between epochs is compared with its Doppler, on which multipath has much
-# less effect than on the pseudorange.
+# **Doppler.** The change of a pseudorange between epochs is compared with the Doppler of the same signal, on which
+# multipath has much less effect than on the pseudorange.
 
 plots.plot_screen_over_time(screens["doppler"].picture, screens["doppler"].time)
 
@@ -54,19 +54,19 @@ plots.plot_screen_over_chainage(screens["antenna_pair"].picture, screens["antenn
 
 
 # %%
-# By default these two screens do not reject (``verdict = "weigh"``): they increase the standard deviation of a
-# suspected observation by the measured error. The geometry therefore does not become weaker where few satellites are
-# left.
+# By default, the screens Doppler and antenna pair do not reject (``verdict = "weigh"``): they increase the standard
+# deviation of a suspected observation by the measured error. The geometry therefore does not become weaker where few
+# satellites are left.
 #
-# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds a threshold of its fault-free
-# distribution.
+# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds a threshold, which follows from
+# the distribution of this sum without faults.
 
 plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainage_m)
 
 
 # %%
 # **Antenna spacing.** The distance between the two positions along the line must equal the spacing of the antennas.
-# The **C/N0** screen needs the open-sky curve of antenna and receiver (``railfix cn0-curve``); it is not run here.
+# The **C/N0** screen requires the open-sky curve of antenna and receiver (``railfix cn0-curve``); it is not run here.
 #
 # Rejected observations
 # ---------------------

@@ -77,17 +77,17 @@ def document() -> str:
     lines = [
         "# The five papers, item by item",
         "",
-        "Written by `python tests/studies/papers.py` from `tests/references/papers.toml` and kept outputs: each item,",
-        "what the paper asks, what is reached, by which command (or Python alone, or a study of `tests/studies`),",
-        "function and test. An item without a test is open.",
+        "For each item of a paper, this page states the figure of the paper, the figure of railfix, the command that",
+        "provides the item (or Python alone, or a study of `tests/studies`), function and its test. An item without",
+        "a test is open. `python tests/studies/papers.py` writes the page from `tests/references/papers.toml`.",
     ]
     for paper, title in DATA["papers"].items():
         lines += ["", f"## {paper}: {title}", ""]
         for item in (item for item in DATA["item"] if item["paper"] == paper):
-            asked = f"; asked: {item['asked']}" if "asked" in item else ""
-            found = f"; reached: {reached(item)}" if reached(item) else ""
+            asked = f"; paper: {item['asked']}" if "asked" in item else ""
+            found = f"; railfix: {reached(item)}" if reached(item) else ""
             test = f"`{item['test']}`" if "test" in item else "**open**"
-            lines.append(f"- {item['what']}{asked}{found}. By {item['by']}: `{item['where']}`, {test}")
+            lines.append(f"- {item['what']}{asked}{found}. By {item['by']}: `{item['where']}`; test {test}")
     lines += ["", "## Where we read the papers differently", ""]
     for found in DATA["difference"]:
         why = f" Why: {found['why']}." if found["why"] else ""
