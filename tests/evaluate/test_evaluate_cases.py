@@ -398,7 +398,7 @@ def test_chainage_is_not_taken_where_it_is_not_the_same(tmp_path: Path):
     moved = {"front": replace(reference(time, place)["front"], chainage_m=place + 100.0)}
     some = {"front": replace(reference(time, place)["front"], chainage_m=np.where(time < 3, np.nan, place))}
     for folder, known, told in (
-        (run, moved, "not of one map (off by 94.0 m"),
+        (run, moved, "not on the same map (median difference 94.0 m"),
         (run, some, "no chainage at 3 of 20"),
         (centre, reference(time, place), "refers to the centre"),
     ):

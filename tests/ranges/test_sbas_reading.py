@@ -215,7 +215,7 @@ BROKEN = {
     "letters": ("2353 3 137 63 : 53FCxx", "not of the form 'week tow prn type"),
     "length": ("2353 3 137 63 : 53FC00", "6 hexadecimal digits"),
     "prn": (f"2353 3 12 63 : {digits(cases.message(63, 0), 64)}", "PRN 12 is not an SBAS PRN"),
-    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "type 62 is stated, the message on L1 has 63"),
+    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "stated message type is 62, the type in"),
     "time": (f"2353 604800 137 63 : {digits(cases.message(63, 0), 64)}", "not a GPS time"),
 }
 

@@ -1,6 +1,6 @@
 """Effect of each screen and of each source of the filter on accuracy and availability.
 
-The logs are read once, and every chunk is processed with each choice of screens and sources.
+The logs are read once, and every chunk of them is processed with each choice of screens and sources.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackStatus
 
-#: Names of the choices with all screens and with none, and of the filter along the track.
+#: Names of three choices: all screens, no screens, and the filter along the track.
 ALL, NONE, FILTER = "all", "none", "filter"
-#: Sources of the filter that require sensors, with the inputs that they require.
+#: Filter sources that require sensor data, and the inputs of a run without which each source is absent.
 _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
     "wheel": ("tachometer",),
     "radar": ("radar",),
@@ -65,7 +65,7 @@ class Effect:
     rate: float  #: Fraction of the epochs that have coordinates.
     ok_rate: float  #: Fraction of the epochs with status ok; for the filter, with status tracking.
     n_used: float  #: Mean number of satellites used.
-    #: Median standard deviation along the line of the epochs with coordinates; NaN if there are none.
+    #: Median of the standard deviation along the line over the epochs with coordinates; NaN without such epochs.
     sigma_p50_m: float
     coordinates: Score | None = None  #: Errors of all positions; None without a reference.
     ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
@@ -97,14 +97,14 @@ _OF_SCORE: Final = ("positions", "mean_m", "std_m", "p50_m", "p95_m", "max_m", "
 class Ablation:
     """Effects of all choices of screens and sources on one log."""
 
-    effects: tuple[Effect, ...]  #: In the order of the antennas, then of the choices.
+    effects: tuple[Effect, ...]  #: One effect per antenna and choice, ordered by antenna, then by choice.
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
 
 
 def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the choices of screens by name: all, none, each screen alone, and all but one; equal choices only once."""
+    """Return the choices of screens by name: all, none, each screen alone, and all but one, without duplicates."""
     named = {ALL: tuple(screens), NONE: ()}
     named |= {f"only {name}": (name,) for name in screens}
     named |= {f"without {name}": tuple(other for other in screens if other != name) for name in screens}
@@ -113,7 +113,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of filter sources by name: all available sources, and all but one; codes are always used."""
+    """Return the choices of filter sources by name: all available sources, and all but one (never without codes)."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {
@@ -122,7 +122,7 @@ def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[s
 
 
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the active screens whose inputs are available in this run, and a note on each other active screen."""
+    """Return the active screens whose inputs this run has, and a note on each active screen that is left out."""
     setup = ScreenSetup(
         antennas=len(trajectories),
         spacing_known=all(t.body_chainage_m is not None for t in trajectories.values()),
@@ -166,7 +166,7 @@ def ablate_files(
         }
         received, states = np.datetime64("NaT", "ns"), dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
-        bare = tallies[NONE if NONE in tallies else ALL]  # equal choices if no screen is active
+        bare = tallies[NONE if NONE in tallies else ALL]  # without active screens, there is no choice "none"
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
         for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
             end = max(part.time[-1] for part in chunk.values() if len(part))
@@ -228,9 +228,9 @@ def _settings_of_choices(inputs: RunInputs, config: Config, screens: tuple[str, 
 def _columns(
     result: AntennaResult, track: AlongTrack | None, reference: AntennaReference | None, trajectory: Trajectory
 ) -> dict[str, Floats]:
-    """Return the columns of one antenna and chunk from which the effect is computed, each of shape (T,).
+    """Return the columns from which the effect on one antenna is computed, for one chunk; each has shape (T,).
 
-    Positions and standard deviations are taken from the filter if `track` is given. Masks are 1.0 or 0.0.
+    Positions and standard deviations are taken from the filter if `track` is given. Masks are stored as 1.0 and 0.0.
     """
     counted = result.status != Status.NO_OBSERVATION
     without = ~counted

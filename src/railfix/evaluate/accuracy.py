@@ -1,4 +1,4 @@
-"""Error statistics by groups of epochs, for constrained and conventional positions, with confidence limits.
+"""Error statistics of constrained and conventional positions by group of epochs, with confidence limits.
 
 Errors of a train are correlated over tens of seconds, so that epochs are not independent samples. Confidence limits are
 therefore computed by resampling blocks of one minute, which are nearly independent.
@@ -21,7 +21,7 @@ from railfix.evaluate.evaluation_inputs import EvaluationOptions, floats
 
 #: Error, or distance from the reference, above which a position counts as wrong [m].
 WRONG_PLACE_M = 50.0
-#: Error magnitudes; the fraction of errors above each magnitude is reported [m].
+#: Error magnitudes [m]; the fraction of errors above each of them is reported.
 OVER_M: Final = (5, 10, 20, 50)
 
 
@@ -30,7 +30,7 @@ class Score:
     """Availability and error statistics of a run; statistics in metres are NaN if there is no position."""
 
     epochs: int  #: Number of epochs with observations within the time span of the reference.
-    positions: int  #: Number of these epochs with a position, so that the error is known.
+    positions: int  #: Number of these epochs at which the position, and therefore the error, is known.
     rate: float  #: positions / epochs.
     mean_m: float  #: Mean of the signed error.
     std_m: float  #: Population standard deviation of the signed error.
@@ -41,9 +41,9 @@ class Score:
 
 
 def score(error_m: Floats, observed: Masks) -> Score:
-    """Compute the statistics of signed errors, shape (T,) and NaN without a position, at the `observed` epochs.
+    """Compute the statistics of signed errors at the `observed` epochs.
 
-    Raise ValueError if no epoch is observed.
+    `error_m` has shape (T,) and is NaN at epochs without a position. Raise ValueError if no epoch is observed.
     """
     if not observed.any():
         raise ValueError("no epoch with observations lies within the time span of the reference")
@@ -62,7 +62,7 @@ def score(error_m: Floats, observed: Masks) -> Score:
     )
 
 
-#: Limits between the classes by number of satellites used.
+#: Numbers of used satellites at which a new class of epochs begins.
 _SATELLITE_EDGES: Final = (4, 5, 6, 7, 8, 10, 12, 15, 20)
 #: Minimum number of blocks for confidence limits.
 FEWEST_BLOCKS: Final = 5
@@ -70,7 +70,8 @@ FEWEST_BLOCKS: Final = 5
 _NODES: Final = 400
 
 
-#: Statistics with confidence limits, as column names; the last two are percentiles of |error| / sigma.
+#: Column names of the statistics that have confidence limits, with {} for "_low", "_high" or no ending. The last two
+#: statistics are percentiles of |error| / sigma.
 LIMITS: Final = ("mean{}_m", "rate{}", "p95{}_m", "normalised_p68{}", "normalised_p95{}")
 LIMIT_COLUMNS: Final = tuple(name.format(end) for name in LIMITS for end in ("_low", "_high"))
 
@@ -86,7 +87,7 @@ def block_limits(
     seed: int,
     confidence: float,
 ) -> dict[str, float]:
-    """Compute the confidence limits `LIMIT_COLUMNS` and the number of blocks, by a block bootstrap.
+    """Compute the confidence limits (`LIMIT_COLUMNS`) by a block bootstrap; return them with the number of blocks.
 
     Errors, sigmas, the masks and the block numbers have shape (T,). Blocks are drawn with replacement `replicates`
     times. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks.
@@ -135,15 +136,16 @@ def block_limits(
 def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, *, share: float) -> Floats:
     """Compute the percentile of each resample, shape (replicates,), by counting values at increasingly fine nodes.
 
-    `size` and the block numbers `member` have shape (T,); `times` is the number of times that a resample has a block,
-    shape (replicates, blocks); `errors` is the number of values of each resample; if it is 0, the result is NaN.
+    `size` and the block numbers `member` have shape (T,). `times`, shape (replicates, blocks), states how often each
+    block is in a resample. `errors` is the number of values of each resample; the result is NaN for a resample without
+    values.
     """
     found = np.full(len(times), np.nan)
     drawn = errors > 0
     if not drawn.any():
         return found
     values, rank = np.unique(size, return_inverse=True)
-    # with the tolerance, the 95th percentile of 20 errors is the nineteenth error
+    # without the tolerance, rounding may make the 95th percentile of 20 errors the twentieth error, not the nineteenth
     wanted = (share * errors[drawn] - 1e-9)[:, None]
     low, high, most = 0, len(values) - 1, _NODES
     while True:
@@ -161,22 +163,24 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
             most = high - low + 1
 
 
-#: Kinds of position: on the map; on the map with status ok; 3-D single point at the nearest point of the line.
+#: Kinds of position: on the map, on the map with every check passed, and 3-D single point moved to the nearest point of
+#: the line.
 POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 #: Columns that identify a row of every table.
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Data type of the columns of names while grouping; these columns have many rows and few distinct names.
+#: Data type of columns of names during grouping. It suits them because they have many rows and few distinct names.
 WORDS: Final = pl.Categorical()
-#: Name of a row in which all groups are combined.
+#: Name of the group of all epochs; also the entry in ``antenna``, ``run`` or ``line`` of rows that combine several.
 ALL: Final = "all"
-#: Groups of `signals`: epochs at which the single-epoch solution used a satellite, and epochs at which it used none.
+#: Groups of the grouping ``signals``: epochs at which the single-epoch solution used a satellite, and epochs at which
+#: it used none.
 WITH_SATELLITES: Final = "with satellites"
 WITHOUT_SATELLITES: Final = "without satellites"
 AIDED: Final = pl.col("observed") & (pl.col("n_used").fill_null(0) > 0)
 
-#: Columns of the table of figures, with their unit and meaning.
+#: Columns of the table of error statistics, with the meaning of each.
 FIGURE_COLUMNS: Final[dict[str, str]] = {
     "grouping": "grouping of the epochs: `all`, `section`, `environment`, `speed`, `satellites`, `signals` (with or "
     "without a satellite used), `status`; with several runs also `configuration` and `line`",
@@ -192,8 +196,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "epochs": "number of epochs with a reference, including epochs missing in the log",
     "observed": "number of epochs with a reference and observations",
     "positions": "number of epochs with a reference and a position",
-    "left_out": "number of positions without an error because the reference is not accurate enough",
-    "errors": "number of positions with an error",
+    "left_out": "number of positions whose error is unknown because the reference is not accurate enough",
+    "errors": "number of positions whose error is known",
     "rate": "fraction of the `observed` epochs with a position",
     "rate_of_run": "fraction of the `epochs` with a position",
     "mean_m": "mean error, + toward the end of the line",
@@ -207,7 +211,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this magnitude"),
     "wrong_places": "number of errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",
-    "along_sigma_p50_m": "median standard deviation along the line that the run states",
+    "along_sigma_p50_m": "median of the standard deviation along the line, as stated by the run",
     **dict.fromkeys(
         ("distance_p50_m", "distance_p95_m", "distance_max_m"),
         "percentile or maximum of the straight distance (3-D) from the position on the map to the reference",
@@ -220,7 +224,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
 }
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
-#: Columns of the epochs from which the figures are computed, in addition to the keys.
+#: Columns of the table of epochs from which the error statistics are computed, in addition to `KEYS`.
 USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
@@ -229,9 +233,10 @@ USED: Final = (
 
 
 def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return the epochs inside the reference, with a class and its rank for every grouping.
+    """Return the epochs that the reference covers, with the name and the rank of their group in every grouping.
 
-    The columns of a grouping are, for example, ``section_group`` and ``section_rank``; the ranks order the groups.
+    For the grouping ``section``, for example, these are the columns ``section_group`` and ``section_rank``. Tables are
+    sorted by rank.
     """
     section = (pl.col("chainage_m") / options.section_m).floor().cast(pl.Int64)
     speed, used = pl.col("speed_mps") * 3.6, pl.col("n_used")
@@ -261,12 +266,12 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
 
 
 def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
-    """Return the expression for the number of edges that are at most equal to a value."""
+    """Return the expression for the number of edges that are not greater than a value."""
     return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
 
 
 def _plain(value: pl.Expr) -> pl.Expr:
-    """Return numbers as text, whole numbers without decimals."""
+    """Return the expression for numbers as text; whole numbers are written without decimals."""
     return pl.when(value == value.round()).then(value.cast(pl.Int64).cast(pl.String)).otherwise(value.cast(pl.String))
 
 
@@ -292,7 +297,7 @@ def has_position(position: str) -> pl.Expr:
 
 
 def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
-    """Return epochs with the columns of one kind of position from which the statistics are computed.
+    """Return the epochs with the columns from which the statistics of one kind of position are computed.
 
     ``has`` is true for epochs with a position. ``error``, ``size`` (error magnitude) and ``normalised`` (error / sigma)
     are null without a position, or if the reference is not accurate enough. ``sigma`` and ``distance`` are null for
@@ -318,7 +323,7 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
 
 
 def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
-    """Return the table `FIGURE_COLUMNS` for every grouping, group, antenna, kind of position and choice of epochs."""
+    """Return error statistics (`FIGURE_COLUMNS`), one row per group, antenna, kind of position and choice of epochs."""
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}
     for epochs in parts:
@@ -388,7 +393,10 @@ def _figures() -> list[pl.Expr]:
 def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
-    """Return the table with confidence limits, computed from the epochs `part`; null without `part` or if undefined."""
+    """Return the table with additional columns of confidence limits, computed from the epochs `part`.
+
+    The limits are null without `part`, or if they are undefined.
+    """
     schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
     if part is None:
         return table.with_columns(pl.lit(None, kind).alias(name) for name, kind in schema.items())

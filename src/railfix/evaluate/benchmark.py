@@ -41,12 +41,14 @@ from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.output import OutputFolder
 from railfix.track.trajectory import Trajectory
 
-#: Name of the row with RTKLIB's single-point positions, and the program that computes them (Debian package rtklib).
+#: Name of the row with RTKLIB's single-point positions.
 RTKLIB_SINGLE: Final = "RTKLIB single point"
+#: RTKLIB's program that computes these positions (Debian package rtklib).
 RTKLIB_PROGRAM: Final = "rnx2rtkp"
-#: Largest time difference between a position and its epoch, as a fraction of the median interval of the epochs.
+#: Largest time difference between a position and the epoch to which it belongs, as a fraction of the median interval of
+#: the epochs.
 _NEAR: Final = 0.4
-_LONGEST_S: Final = 600.0  #: Time after which RTKLIB is ended [s].
+_LONGEST_S: Final = 600.0  #: Time after which RTKLIB is stopped [s].
 #: Bits of the constellations in RTKLIB's option pos1-navsys.
 _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
@@ -55,8 +57,8 @@ def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     """Return the row of a log for each epoch, shape (T,); -1 for epochs without a row.
 
     `time` are the epochs, `found` the times of the log. A row belongs to the nearest epoch if the time difference is
-    less than 0.4 of the median interval of the epochs; of several rows for an epoch the nearest is returned. With fewer
-    than two epochs, no epoch has a row.
+    less than 0.4 of the median interval of the epochs. If several rows belong to an epoch, the nearest is returned.
+    With fewer than two epochs, no epoch has a row.
     """
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
@@ -191,7 +193,7 @@ BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     "time_to_first_s": "time from the first epoch with observations to the first position",
     "over_level": "number of errors above a usable level (no alarm, and a status with a bounded error)",
     "over_level_alarm": "number of errors above a level that was not usable, because of an alarm or the status",
-    **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, own limit)" for name in _OF_STANFORD},
+    **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, alarm limit of the run)" for name in _OF_STANFORD},
     "error": "reason for a missing result",
 }
 #: Columns of the printed table: column, header, performance feature of EN 16803-1, decimals, factor.
@@ -226,8 +228,9 @@ def run_benchmark(
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Run the cases of a folder with one configuration, evaluate them and the other programs, and write the tables.
 
-    Return the table `BENCHMARK_COLUMNS`, in which a failed case has its reason in ``error``, and notes. Raise
-    InputFileError if a file has a wrong hash, MismatchError if settings were derived from a held-out case.
+    Return the table (`BENCHMARK_COLUMNS`) and notes. The row of a failed case states the reason of the failure in
+    ``error``. Raise InputFileError if a file has a wrong hash, MismatchError if settings were derived from a held-out
+    case.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)

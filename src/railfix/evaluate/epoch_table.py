@@ -47,7 +47,7 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "conventional_error_m": "error of the nearest point of the trajectory to the 3-D single point, + toward the end of "
     "the line",
     "distance_m": "straight distance (3-D) from the position on the map to the reference",
-    "along_sigma_m": "standard deviation along the line that the run states",
+    "along_sigma_m": "standard deviation along the line, as stated by the run",
     "branch_probability": "probability of the branch, for the filter along the track",
     "sources": "measurements that the filter used",
     "interval_m": "distance travelled since the previous position",
@@ -57,7 +57,7 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "block": "number of the time block within the run, for confidence limits",
 }
 
-#: Expression for rows of the filter, recognised by the probability of the branch, which only the filter states.
+#: Expression for rows that come from the filter's table, the only table with a probability of the branch.
 OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 
@@ -70,9 +70,9 @@ class AntennaEpochs:
 
     errors: PlaceErrors
     speed_from: str  #: Source of the speed: "reference", or "places" if computed from positions of the reference.
-    outside: int  #: Number of epochs of the log outside the reference.
+    outside: int  #: Number of epochs of the log that the reference does not cover.
     step_s: float  #: Median interval of the log; NaN with fewer than two epochs.
-    from_sections: int  #: Number of epochs with a reference whose environment is from the sections.
+    from_sections: int  #: Number of epochs with a reference at which the environment is taken from the sections.
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
@@ -88,7 +88,7 @@ def protection_columns(table: pl.DataFrame) -> list[str]:
 
 
 def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Concatenate tables of epochs; columns that a table does not have are null in its rows.
+    """Concatenate tables of epochs; a column that a table lacks is null in the rows of that table.
 
     The columns are removed from the given tables one by one, to save memory.
     """
@@ -105,10 +105,10 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Return the epochs of a log and the epochs missing in its gaps, a mask of the logged epochs, and the interval [s].
+    """Return the epochs of a log with missing epochs added, a mask of logged epochs, and the median interval [s].
 
-    A gap is longer than 1.5 times the median interval; missing epochs are spread evenly over it. With fewer than two
-    epochs the interval is NaN.
+    Epochs are missing where an interval is longer than 1.5 times the median interval; they are spread evenly over this
+    gap. With fewer than two epochs, the median interval is NaN.
     """
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
@@ -129,7 +129,8 @@ def distance_travelled(
     """Return the distance travelled since the first known reference position, shape (T,) [m].
 
     `step_m` are the distances between successive known positions. Steps at a speed below `options.standing_mps` are not
-    counted. The distance is interpolated by time over gaps; NaN before the first and after the last known position.
+    counted. Over gaps, the distance is interpolated in time. It is NaN before the first and after the last known
+    position.
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)
@@ -145,9 +146,9 @@ def distance_travelled(
 
 
 def since_last(values: Floats, has: Masks) -> Floats:
-    """Return the increase of a quantity since the previous row of the mask `has`, shape (T,).
+    """Return the increase of a quantity since the previous row at which the mask `has` is true, shape (T,).
 
-    The increase is NaN at rows outside the mask, at the first row of the mask, and where the quantity is NaN.
+    The increase is NaN where the mask is false, at the first row where it is true, and where the quantity is NaN.
     """
     grown = np.full(len(values), np.nan)
     at = np.flatnonzero(has & np.isfinite(values))
@@ -231,7 +232,7 @@ class _OwnColumns(NamedTuple):
     """Columns of an antenna's positions, extended to the epochs that are missing in the log."""
 
     table: pl.DataFrame
-    rows: Indices  #: Row of the table for each epoch; the length of the table for a missing epoch.
+    rows: Indices  #: Row of the table for each epoch; for a missing epoch, the number of rows of the table.
 
     def floats(self, name: str) -> Floats:
         """Return a column of numbers, NaN for missing epochs."""
@@ -254,7 +255,7 @@ class _OwnColumns(NamedTuple):
 
 
 def _since_last_position(time: Datetimes, moved_m: Floats, answers: Answers) -> dict[str, Floats]:
-    """Return distance travelled and time since the previous position, on the map and for conventional positions.
+    """Return the distance and time since the previous position, for constrained and for conventional positions.
 
     Positions in gaps of the reference are included, because `moved_m` is interpolated over the gaps.
     """

@@ -47,12 +47,13 @@ class RunAndReference:
     """Table of positions of a run, and the reference trajectory of the run."""
 
     run: Path  #: Folder that `railfix run` wrote.
-    #: File, or trajectories by antenna; with None, the file of `BESIDE_THE_LOG` in the folder of the run's log.
+    #: Reference file, or reference trajectories by antenna. If None, the folder of the run's log must have a file with
+    #: one of the names `BESIDE_THE_LOG`.
     reference: Reference = None
-    configuration: str | None = None  #: Name of the settings; with None, the settings that differ between the runs.
+    configuration: str | None = None  #: Name of the configuration; if None, it is made from the settings.
     table: str = POSITIONS_TABLE  #: Name of the table, see `railfix.evaluate.evaluation_inputs.list_position_tables`.
-    #: Another run on the same log, whose conventional positions replace the run's own. P1 compares with the
-    #: conventional positions of a run with only the elevation and C/N0 screens.
+    #: Folder of another run on the same log; its conventional positions replace those of `run`. For the comparison of
+    #: P1, that other run has only the elevation and C/N0 screens.
     conventional: Path | None = None
 
 
@@ -66,7 +67,7 @@ class EvaluatedRun:
     path: Path
     table: str  #: Name of the table of positions.
     reference: str  #: File of the reference, or "given" for arrays.
-    method: Mapping[str, str]  #: Method of the errors by antenna: "chainage" or "trajectory".
+    method: Mapping[str, str]  #: Method by which the errors of each antenna were computed: "chainage" or "trajectory".
     speed_from: Mapping[str, str]  #: Source of the speed by antenna: "reference" or "places".
     outside: Mapping[str, int]  #: Number of epochs of the log outside the reference, by antenna.
     step_s: Mapping[str, float]  #: Median interval of the log, by antenna.
@@ -83,16 +84,19 @@ class Evaluation(NotebookTable):
     runs: tuple[EvaluatedRun, ...]
     epochs: pl.DataFrame  #: One row per epoch, antenna and run: `EPOCH_COLUMNS`, then protection levels.
     figures: pl.DataFrame  #: Error statistics of every grouping: `FIGURE_COLUMNS`.
-    intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
-    levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None if no run has a protection level.
-    integrity: Mapping[str, Integrity]  #: Levels against errors, by the kind of level.
-    outages: pl.DataFrame | None  #: `OUTAGE_COLUMNS`; None without a table of the filter along the track.
-    branches: pl.DataFrame | None  #: `BRANCH_COLUMNS`; None without a table of the filter along the track.
+    intervals: pl.DataFrame  #: Intervals between positions: `INTERVAL_COLUMNS`.
+    #: Statistics of the protection levels: `LEVEL_COLUMNS`; None if no run has a protection level.
+    levels: pl.DataFrame | None
+    integrity: Mapping[str, Integrity]  #: Comparison of levels with errors, by kind of level.
+    #: Stretches without satellites: `OUTAGE_COLUMNS`; None without a table of the filter along the track.
+    outages: pl.DataFrame | None
+    #: Probabilities of the branch: `BRANCH_COLUMNS`; None without a table of the filter along the track.
+    branches: pl.DataFrame | None
     options: EvaluationOptions
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return column `name` of the row of `figures` with the values `where`.
+        """Return the value in column `name` of the one row of `figures` in which other columns have the values `where`.
 
         The defaults are `grouping` "all", `epochs_of` "own" and `position` "constrained". Raise LookupError unless
         exactly one row has these values.
@@ -132,11 +136,11 @@ def evaluate_runs(
     """Evaluate runs against their reference trajectories.
 
     `sections` is a CSV file of the environment by chainage (``from_m,to_m,environment``), used where a reference does
-    not state it. `files` replaces the track and the vehicle that ``run.json`` names.
+    not state the environment. `files` replaces the track and the vehicle that ``run.json`` names.
 
     Raise InputFileError if a file is missing or its content is not as expected; raise MismatchError if a run and its
     reference do not overlap in time, or the errors cannot be computed as requested; raise SettingsError if no run is
-    given, or a run twice.
+    given, or a run is given twice.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
@@ -187,7 +191,7 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Return one run without a name, the epochs of each antenna, and the kind of its levels with the alarm limit.
+    """Evaluate a run; return it without its name, the epochs of each antenna, and the kind and limit of its levels.
 
     References that are read from files are kept in `read`, so that several runs share them.
     """
@@ -228,7 +232,7 @@ def _evaluate(
         notes.append("run.json does not state the basis of the protection levels; their kind is unknown")
     stated = folder.table != POSITIONS_TABLE or "protection_status" in folder.positions.columns
     if folder.level_kind is not None and not stated:
-        notes.append("the run has no protection_status: levels are taken as usable if the status is ok")
+        notes.append("the run has no protection_status: levels count as usable if the status of the position is ok")
     notes += [note for antenna in antennas.values() for note in antenna.errors.notes]
     facts = {fact: {name: getattr(antenna, fact) for name, antenna in antennas.items()} for fact in _FACTS}
     run = EvaluatedRun(
@@ -255,18 +259,18 @@ def _references(
     read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]],
     options: EvaluationOptions,
 ) -> tuple[Mapping[str, AntennaReference], Path | None]:
-    """Return the references of a run by antenna, and their file, or None for arrays.
+    """Return the references of a run by antenna, and the path of their file; None as path if arrays were given.
 
-    The content of a file is kept in `read`. Raise MismatchError if an antenna has no reference, or the file is a
-    table of the run itself.
+    The content of a file is kept in `read` for further runs. Raise MismatchError if an antenna has no reference, or the
+    file is a table of the run itself.
     """
     if isinstance(item.reference, Mapping):
         if missing := [name for name in folder.antennas if name not in item.reference]:
-            raise MismatchError(f"{folder.path}: the references given have none of the {missing[0]} antenna; add it")
+            raise MismatchError(f"{folder.path}: the given references do not include the {missing[0]} antenna; add it")
         return item.reference, None
     path = item.reference or reference_beside(folder)
     if path.resolve().parent == item.run.resolve() and path.name.split(".")[0] in TABLES:
-        raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
+        raise MismatchError(f"{path}: is a table of the run itself; give the reference of an independent measurement")
     key = path, tuple(folder.antennas)
     if key not in read:
         reading = options.columns.arguments
@@ -277,7 +281,7 @@ def _references(
 def reference_beside(run: RunFolder) -> Path:
     """Return the path of the reference (`BESIDE_THE_LOG`) in the folder of the front antenna's log.
 
-    Raise InputFileError unless there is exactly one.
+    Raise InputFileError unless the folder has exactly one such file.
     """
     logs = run.input_paths("front")
     if not logs:
@@ -297,7 +301,7 @@ def reference_beside(run: RunFolder) -> Path:
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
     """Return a name for the settings of each run: the given label, or the preset and the settings that differ.
 
-    For a single run the name has the preset and the screens.
+    The name of a single run consists of the preset and the screens.
     """
     keys = dict.fromkeys(key for run_settings in settings for key in run_settings)
     differ = [
@@ -313,7 +317,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return the runs with configurations and short distinct names, with the table if it is not `positions`."""
+    """Return the runs with configurations and short distinct names, which state the table if it is not `positions`."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
@@ -346,9 +350,9 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Yield the rows of each value of the column `by`, first by antenna, then with both antennas combined.
+    """Yield the rows of each value of the column `by`, with the columns `as_one` set to `ALL`.
 
-    The columns `as_one`, and in the second case ``antenna``, are set to `ALL`.
+    With two antennas, yield the rows of each value again with both antennas combined: ``antenna`` is `ALL`, too.
     """
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):

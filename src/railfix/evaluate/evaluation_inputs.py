@@ -26,15 +26,15 @@ from railfix.run.record import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions must have.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
-#: Selector of no columns, to read only the columns that a table must have.
+#: Selector that matches no column, so that only the columns `NEEDED` are read.
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
-#: Name of the table of single-epoch positions, from which ``train`` gets the columns `SINGLE_EPOCH`.
+#: Name of the table of single-epoch positions; the filter's table ``train`` gets the columns `SINGLE_EPOCH` from it.
 POSITIONS_TABLE: Final = "positions"
 TABLES: Final = (POSITIONS_TABLE, "train")
 SINGLE_EPOCH: Final = ("n_used", *CONVENTIONAL)
-#: Kind of protection levels where neither the positions nor ``run.json`` state the kind.
+#: Kind of protection levels if neither the positions nor ``run.json`` state it.
 UNKNOWN_KIND: Final = "unknown"
 _KEYS: Final = ("time_gpst", "antenna")
 _ENDINGS: Final = (".parquet", ".csv")
@@ -57,11 +57,13 @@ class RunFolder(RunRecord):
 
     @property
     def chainage_of(self) -> Mapping[str, str]:
-        """Point of the train whose chainage is given, by antenna, such as "antenna"; empty if not recorded."""
+        """Point of the train to which the chainage refers, such as "antenna", by antenna; empty if not recorded."""
         return dict(self._line.get("chainage_of") or {})
 
     def turn_m(self, antenna: str) -> float:
-        """Return the length of a closed line in chainage of an antenna [m]; infinity for an open or unrecorded line."""
+        """Return the length of a closed line, measured in an antenna's chainage [m]; infinity for an open or unrecorded
+        line.
+        """
         turn = (self._line.get("turn_m") or {}).get(antenna)
         return float("inf") if turn is None else float(turn)
 
@@ -283,33 +285,33 @@ class EvaluationInputs(Settings):
     """Files of an evaluation in addition to the runs, and names of the configurations."""
 
     reference: tuple[str, ...] = option(
-        "Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one file for all runs, or one for each run in "
-        "order; `auto` uses truth.csv or reference.csv in the folder of each run's log.",
+        "File of reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs, or one for each run "
+        "in order; `auto` uses truth.csv or reference.csv in the folder of each run's log.",
         metavar="FILE",
         panel=INPUTS,
     )
     table: tuple[str, ...] = option(
         "Table of positions: `positions` (single epochs) or `train` (filter along the track); may be repeated. By "
-        "default every table of the run.",
+        "default, every table of the run is evaluated.",
         (),
         metavar="NAME",
         panel=INPUTS,
     )
     conventional: Path | None = option(
-        "Another run on the same log, whose conventional positions replace the run's own. A run with "
-        "`--screens elevation` gives unscreened positions, as in P1.",
+        "Folder of another run on the same log; its conventional positions replace those of the run. A run with "
+        "`--screens elevation` provides unscreened positions, as in P1.",
         None,
         metavar="RUN",
         panel=INPUTS,
     )
     sections: Path | None = option(
-        "Environment by chainage (from_m,to_m,environment), used where the reference states none.",
+        "CSV file of the environment by chainage (from_m,to_m,environment), used where the reference states none.",
         None,
         metavar="CSV",
         panel=INPUTS,
     )
     label: tuple[str, ...] = option(
-        "Name of the configuration of a run, repeated for each run in order; by default from the settings.",
+        "Name of the configuration of a run, repeated for each run in order; by default, made from the settings.",
         (),
         metavar="TEXT",
     )

@@ -21,15 +21,16 @@ from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]
 
-#: Choices of levels, see the description of the module.
+#: Choices of the levels that are compared with errors; the docstring of this module defines them.
 LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
-#: Columns of the parts of a level, and of its cause and status, without the prefix "protection_".
+#: Columns of the parts of a level, without the prefix "protection_".
 PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
+#: Columns of the cause and the status of a level, without the prefix "protection_".
 STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
-#: Columns of the epochs for a Stanford diagram, in addition to the level and its status.
+#: Columns of the table of epochs that a Stanford diagram requires, in addition to the level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
-#: Statuses of positions whose level bounds the error; a coasting filter has a level, too.
+#: Statuses of a position with which its protection level bounds the error; a coasting filter has a level, too.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -51,7 +52,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "own_limit": "whether this is the alarm limit of the run",
     "epochs": "number of epochs with a reference, including epochs missing in the log",
     "observed": "number of these epochs with observations",
-    "judged": "number of these epochs with an error",
+    "judged": "number of these epochs at which the error is known",
     "nominal": "epochs with error <= level <= AL",
     "misleading": "epochs with level < error <= AL",
     "hazardously_misleading": "epochs with level <= AL < error",
@@ -89,7 +90,7 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
 }
 
 
-#: Kind of the protection levels of a run, which is the prefix of their columns, and alarm limit of the run [m] or None.
+#: Kind of a run's protection levels, which is the prefix of their columns, and the run's alarm limit [m] or None.
 Level = tuple[str, float | None]
 
 
@@ -97,8 +98,8 @@ Level = tuple[str, float | None]
 class Integrity:
     """Comparison of the protection levels of one kind with the errors."""
 
-    stanford: pl.DataFrame  #: `railfix.evaluate.accuracy.KEYS`, then `STANFORD_COLUMNS`.
-    beyond: pl.DataFrame  #: `BEYOND_COLUMNS`, the largest excess first.
+    stanford: pl.DataFrame  #: Counts of epochs: `railfix.evaluate.accuracy.KEYS`, then `STANFORD_COLUMNS`.
+    beyond: pl.DataFrame  #: Epochs beyond their level: `BEYOND_COLUMNS`, the largest excess first.
 
 
 def level_name(kind: str) -> str:
@@ -109,8 +110,8 @@ def level_name(kind: str) -> str:
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
     """Return the levels that are compared with errors, shape (T,) [m].
 
-    A level is infinite if it is missing or, with `levels_of` "usable", not usable; it is NaN without a position
-    (mask `has`). `status` is the status of the position, `verdict` the status of the level.
+    A level is infinite if it is missing, or if it is not usable and `levels_of` is "usable". It is NaN without a
+    position (mask `has`). `status` is the status of the position, `verdict` the status of the level.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
@@ -153,7 +154,7 @@ def positions_diagram(
 ) -> Stanford:
     """Return the Stanford diagram of one antenna's epochs (`POSITION_COLUMNS`) without a reference.
 
-    Without errors the diagram has only availability and continuity.
+    Since the errors are unknown, the diagram has only availability and continuity.
     """
     level = effective_levels(
         floats(positions, "protection_level_m"),

@@ -104,7 +104,7 @@ def _seconds(duration: pl.Expr) -> pl.Expr:
     return duration.dt.total_nanoseconds() / 1e9
 
 
-#: Minimum duration of a stretch without satellites in the table [s].
+#: Minimum duration with which a stretch without satellites is listed in the table [s].
 LEAST_S: Final = 2.0
 
 #: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
@@ -174,7 +174,7 @@ _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branc
 #: Columns of the table of probabilities in addition to its keys, with their unit and meaning.
 BRANCH_COLUMNS: Final[dict[str, str]] = {
     "probability": "class of the stated probability of the branch; `all` for every epoch",
-    "judged": "number of positions of the class with an error",
+    "judged": "number of positions of the class whose error is known",
     "probability_mean": "mean of the stated probabilities",
     "right_share": "fraction of the positions within 50 m of the reference",
     "wrong_places": "number of positions farther than 50 m from the reference",
@@ -220,7 +220,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
     "level_share": "fraction of the `observed` epochs with a finite level",
     "level_p50_m": "median of the finite levels",
     "level_p95_m": "95th percentile of the finite levels",
-    "errors": "number of positions with a finite level and an error",
+    "errors": "number of positions with a finite level and a known error",
     "over_level": "number of errors above the finite level",
     "over_level_share": "over_level / errors",
 }
@@ -235,7 +235,7 @@ def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
     for level in level_columns(epochs):
         if epochs[level].null_count() == len(epochs):
             continue
-        # runs without this level, such as the filter along the track, have no row
+        # runs without this level have no row; runs of the filter's table, for example, have no level of single epochs
         columns = ("run", *by, "status", "observed", "in_reference", "reference_good", "positioned", "error_m", level)
         spanned = epochs.select(*dict.fromkeys(columns)).filter(
             "in_reference", pl.col(level).is_not_null().any().over("run")
@@ -333,7 +333,9 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
 
 
 def _epochs(folder: Path, run: RunFolder, number: int) -> pl.DataFrame:
-    """Return the epochs of one run with chainages, and with status and level of the filter, null without the filter."""
+    """Return the epochs of one run with chainage and with the filter's status and level, which are null without a
+    filter.
+    """
     single = run.positions.select(
         "time_gpst", "antenna", "chainage_m", pl.col("status").cast(pl.String),
         *(pl.col(name).cast(pl.Float64) for name in _POSITION_COLUMNS),

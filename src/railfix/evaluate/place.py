@@ -30,13 +30,14 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Bracket:
-    """Neighbouring instants of a reference, which has R instants, for each of T times."""
+    """Neighbouring instants of a reference for each of T times; the reference has R instants."""
 
-    #: Indices of the instants before and after each time, equal if an instant is at the time itself; shape (T,).
+    #: Index of the reference instant before each time, or of the instant at the time itself; shape (T,).
     left: Indices
+    #: Index of the reference instant after each time; equal to `left` if an instant is at the time itself; shape (T,).
     right: Indices
-    share: Floats  #: Fraction of the interval from left to right that has passed, 0 to 1, shape (T,).
-    inside: Masks  #: False before the first, after the last, and in gaps of the reference; shape (T,).
+    share: Floats  #: Fraction of the interval from left to right that has passed at each time, 0 to 1, shape (T,).
+    inside: Masks  #: False before the first instant, after the last instant, and in gaps of the reference; shape (T,).
 
     def of(self, values: Floats) -> Floats:
         """Return values of the reference, shape (R,) or (R, n), interpolated linearly to the T times; NaN outside."""
@@ -103,7 +104,7 @@ def along_track_error(
     reference_ecef_m : ndarray, shape (T, 3) [m]
         Reference positions.
     same_place_m : float [m]
-        Largest distance of a pass of the map from the reference position.
+        Largest distance from the reference position at which the map counts as passing it.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -142,20 +143,22 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Largest median difference between distances in chainage and in ECEF of run and reference on the same map [m].
+#: Run and reference are on the same map if their distance in chainage differs from their distance in space by at most
+#: this at the median [m].
 SAME_MAP_M: Final = 1.0
-#: Largest distance of a position from the trajectory of its run [m].
+#: Largest distance of a position from the trajectory of the run that computed it [m].
 SAME_TRAJECTORY_M: Final = 0.01
-#: Largest distance between two points of a vehicle along the line [m].
+#: Largest distance along the line between two points of a vehicle [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: Excess of the distance along the line over twice the error, above which the error is to another pass of the line [m].
+#: An error counts as measured to another pass of the line if the distance along the line to the reference's nearest
+#: point exceeds twice the error by more than this [m].
 _ANOTHER_PASS_M: Final = 50.0
 #: Tolerance for rounded chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Files that replace the files of ``run.json``, and options for reading the track (except `reading.reference`)."""
+    """Files that replace the files of ``run.json``, and options for reading the track (without `reading.reference`)."""
 
     track: tuple[Path, ...] = option(
         "Track map to use instead of the track in run.json.", (), metavar="TRACK", panel=INPUTS
@@ -173,8 +176,9 @@ class Answers:
     chainage_m: Floats  #: Chainage of the position on the map, shape (T,); NaN without a position.
     conventional_chainage_m: Floats  #: Chainage of the conventional position, shape (T,); NaN without a position.
     ecef_m: Floats  #: Position on the map, shape (T, 3); NaN without a position.
-    reference_chainage_m: Floats  #: Shape (T,); NaN outside the reference, or where it has no chainage.
-    reference_ecef_m: Floats  #: Shape (T, 3); NaN outside the reference.
+    #: Chainage of the reference, shape (T,); NaN outside the reference, or where it has no chainage.
+    reference_chainage_m: Floats
+    reference_ecef_m: Floats  #: Position of the reference, shape (T, 3); NaN outside the reference.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,12 +188,13 @@ class PlaceErrors:
     method: Method
     error_m: Floats  #: Signed error of the position on the map, shape (T,).
     conventional_error_m: Floats  #: Signed error of the conventional position, shape (T,).
-    #: Straight distance (3-D) from the position on the map to the reference, shape (T,): to its nearest point on the
-    #: map with the method "trajectory", to the reference position with the method "chainage".
+    #: Straight distance (3-D) from the position on the map to the reference, shape (T,). With the method "trajectory",
+    #: the distance is to the reference's nearest point on the map; with the method "chainage", to the reference
+    #: position.
     distance_m: Floats
     #: Chainage of the reference, computed from the map if the reference has none; shape (T,).
     reference_chainage_m: Floats
-    files: tuple[tuple[str, Path], ...] = ()  #: Kinds and paths of track and vehicle, if they were read.
+    files: tuple[tuple[str, Path], ...] = ()  #: Kind ("track" or "vehicle") and path of each file that was read.
     notes: tuple[str, ...] = ()
 
 
@@ -205,7 +210,7 @@ def compute_errors(
 
     With the method "auto" the errors are differences of chainage if run and reference share a map (`SAME_MAP_M`),
     otherwise distances along the trajectory. Raise MismatchError if the reference is of another region, the method
-    "chainage" is impossible, or the track is not the run's; raise InputFileError if a file is missing.
+    "chainage" is impossible, or the track is not the track of the run; raise InputFileError if a file is missing.
     """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
@@ -251,7 +256,7 @@ def compute_errors(
 
 
 def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
-    """Raise MismatchError if the reference is farther than `ANOTHER_PLACE_M` from the positions."""
+    """Raise MismatchError if the median distance between reference and positions exceeds `ANOTHER_PLACE_M`."""
     apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
     apart = apart[np.isfinite(apart)]
     if len(apart) and (median := float(np.median(apart))) > ANOTHER_PLACE_M:
@@ -264,7 +269,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
 def _note_of_passes(
     antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
 ) -> tuple[str, ...]:
-    """Return a note on the number of errors to a pass of the line that is not nearest to the reference, if any."""
+    """Return a note with the number of errors not measured to the pass of the line that is nearest to the reference."""
     known = np.isfinite(error_m)
     nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
     others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())
@@ -272,8 +277,7 @@ def _note_of_passes(
         return ()
     return (
         f"{antenna}: the line passes the same point several times; {others} of {int(known.sum())} errors "
-        "are to the "
-        "pass nearest to the position, and the train may have been on another pass",
+        "were measured to the pass nearest to the position, but the train may have been on another pass",
     )
 
 
@@ -295,14 +299,16 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
     both = np.isfinite(difference) & np.isfinite(apart)
     off = float(np.median(np.abs(difference - apart)[both])) if both.any() else 0.0
     if off > SAME_MAP_M + (0.0 if point == "antenna" else _WITHIN_VEHICLE_M):
-        return f"the chainages of run and reference are not of one map (off by {off:.1f} m at the median)", False
+        return f"the chainages of run and reference are not on the same map (median difference {off:.1f} m)", False
     if point != "antenna":
         return f"the chainage of the run refers to the {point}, the chainage of the reference to the antenna", True
     return None, True
 
 
 def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
-    """Return the arc lengths at chainages; chainages beyond an end by less than `_ROUNDING_M` are moved to the end."""
+    """Return the arc lengths at chainages; chainages beyond an end of the line by less than `_ROUNDING_M` are moved to
+    it.
+    """
     first, last = trajectory.chainage_m[0], trajectory.chainage_m[-1]
     near = (chainage_m > first - _ROUNDING_M) & (chainage_m < last + _ROUNDING_M)
     return trajectory.arc_at_chainage(np.where(near, np.clip(chainage_m, first, last), chainage_m))
@@ -344,7 +350,7 @@ def find_trajectory(
     distance = f"{min(farthest):.2f} m" if np.isfinite(min(farthest)) else "the length of the line"
     raise MismatchError(
         f"{tracks[0]}: is not the track of {run.path}, whose positions of the {antenna} antenna lie up to {distance} "
-        "from it; give the run's own --track and --vehicle, and its --crs, --height-datum and --geoid where it had them"
+        "from it; give the --track and --vehicle of the run, and its --crs, --height-datum and --geoid if it had any"
     )
 
 

@@ -43,7 +43,8 @@ DRIVE_FILES: Final = {
     "base.rnx": "MARE00ESP_R_20203341240_20M_01S_MO.rnx",
     "nav.rnx": "CARD00ESP_R_20203340900_15H_MN.rnx",
 }
-#: Trajectory of the publisher: GPS week and seconds, latitude, longitude, height, and sigmas north, east and up.
+#: File of the publisher's trajectory, with the columns GPS week and seconds, latitude, longitude, height, and sigmas
+#: north, east and up.
 _PUBLISHED: Final = "reference_trajectory.csv"
 #: Options of rnx2rtkp: kinematic, forward and backward, L1 and L2 (E5b), GPS, Galileo, BeiDou, and GLONASS with float
 #: ambiguities.
@@ -76,7 +77,10 @@ def fetch_public_data() -> Path:
         try:
             subprocess.run(command, check=True, capture_output=True, timeout=_LONGEST_S)
         except (OSError, subprocess.SubprocessError) as error:
-            what = f"{WHEEL} could not be downloaded ({type(error).__name__} of {pip[-1]}); it needs pip and a network"
+            what = (
+                f"{WHEEL} could not be downloaded ({type(error).__name__} of {pip[-1]}); "
+                "the download needs pip and a network"
+            )
             raise InputFileError(folder, what) from None
         unpack_wheel(next(Path(name).glob("*.whl")), Path(name) / "unpacked")
         (Path(name) / "unpacked").rename(folder)
@@ -96,11 +100,12 @@ def unpack_wheel(wheel: Path, folder: Path) -> None:
 
 
 def write_drive(recordings: Path, folder: Path) -> str:
-    """Write the drive as a held-out case of `railfix benchmark` into a folder; return a text on its ground truth.
+    """Write the drive as a held-out case of `railfix benchmark` into a folder; return a text that describes the ground
+    truth.
 
     The ground truth is RTKLIB's kinematic solution with the station, forward and backward, if `rnx2rtkp` is installed,
-    otherwise the publisher's trajectory; the text states its accuracy. The map is made from the ground truth. Raise
-    OutputError if RTKLIB fails.
+    otherwise the publisher's trajectory; the text states the accuracy of this trajectory. The map is made from the
+    ground truth. Raise OutputError if RTKLIB fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, source in DRIVE_FILES.items():

@@ -1,4 +1,5 @@
-"""Pseudorange errors against a reference position, after subtraction of clock and common errors (P1 7, fig. 14).
+"""Pseudorange errors against a reference position, after subtraction of receiver clock and common errors (P1 7, fig.
+14).
 
 A nearby reference station measures the common errors. An error model is fitted to the errors of several runs.
 """
@@ -49,7 +50,7 @@ __all__ = [
     "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
 ]  # fmt: skip
 
-#: Rejection reasons for which no range error is defined: no pseudorange, no ephemeris, no correction.
+#: Rejection reasons with which no range error can be computed: no pseudorange, no ephemeris, no correction.
 NO_RANGE: Final = (
     Reason.NOT_OBSERVED
     | Reason.IMPLAUSIBLE_CODE
@@ -67,10 +68,11 @@ NO_RANGE: Final = (
     | Reason.SBAS_NO_IONOSPHERE
 )
 
-#: Largest standard deviation of a reference position that is used.
+#: Largest standard deviation of a reference position that is used [m].
 _LARGEST_REFERENCE_SIGMA_M: Final = 0.5
-#: Longest gaps of the reference trajectory and of the reference station's log over which they are interpolated.
+#: Longest gap of the reference trajectory over which its positions are interpolated [s].
 _LARGEST_REFERENCE_GAP_S: Final = 2.5
+#: Longest gap of the reference station's log over which its range errors are interpolated [s].
 _LARGEST_BASE_GAP_S: Final = 35.0
 #: Minimum number of ranges of a constellation, after the screens, from which its receiver clock is estimated.
 _LEAST_RANGES: Final = 4
@@ -83,7 +85,8 @@ class StationErrors:
     name: str
     time: Datetimes  #: Shape (B,).
     satellite: Strings  #: Shape (S,).
-    error_m: Floats  #: Corrected pseudorange minus range and receiver clock; NaN where not observed; shape (B, S).
+    #: Corrected pseudorange minus geometric range and receiver clock; NaN where not observed; shape (B, S).
+    error_m: Floats
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
@@ -144,7 +147,7 @@ def base_station_from_files(
     position_ecef_m: Floats | None = None,
     reader: Reader = "railfix",
 ) -> StationErrors:
-    """Compute common range errors from the RINEX files of a station, by default at the position of the header.
+    """Compute common range errors from the RINEX files of a station, by default at the position stated in their header.
 
     Raise InputFileError if no position is known, or no range error of any satellite can be computed.
     """
@@ -179,9 +182,9 @@ def range_errors(
     """Compute the pseudorange errors of one antenna in one chunk of T epochs; `block_s` is the length of a block [s].
 
     The clock of each constellation is the robust mean of the residuals that passed the screens. Each range contributes
-    to the estimate of its clock, which reduces its residual; the factor ``1 / sqrt(1 - share)`` compensates for this
-    reduction. An error common to all satellites is absorbed by the clock and does not affect the position. Without
-    `base`, the satellite and atmospheric errors remain.
+    to the clock that is subtracted from it, so that its residual becomes too small; the factor ``1 / sqrt(1 - share)``,
+    with the weight `share` of the range in the clock, compensates for this. An error common to all satellites is
+    absorbed by the clock and does not affect the position. Without `base`, the satellite and atmospheric errors remain.
 
     Raise MismatchError if fewer than two reference positions have a sigma within the limit.
     """
@@ -240,7 +243,9 @@ def _level_sigma_m(result: AntennaResult) -> Floats:
 class StationBeside(Settings):
     """Options of the command line for the reference positions of the runs and a reference station."""
 
-    reference: tuple[Path, ...] = input_option("Reference positions, one file for each RUN in order.", metavar="FILE")
+    reference: tuple[Path, ...] = input_option(
+        "File of reference positions, one for each RUN in order.", metavar="FILE"
+    )
     base: tuple[Path, ...] = input_option(
         "RINEX observations of a nearby reference station during all RUNs; may be repeated.",
         (),
@@ -259,7 +264,7 @@ class ModelInputs:
     run: Path  #: Folder written by ``railfix run``.
     reference: Path  #: Reference trajectory of the antennas (`railfix.io.reference_log`).
     base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
-    #: Position of the station, ECEF, shape (3,) [m]; None for the position in the header of its first file.
+    #: Position of the station, ECEF, shape (3,) [m]; None for the position in the header of the station's first file.
     base_position_ecef_m: Floats | None = None
     columns: ColumnNames = field(default_factory=ColumnNames)  #: Options for reading the reference.
 
@@ -290,7 +295,9 @@ def error_model_from_runs(
     fit = fit or ErrorModelFit()
     with_base = {bool(source.base) for source in inputs}
     if len(with_base) != 1:
-        raise MismatchError("give a reference station for every run or for none: the errors are of different kinds")
+        raise MismatchError(
+            "give a reference station for every run or for none; errors with and without a station cannot be combined"
+        )
     runs = [_run_errors(source, number, fit) for number, source in enumerate(inputs)]
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
@@ -325,7 +332,9 @@ def error_model_from_runs(
 
 
 def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
-    """Compute the range errors of one run by processing it again, chunk by chunk; block numbers depend on `number`."""
+    """Compute the range errors of one run by processing it again, chunk by chunk; `number` makes the block numbers of
+    the runs distinct.
+    """
     past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)

@@ -261,7 +261,9 @@ def _where(rows: pl.DataFrame) -> list[Column]:
 
 
 def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows that combine the runs of a configuration, or the rows by run if no configuration has several."""
+    """Return the rows that combine the runs of a configuration, or the rows by run if no configuration has several
+    runs.
+    """
     runs = rows.filter(pl.col("run") != "all")
     several = "all" in rows["run"] and runs["run"].n_unique() > runs["configuration"].n_unique()
     return rows.filter(run="all") if several else runs
@@ -358,7 +360,8 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: Maximum number of epochs beyond their level in ``evaluation.json``, the worst first; the CSV file has all.
+#: Maximum number of epochs beyond their level in ``evaluation.json``, sorted by descending excess; the CSV file has all
+#: these epochs.
 MOST_BEYOND: Final = 200
 
 

@@ -17,7 +17,7 @@ SECTION_COLUMNS: Final = ("from_m", "to_m", "environment")  #: Columns of a tabl
 
 @dataclass(frozen=True, kw_only=True)
 class Sections:
-    """S stretches of the line with their environment, in rising order, without overlap."""
+    """Environment of S stretches of the line, which are in ascending order and do not overlap."""
 
     path: Path
     from_m: Floats  #: Chainage of the start, shape (S,) [m].

@@ -30,9 +30,9 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
 
 
 def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
-    """Return the median over channels of the vertical delay on L1 that slant delays imply, shape (T,) [m].
+    """Return the vertical delay on L1, as the median over channels of the mapped slant delays, shape (T,) [m].
 
-    `slant_m` and `elevation_deg` have shape (T, K), `frequency_hz`, shape (K,), is the carrier. 0 without a delay.
+    `slant_m` and `elevation_deg` have shape (T, K), the carriers `frequency_hz` shape (K,). 0 where no delay is known.
     """
     vertical = medians(slant_m / thin_shell_obliquity(elevation_deg) * (frequency_hz / FREQUENCY_L1) ** 2)
     return np.where(np.isfinite(vertical), vertical, 0.0)
@@ -73,7 +73,7 @@ def klobuchar_delay_m(
     period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    # With this order of comparison NaN stays NaN and does not become the night-time delay.
+    # In this form of the comparison, a NaN phase results in NaN and not in the night-time delay.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
@@ -84,7 +84,7 @@ def saastamoinen_delay_m(
     """Return Saastamoinen's tropospheric delay in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
 
     The hydrostatic and wet delays are mapped by 1/sin(elevation). Negative ellipsoidal heights are replaced by 0. The
-    delay is NaN where an input is NaN, at or below the horizon, and outside -100 m to 10 km.
+    delay is NaN where an input is NaN, at or below the horizon, and at heights outside -100 m to 10 km.
     """
     height = np.where((height_m >= -100.0) & (height_m <= 1e4), np.maximum(height_m, 0.0), np.nan)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
@@ -98,7 +98,7 @@ def saastamoinen_delay_m(
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Directions to the satellites from a receiver position accurate to hundreds of metres: T epochs by K channels."""
+    """Directions to satellites from receiver positions accurate to hundreds of metres, T epochs by K channels."""
 
     receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
     #: Geodetic coordinates of the receiver, shape (T,).
@@ -130,12 +130,12 @@ class SeenFrom:
 class Delays:
     """Delays of T epochs by K channels, and the standard deviation of the residual errors."""
 
-    #: Delays on the channel's carrier; 0 where a model is off, NaN where SBAS gives none; shape (T, K).
+    #: Delays at the channel's carrier frequency; 0 if the model is off, NaN where SBAS provides none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation to be added to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Standard deviation in addition to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
-    reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
+    reason: Bits  #: Rejection reasons due to unknown delays (`Reason` bits), shape (T, K).
 
 
 def model_delays(

@@ -20,19 +20,19 @@ from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDela
 Values = TypeVar("Values", Floats, Integers)
 #: Largest time by which an epoch of the station may be later than the train's epoch, since receiver clocks differ [s].
 _SAME_S: Final = 0.05
-#: Largest ages of the station's codes and phases [s]. Without selective availability, code errors change by centimetres
-#: in 30 s, and phase errors by millimetres in a second.
+#: Largest age of the station's code errors [s]; without selective availability, they change by centimetres in 30 s.
 LONGEST_AGE_S: Final = 60.0
+#: Largest age of the station's phase errors [s]; they change by millimetres in a second.
 _PHASE_AGE_S: Final = 1.1
-#: Sigma per kilometre between station and train, of differences in ionospheric, tropospheric and orbit errors [m].
+#: Sigma of ionospheric, tropospheric and orbit error differences per kilometre between station and train [m].
 _PER_KM_M: Final = 0.004
 LONGEST_KM: Final = 100.0  #: Largest distance at which the station is used [km].
 
 
 class BaseLimits(Settings):
-    """Limits of the differences with a base station."""
+    """Settings of the corrections by a base station."""
 
-    #: Standard deviation of a difference in addition to the train's noise, due to the station's smoothed multipath.
+    #: Standard deviation due to the station's smoothed multipath, in addition to the noise of the train's ranges [m].
     sigma_m: float = Field(default=0.3, gt=0)
     #: Random walk of phase differences, used in place of `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
@@ -47,16 +47,16 @@ class BaseErrors:
     #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings
-    #: Corrected code less range and receiver clock of its constellation; NaN where not observed; shape (B, S).
+    #: Corrected code minus range and the constellation's receiver clock; NaN where not observed; shape (B, S).
     code_m: Floats
-    phase_m: Floats  #: Corrected phase less range and a clock common to all channels, with ambiguity; shape (B, S).
+    phase_m: Floats  #: Corrected phase minus range and a clock common to all channels, with ambiguity; shape (B, S).
     arc: Integers  #: Number of the arc of each phase, shape (B, S).
 
     def __len__(self) -> int:
         return len(self.time)
 
     def merge(self, later: BaseErrors) -> BaseErrors:
-        """Return the errors joined with later errors, with all channels of both tables."""
+        """Return these errors followed by later errors, with the channels of both."""
         parts = (self, later)
         keys = sorted({key for part in parts for key in part.keys})
         return replace(
@@ -89,7 +89,7 @@ class BaseErrors:
     def at(
         self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
     ) -> BaseDifferences:
-        """Return the newest errors at the epochs of a train (T,), for its channels (K,), at approximate positions.
+        """Return the newest errors at a train's epochs (T,) and approximate positions (T, 3), for its channels (K,).
 
         For a channel that the station does not observe, another signal of the same band is used; the two signals differ
         by a constant per constellation. The errors are NaN (arc -1) without a recent error, or beyond `LONGEST_KM`.

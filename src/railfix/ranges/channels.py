@@ -28,7 +28,7 @@ DEFAULT_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "R": ("1C", "1P"),
 }
 
-#: Second signals in order of preference. L2 comes before L5 for GPS and QZSS: LNAV lacks the delay of L5
+#: Second signals in order of preference. L2 comes before L5 for GPS and QZSS, because LNAV lacks the group delay of L5
 #: (`railfix.ranges.second_codes.group_delay_sigma_m`).
 SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "G": ("2L", "2X", "2S", "2W", "5Q", "5X", "5I"),
@@ -57,7 +57,7 @@ def relative_noise(signal: str) -> float:
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Return slices of channels that share a receiver clock; raise ValueError if the channels are not adjacent."""
+    """Return slices of channels that share a receiver clock; raise ValueError if they are not adjacent."""
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
@@ -93,33 +93,31 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
 class Channels:
     """M channels of a log, and the K channels among them that the settings allow."""
 
-    #: Columns of the K channels in the observations; channels of one clock are adjacent, a satellite's preferred signal
-    #: is first; shape (K,).
+    #: Columns of the K channels in the observations, shape (K,). Channels of one clock are adjacent. Of each satellite,
+    #: the preferred signal is first.
     columns: Indices
     #: Satellite and signal of each of the K channels, shape (K,).
     satellite: Strings
     signal: Strings
-    groups: tuple[slice, ...]  #: Channels of each receiver clock.
-    clocks: tuple[str, ...]  #: Letter of each receiver clock.
+    groups: tuple[slice, ...]  #: Slice of the K channels for each receiver clock.
+    clocks: tuple[str, ...]  #: Letter of each receiver clock (`CLOCK_GROUP`).
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
     frequency_hz: Floats  #: Carrier frequency of the K channels, shape (K,).
     every_frequency_hz: Floats  #: Carrier frequency of all channels of the log, shape (M,).
-    left_out: Integers  #: Reason why settings leave out a channel, 0 for the other channels; shape (M,).
+    left_out: Integers  #: Reason why the settings leave a channel out, 0 for the other channels; shape (M,).
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
-    #: Columns of the second signals of each channel's satellite, in order of preference, -1 for none; shape (K, P). P
-    #: is 0 with one frequency, and at least 1 with two, so that epochs without a second code are processed likewise.
+    #: Columns of the second signals of each channel's satellite in order of preference, -1 for none; shape (K, P). P is
+    #: 0 with one frequency. With two frequencies it is at least 1, even if the log has no second signal.
     second: Indices
-    #: Second signal with the letter of the constellation, squared ratio of the first to the second frequency, and noise
-    #: of the second signal relative to L1 C/A; shape (K, P).
-    second_signal: Strings
-    second_ratio: Floats
-    second_noise: Floats
-    pair_names: tuple[str, ...]  #: Satellite and both signals of each pair, length K P.
-    pair_groups: Integers  #: Group of each pair; the pairs of a group have a common receiver delay; shape (K P,).
+    second_signal: Strings  #: Second signals with the letter of the constellation, shape (K, P).
+    second_ratio: Floats  #: Squared ratio of the first to the second frequency, shape (K, P).
+    second_noise: Floats  #: Noise of the second signals relative to L1 C/A, shape (K, P).
+    pair_names: tuple[str, ...]  #: Satellite and both signals of each pair of codes, length K * P.
+    pair_groups: Integers  #: Group of each pair; the pairs of a group have a common receiver delay; shape (K * P,).
 
     @cached_property
     def names(self) -> Strings:
-        """Satellite and signal, shape (K,)."""
+        """Name of each channel: satellite and signal, shape (K,)."""
         return np.char.add(self.satellite, self.signal)
 
     @cached_property
@@ -199,7 +197,7 @@ def _second_channels(
     frequency_hz: Floats,
     wanted: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
-    """Return the fields of `Channels` on second signals."""
+    """Return the fields of `Channels` that describe second signals."""
     of_satellite: dict[str, dict[str, int]] = {}
     for i, (name, signal) in enumerate(zip(every_satellite.tolist(), every_signal.tolist(), strict=True)):
         of_satellite.setdefault(name, {})[signal] = i

@@ -1,7 +1,7 @@
-"""Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
+"""Mean C/N0 over elevation for one antenna and receiver, from a day under open sky (P1 2.3(1), figure 3).
 
-A curve is fitted for each constellation and signal. BeiDou and QZSS have satellites in two kinds of orbits, with
-separate curves. The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the
+A curve is fitted for each constellation and signal. BeiDou and QZSS have satellites in two kinds of orbits; each kind
+has its own curve. The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the
 median). Between bin centres the curve is interpolated by monotone cubics (PCHIP). Above the highest bin the last mean
 is used; below the lowest bin there is no curve. The file is TOML.
 """
@@ -27,11 +27,12 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "Cn0Curve", "Cn0CurveSource", "Cn0Mean", "SourceFile", "satellite_kind"]
 
 
-#: Numbers of BeiDou satellites at a height of 36 000 km (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
+#: Numbers of BeiDou satellites at a height of 36 000 km (GEO: C01-C05 and C59-C63; IGSO: according to CSNO,
+#: constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
 _QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 
-#: Kinds of satellites with equal transmit power, and their names.
+#: Kinds of satellites, and the name of each kind; the satellites of a kind have equal transmit power.
 KINDS: Final[dict[str, str]] = {
     "G": "GPS",
     "J": "QZSS",
@@ -57,14 +58,13 @@ def satellite_kind(satellite: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Mean:
-    """Mean C/N0 over elevation of one kind of satellites on one signal, B bins."""
+    """Mean C/N0 over elevation of one signal of one kind of satellites, in B elevation bins."""
 
     kind: str  #: Key of `KINDS`.
     signal: str
     elevation_deg: Floats  #: Bin centres in ascending order, shape (B,).
-    #: Mean [dB-Hz] and robust standard deviation [dB], shape (B,) each.
-    mean_dbhz: Floats
-    spread_db: Floats
+    mean_dbhz: Floats  #: Mean C/N0 per bin, shape (B,).
+    spread_db: Floats  #: Robust standard deviation of the C/N0 per bin, shape (B,).
     count: Integers  #: Number of samples per bin, shape (B,).
 
     def __post_init__(self) -> None:
@@ -119,12 +119,12 @@ class Cn0CurveSource(Settings):
 class Cn0Curve:
     """Mean C/N0 over elevation of an antenna and receiver."""
 
-    means: tuple[Cn0Mean, ...]  #: One curve per kind and signal.
+    means: tuple[Cn0Mean, ...]  #: One curve per kind of satellites and signal.
     source: Cn0CurveSource = field(default_factory=Cn0CurveSource)
 
     def __post_init__(self) -> None:
         if len(self._by_key) != len(self.means):
-            raise ValueError("a kind and signal has two curves")
+            raise ValueError("a kind of satellites has two curves for one signal")
 
     @cached_property
     def _by_key(self) -> dict[tuple[str, str], Cn0Mean]:

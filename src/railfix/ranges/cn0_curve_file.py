@@ -25,7 +25,7 @@ def _number(low: float, high: float) -> object:
 
 
 class _Curve(Settings):
-    """`Cn0Mean` as columns."""
+    """Curve of the file: the columns of a `Cn0Mean`."""
 
     kind: str
     signal: str = Field(min_length=2, max_length=2)
@@ -43,7 +43,7 @@ class _Curve(Settings):
 
 
 class _CurveFile(Settings):
-    """Content of the file."""
+    """Content of the file of a C/N0 curve."""
 
     format: Literal["railfix C/N0 curve 1"]
     source: Cn0CurveSource
@@ -67,7 +67,7 @@ def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
 
 
 def read_cn0_curve(path: FilePath) -> Cn0Curve:
-    """Read a curve.
+    """Read a C/N0 curve from its file.
 
     Raises InputFileError if the file is missing, unreadable or not a C/N0 curve, or if an entry is unknown, missing or
     out of range.
@@ -79,7 +79,7 @@ def read_cn0_curve(path: FilePath) -> Cn0Curve:
     try:
         return Cn0Curve(means=means, source=file.source)
     except ValueError as error:
-        raise InputFileError(path, f"{error}; each kind and signal must occur once") from None
+        raise InputFileError(path, f"{error}; each combination of kind and signal must occur once") from None
 
 
 def _mean(path: FilePath, curve: _Curve, where: str) -> Cn0Mean:

@@ -24,9 +24,11 @@ class CurveFit(Settings):
     """Settings of the fit of a curve."""
 
     bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
-    least_samples: int = Field(default=30, ge=1)  #: A bin with fewer samples is left out.
-    least_bins: int = Field(default=4, ge=2)  #: No curve is fitted for a kind and signal with fewer bins.
-    #: Samples farther from their bin's median, in robust standard deviations, are left out.
+    #: Minimum number of samples of a bin; a bin with fewer samples is left out.
+    least_samples: int = Field(default=30, ge=1)
+    least_bins: int = Field(default=4, ge=2)  #: Minimum number of bins of a curve; no curve is fitted to fewer bins.
+    #: Largest distance of a sample from the median of the bin, in robust standard deviations; other samples are left
+    #: out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
@@ -62,10 +64,10 @@ def fit_cn0_curve(
     fit: CurveFit | None = None,
     source: Cn0CurveSource | None = None,
 ) -> Cn0Curve:
-    """Fit the mean C/N0 over elevation, one curve per kind and signal with enough bins.
+    """Fit the mean C/N0 over elevation, one curve per kind of satellites and signal with enough bins.
 
-    `samples` is a `Cn0Samples` of an antenna under open sky, or an iterable of C/N0 (T, M), elevation (T, M), satellite
-    and signal (M,). Raises ValueError if no kind and signal has enough samples.
+    `samples` is a `Cn0Samples` of an antenna under open sky, or an iterable of tuples of C/N0 (T, M), elevation (T, M),
+    satellite (M,) and signal (M,). Raises ValueError if no kind and signal has enough samples.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):
@@ -77,7 +79,7 @@ def fit_cn0_curve(
     fitted = tuple(mean for mean in means if mean is not None)
     if not fitted:
         raise ValueError(
-            f"no constellation and signal has {fit.least_bins} bins of {fit.least_samples} samples over elevation"
+            f"no signal of a constellation has {fit.least_bins} elevation bins with {fit.least_samples} samples each"
         )
     return Cn0Curve(means=fitted, source=source or Cn0CurveSource())
 

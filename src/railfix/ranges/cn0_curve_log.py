@@ -23,12 +23,13 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
 _SHORT_S: Final = 12 * 3600.0  #: Duration below which a log causes a note [s]; P1 2.3(1) requires about a day.
-_DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
-#: Lowest elevation of the samples compared with `_DEFICIT_DBHZ` [deg], and largest rejected fraction without a note.
+_DEFICIT_DBHZ: Final = 10.0  #: Deficit below the mean C/N0 with which P1 (table 6) rejects a signal [dB-Hz].
+#: Lowest elevation of the samples that are compared with the curve [deg], and largest fraction of these samples that
+#: may lie `_DEFICIT_DBHZ` below the curve without a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Largest fraction of satellites below `_BELOW_DEG` without an error.
+_BELOW_SHARE: Final = 0.05  #: Fraction of satellites below `_BELOW_DEG` above which an error is raised.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +42,9 @@ class Cn0Calibration:
 
 
 def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
-    """Return the elevation of each satellite from a fixed position (3,), (T, M) [deg]; NaN without orbit or code."""
+    """Return the elevation of satellites seen from a fixed position (3,), shape (T, M) [deg]; NaN without orbit or
+    code.
+    """
     names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
     code = np.full((len(observations), len(names)), np.nan)
     for m, k in enumerate(which.tolist()):
@@ -64,10 +67,11 @@ def cn0_curve_from_log(
 ) -> Cn0Calibration:
     """Fit a curve to a receiver log of about a day, recorded with an antenna under open sky.
 
-    `position_ecef_m`, shape (3,), is the antenna position to a few kilometres, by default the position in the header.
-    Raises InputFileError if a file is missing or of another kind, or if the log has no epochs or no C/N0; SettingsError
-    if neither the header nor the caller gives a position; MismatchError if tracked satellites are below the horizon of
-    the position, the navigation files have no orbit for the log, or there are too few samples for any curve.
+    `position_ecef_m`, shape (3,), is the antenna position, accurate to a few kilometres; by default, the position in
+    the header is used. Raises InputFileError if a file is missing or of another kind, or if the log has no epochs or no
+    C/N0; SettingsError if neither the header nor the caller gives a position; MismatchError if tracked satellites are
+    below the horizon of the position, the navigation files have no orbit for the log, or there are too few samples for
+    any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0

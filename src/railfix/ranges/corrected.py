@@ -42,7 +42,7 @@ class AntennaRanges(NotebookTable):
     #: Direction from the antenna to each satellite, shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    #: Code corrected for satellite clock, group delay and atmosphere, and standard deviations; shape (T, K).
+    #: Code corrected for satellite clock, group delay and atmosphere, and sigma of the corrected code; shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
     reason: Bits  #: `reasons.Reason` bits of the reasons found so far, 0 if usable; shape (T, K).
@@ -50,7 +50,7 @@ class AntennaRanges(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class SecondCodes:
-    """Second codes of satellites: T epochs by K channels of the first codes."""
+    """Second-frequency codes of satellites: T epochs by the K channels of the first codes."""
 
     code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
     noise_m: Floats  #: Standard deviation of noise and multipath assumed by the weights, shape (T, K).
@@ -61,7 +61,7 @@ class SecondCodes:
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
     pair: Integers  #: Index of satellite and signals in `Channels.pair_names`, shape (T, K).
-    column: Integers  #: Column of the observations, -1 where missing; shape (T, K).
+    column: Integers  #: Column of the code in the observations, -1 where missing; shape (T, K).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -71,19 +71,19 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
-    #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS gives none; shape (T, K).
+    #: Delays subtracted from the codes; 0 if the model is off, NaN where SBAS provides none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation of satellite and atmospheric errors, from SBAS, otherwise from `NominalErrors`; shape (T, K).
+    #: Standard deviation of satellite and atmospheric errors, from SBAS or from `NominalErrors`; shape (T, K).
     nominal_m: Floats
     #: Standard deviation that `NominalErrors` assumes by elevation and ionospheric delay; 0 with SBAS; shape (T, K).
     nominal_elevation_sigma_m: Floats
     #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: Epochs with a gross error that cannot be identified, which noise and map estimates leave out; shape (T,).
+    #: Epochs with a gross error that cannot be identified; noise and map estimates leave them out; shape (T,).
     unsure: Masks
-    second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`), where they are used.
+    second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`); None if not used.
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
 
     @property
@@ -103,10 +103,10 @@ class CorrectedRanges(AntennaRanges, OnDemand):
 
 
 class SatelliteRanges(NamedTuple):
-    """Satellites and clock corrections of the codes of a log, T epochs by K channels."""
+    """Satellites of a log, and clock corrections of the codes, T epochs by K channels."""
 
     source: SourceSatellites
-    correction_m: Floats  #: Satellite clock less group delay, to be added to the codes; shape (T, K).
+    correction_m: Floats  #: Satellite clock minus group delay, to be added to the codes; shape (T, K).
     reason: Bits  #: `reasons.Reason` bits of codes, records and corrections; 0 if usable; shape (T, K).
 
     @property
@@ -131,8 +131,7 @@ def find_satellites(
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Largest difference between an epoch and the reference time of its record, if less than the validity of the
-        record.
+        Largest difference between an epoch and the reference time of the record used, if less than its validity.
     """
     code = observations.code_m[:, channels.columns]
     reason = _reasons_of_codes(channels.satellite, code)
@@ -186,7 +185,7 @@ def corrected_ranges(
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used have a rejection reason; they are kept, or NaN where a correction is missing.
+        Codes that cannot be used have a rejection reason; their values are kept, or NaN where a correction is missing.
 
     Raises
     ------

@@ -26,7 +26,7 @@ class Conditions(Settings):
 def condition_differences(
     first: Conditions, second: Conditions, *, names: tuple[str, str] = ("model", "run")
 ) -> tuple[str, ...]:
-    """Return one text for each field in which two conditions differ: "codes: model raw, run smoothed".
+    """Return a text such as "codes: model raw, run smoothed" for each field in which two conditions differ.
 
     The order of screens and constellations does not matter; the order of signals, which is a preference, does.
     """

@@ -1,7 +1,8 @@
 """Error model of pseudoranges on a railway: bias, sigma and overbound by direction and C/N0 (P1 7).
 
-The bins are elevation, azimuth relative to the car body and C/N0. The file is TOML with the bins, the conditions, and
-one array of numbers per column, in the order of elevation, then sector, then C/N0. `pooled` is an index into `POOLED`.
+A bin is an interval of elevation, of azimuth relative to the car body, and of C/N0. The TOML file has the bins, the
+conditions, and the columns of `BinStatistics`. Each column is an array with one number per bin, ordered by elevation,
+then sector, then C/N0.
 """
 
 from __future__ import annotations
@@ -92,7 +93,9 @@ class BinStatistics:
     """Statistics of every bin, shape (E, A, C); NaN where the pooled samples are fewer than three."""
 
     count: Integers  #: Number of samples in the bin.
-    blocks: Integers  #: Number of blocks of time and satellite in the bin; samples of one block are correlated.
+    #: Number of blocks in the bin. A block has the samples of one satellite in a time interval
+    #: (`ErrorModelFit.block_s`), whose errors are correlated.
+    blocks: Integers
     #: Mean and standard deviation of the samples used for the bin.
     bias_m: Floats
     sigma_m: Floats
@@ -114,36 +117,37 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each file.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Largest upper bound of a prior that permits a finite protection level.
+LARGEST_PRIOR: Final = 0.05  #: Largest upper bound of a fault prior with which a protection level can be finite.
 
 
 class FaultRate(Settings):
     """Measured probability that a used range is faulty at a given time."""
 
-    #: A range is faulty if its error exceeds this multiple of its sigma in the protection level; noise exceeds the
-    #: default of 5 with a probability of 6e-7.
+    #: A range is faulty if the error exceeds this multiple of the sigma that the protection level assumes for the
+    #: range. Normal noise exceeds five sigmas, the multiple in use, with a probability of 6e-7.
     beyond_sigma: float = Field(gt=0)
-    #: Number of used ranges, and of faulty ranges.
-    ranges: int = Field(ge=0)
-    faulty: int = Field(ge=0)
-    #: Number of blocks of time of single satellites, which are independent, and of blocks with a faulty range.
+    ranges: int = Field(ge=0)  #: Number of used ranges.
+    faulty: int = Field(ge=0)  #: Number of faulty ranges.
+    #: Number of blocks. A block has the ranges of one satellite in a time interval; blocks count as independent.
     blocks: int = Field(ge=0)
-    faulty_blocks: int = Field(ge=0)
+    faulty_blocks: int = Field(ge=0)  #: Number of blocks with a faulty range.
     prior: float = Field(ge=0, le=1)  #: Fraction of used ranges that are faulty.
-    #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks), for `local_prior`.
+    #: Upper end of the one-sided 95 % confidence interval of the prior (Clopper and Pearson), computed from the numbers
+    #: of blocks. The value is used for `local_prior`.
     upper: float = Field(ge=0, le=1)
-    #: Number of blocks of time with two or more faulty satellites, divided by the number expected for independent
-    #: satellites; 0 without faults.
+    #: Number of time intervals in which two or more satellites are faulty, divided by the number expected for
+    #: independent satellites; 0 without faults.
     together: float = Field(ge=0)
-    #: Number of blocks of time with at least two low satellites on one side of the track, each side counted separately,
-    #: and of blocks in which two of these satellites were faulty.
+    #: Number of time intervals with at least two low satellites on one side of the track, added for both sides.
     side_blocks: int = Field(default=0, ge=0)
+    #: Number of these time intervals in which at least two of the low satellites were faulty.
     side_faulty_blocks: int = Field(default=0, ge=0)
-    #: Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, from these
-    #: blocks; 1 without such blocks. The value is used for `side_prior` if it is small enough for a finite protection
-    #: level.
+    #: Upper end of the one-sided 95 % confidence interval of the probability that low satellites of one side are faulty
+    #: together, computed from `side_blocks` and `side_faulty_blocks`; 1 without such blocks. The value is used for
+    #: `side_prior` if it is small enough for a finite protection level.
     side_upper: float = Field(default=1.0, ge=0, le=1)
-    #: Stretches with more frequent local faults than the line (`faulty_stretches`): first and last chainage of each.
+    #: Stretches with more frequent local faults than the whole line (`faulty_stretches`): first and last chainage of
+    #: each [m].
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -157,14 +161,12 @@ class ErrorModel:
     """Errors of corrected pseudoranges by bin."""
 
     bins: ErrorBins
-    #: Errors before and after the screens. Weights and protection level use the errors after the screens; the
-    #: difference is the effect of the screens.
-    before: BinStatistics
-    after: BinStatistics
+    before: BinStatistics  #: Errors before the screens; the difference to `after` is the effect of the screens.
+    after: BinStatistics  #: Errors after the screens, from which weights and protection level are computed.
     #: "local": only multipath and receiver noise, because a reference station removed satellite and atmospheric errors.
     #: "satellite_and_atmosphere": in addition, satellite and atmospheric errors of the recorded days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    #: Settings under which the model is valid; None if unknown, so that they are not compared with a run's settings.
+    #: Settings under which the model is valid; None if unknown; they are then not compared with a run's settings.
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
     #: Rate of local faults among the ranges to which the model was fitted; None if not measured.
@@ -212,7 +214,7 @@ class _Columns(Settings):
 
 
 class _ErrorModelFile(Settings):
-    """Content of the file."""
+    """Content of the file of an error model."""
 
     format: Literal["railfix error model 2"]
     covers: Literal["local", "satellite_and_atmosphere"]
@@ -238,7 +240,7 @@ def _columns(statistics: BinStatistics) -> _Columns:
 
 
 def read_error_model(path: FilePath) -> ErrorModel:
-    """Read a model.
+    """Read an error model from its file.
 
     Raises InputFileError if the file is missing, unreadable, not an error model or of version 1, or if an entry is
     missing or out of range.

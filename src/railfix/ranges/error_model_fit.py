@@ -21,11 +21,11 @@ from railfix.core.options import option
 from railfix.core.settings import Settings
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
-TAIL_SCORE: Final = 1.0  #: Least standard score of the samples in the tail, from which sigma is determined.
+TAIL_SCORE: Final = 1.0  #: Least standard score of a sample in the tail; the tail determines sigma.
 
 
 def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
-    """Return bias and sigma [m] of two normal distributions, shifted by +bias and -bias, that bound a sample (n,).
+    """Return bias and sigma [m] with which normal distributions shifted by +bias and -bias bound a sample (n,).
 
     The k-th of n samples from either end is the quantile of probability ``k / (n + 1)``. Sigma is the least value that
     bounds both tails (beyond one standard score) for a bias equal to the absolute median; the bias is then the least
@@ -50,13 +50,13 @@ class ErrorModelFit(Settings):
     """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    #: Independent passes below which a bin uses the samples of a wider set of bins. With 30 passes, the largest error
-    #: is about the quantile of 2 standard scores, so that the samples include the beginning of the tail.
+    #: Number of independent blocks below which a bin uses the samples of a wider set of bins. With 30 blocks, the
+    #: largest error is about the quantile of 2 standard scores, so that the samples include the beginning of the tail.
     least_blocks: int = option(
-        "Passes of a satellite (30 s blocks) below which a bin has the values of a wider bin.", 30, metavar="N", ge=1
+        "Number of blocks (30 s of one satellite) below which a bin uses a wider bin's samples.", 30, metavar="N", ge=1
     )
-    #: Length of the blocks in which a satellite's samples are counted. Errors are correlated over tens of seconds while
-    #: a train is at rest.
+    #: Length of the blocks into which a satellite's samples are divided [s]. Errors are correlated over tens of seconds
+    #: while a train is at rest.
     block_s: float = Field(default=30.0, gt=0.0)
 
 
@@ -65,22 +65,23 @@ class ErrorSamples:
     """Errors of single pseudoranges, n samples."""
 
     error_m: Floats  #: Error of the pseudorange, shape (n,).
-    #: Direction of the satellite, with the azimuth from the car's front, and C/N0; shape (n,).
-    elevation_deg: Floats
-    relative_azimuth_deg: Floats
-    cn0_dbhz: Floats
-    block: Integers  #: Number of the block of time and satellite; samples of one block are correlated; shape (n,).
+    elevation_deg: Floats  #: Elevation of the satellite, shape (n,).
+    relative_azimuth_deg: Floats  #: Azimuth of the satellite, clockwise from the car's front, shape (n,).
+    cn0_dbhz: Floats  #: Carrier-to-noise density, shape (n,).
+    #: Number of the sample's block, shape (n,). A block has the samples of one satellite in a time interval, whose
+    #: errors are correlated.
+    block: Integers
     used: Masks  #: Samples that passed every screen, shape (n,).
-    sigma_m: Floats  #: Standard deviation of the range in the protection level of the run, shape (n,).
-    chainage_m: Floats  #: Position of the train; NaN where unknown; shape (n,).
+    sigma_m: Floats  #: Standard deviation that the protection level of the run assumes for the range, shape (n,).
+    chainage_m: Floats  #: Chainage of the train; NaN where unknown; shape (n,).
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
     """Return the statistics of the bins from the samples `which`, a mask of shape (n,).
 
     A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of a wider set of bins, the first of the
-    following sets with enough blocks: all azimuths of its elevation and C/N0; all azimuths and C/N0 of its elevation;
-    all azimuths and elevations of its C/N0; all samples.
+    following sets with enough blocks: all azimuths at the bin's elevation and C/N0; all azimuths and C/N0 at the bin's
+    elevation; all azimuths and elevations at the bin's C/N0; all samples.
     """
     bins = fit.bins
     kept = which & np.isfinite(samples.error_m)
@@ -140,10 +141,11 @@ _SIDES: Final = {1: ("all round",), 2: ("ahead", "behind"), 4: ("ahead", "right"
 
 
 def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
-    """Yield rows by elevation, sector and C/N0: name; count, bias, sigma and overbound before and after the screens.
+    """Yield the rows of a table: one for each interval of elevation, for each sector and for each interval of C/N0.
 
-    Bias and sigma combine the statistics of the row's bins by their counts; the overbound is the range of their
-    bounding sigmas.
+    A row has a name, and count, bias, sigma and overbound before and after the screens. Bias and sigma are combined
+    from the bins of the row with the counts as weights. The overbound is the range of the bounding sigmas of these
+    bins.
     """
     bins = model.bins
     width = 360.0 / bins.sectors
@@ -171,19 +173,22 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-#: Multiple of its sigma above which the error of a range is a fault; confidence level of the bounds of rates.
-_BEYOND_SIGMA: Final = 5.0
-_CONFIDENCE: Final = 0.95
-#: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
+_BEYOND_SIGMA: Final = 5.0  #: Multiple of the sigma of a range above which an error is a fault.
+_CONFIDENCE: Final = 0.95  #: Confidence level of the bounds of fault rates.
+#: Elevation up to which satellites count as low, equal to `RiskBudget.side_elevation_deg` [deg].
 _SIDE_ELEVATION_DEG: Final = 45.0
 #: Length of the parts of the line that are compared with the whole line [m].
 _STRETCH_M: Final = 100.0
-#: A block's number is its time index times this value plus the index of its satellite (`ErrorSamples.block`).
+#: The number of a block is the index of the time interval times this value, plus the index of the satellite
+#: (`ErrorSamples.block`).
 _SATELLITES: Final = 1_000_000
 
 
 def fault_rate(samples: ErrorSamples) -> FaultRate:
-    """Return the rate of local faults, of ranges and of sides of the track, among ranges that passed every screen."""
+    """Return the rates of local faults of ranges, and of faults common to a side of the track.
+
+    Only ranges that passed every screen are counted.
+    """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     every, bad = np.unique(samples.block[used]), np.unique(samples.block[faulty])
@@ -214,7 +219,7 @@ def _upper(hits: int, trials: int) -> float:
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
-    """Count the blocks of time in which the samples `which` have two or more satellites on a side, for both sides."""
+    """Count time intervals in which the samples `which` have two or more satellites on a side; sum over both sides."""
     right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
     one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
     _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
@@ -249,7 +254,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Return the ratio of observed to expected blocks of time with two or more faulty satellites; 0 without faults."""
+    """Return the ratio of observed to expected time intervals with two or more faulty satellites; 0 without faults."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

@@ -11,9 +11,8 @@ from railfix.core.arrays import Floats
 from railfix.core.settings import Settings
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: C/N0 to which `zenith_sigma_m` refers, and C/N0 above which sigma does not decrease further.
-_CN0_REFERENCE_DBHZ: Final = 45.0
-_CN0_CAP_DBHZ: Final = 50.0
+_CN0_REFERENCE_DBHZ: Final = 45.0  #: C/N0 to which `zenith_sigma_m` refers.
+_CN0_CAP_DBHZ: Final = 50.0  #: C/N0 above which sigma does not decrease further.
 
 
 class CodeNoise(Settings):
@@ -24,7 +23,7 @@ class CodeNoise(Settings):
 
     model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" omits the C/N0 factor.
     #: Standard deviation at the zenith and the reference C/N0. Only ratios of sigmas affect the position, because the
-    #: scale of a receiver is estimated from the residuals (`pipeline.AntennaState`).
+    #: noise scale of the receiver is estimated from the residuals (`pipeline.AntennaState`).
     zenith_sigma_m: float = Field(default=1.0, gt=0)
     #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
@@ -56,15 +55,15 @@ class NominalErrors(Settings):
     (A.4.4.10.4 and A.4.2.4) and the modelled slant delay I.
     """
 
-    #: Orbit and clock error in the range. This error is about half a metre for GPS and Galileo, whose service
+    #: Orbit and clock error in the range. This error is about half a metre for GPS and Galileo; their service
     #: definitions state 2 m as the 95 % bound.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
     #: Vertical delay error of the Klobuchar model. The error is mostly common to all satellites, but treated as
     #: independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
-    #: Least ionospheric error as a fraction of the modelled slant delay, which depends on local time, season and solar
-    #: activity; a fifth is the value of DO-229D J.2.3. Where this exceeds a vertical error of 1 m, it also widens the
-    #: filter's sigma and level, unless SBAS or a base station corrects the ionosphere. 0 switches it off.
+    #: Minimum ionospheric error as a fraction of the modelled slant delay, which depends on local time, season and
+    #: solar activity; a fifth is the value of DO-229D J.2.3. Where it exceeds a vertical error of 1 m, it also widens
+    #: the filter's sigma and level, unless SBAS or a base station corrects the ionosphere. 0 disables it.
     ionosphere_share: float = Field(default=0.2, ge=0)
     #: Additional vertical delay error with typical coefficients, which is also added to the sigma of the ranges.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
@@ -86,7 +85,7 @@ class NominalErrors(Settings):
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
     def vertical_ionosphere_m(self, vertical_m: Floats) -> Floats:
-        """Return the standard deviation of the vertical delay for modelled vertical delays, any shape [m]."""
+        """Return the standard deviation of the errors of modelled vertical delays, any shape [m]."""
         return np.maximum(self.ionosphere_sigma_m, self.ionosphere_share * vertical_m)
 
     def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:

@@ -90,8 +90,7 @@ def _delays(
 
 @lru_cache(maxsize=64)
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
-    """Return a signal's group delay and its standard deviation [m], and whether the signal is unhealthy, by record
-    (n,).
+    """Return a signal's group delay, sigma of the delay [m], and whether the signal is unhealthy, for n records.
 
     For GPS, QZSS and BeiDou the clocks of all messages refer to the same signals, so a missing delay is taken from the
     satellite's nearest record of another message.
@@ -115,8 +114,8 @@ def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, 
 
 
 #: Standard deviation of the delay on L2 and L5 without ISC [m]. For GPS satellites whose CNAV had ISC on 2025-02-15,
-#: the difference of TGD - ISC and the value used instead has a standard deviation of 0.24 m on L2C and 0.55 m on L5Q
-#: (`tests/gnss/test_group_delays.py`).
+#: the difference between TGD - ISC and the value used instead has a standard deviation of 0.24 m on L2C and 0.55 m on
+#: L5Q (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 
 

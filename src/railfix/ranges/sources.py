@@ -46,8 +46,8 @@ class SourceDelays(NamedTuple):
     """Delays and standard deviations of a source, T epochs by K channels."""
 
     delays: Delays  #: Delays that are subtracted from the codes.
-    sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
-    #: Standard deviation of satellite and atmospheric errors, and its part assumed by `NominalErrors`; shape (T, K).
+    sigma_m: Floats  #: Sigma of the errors that the weights include in addition to receiver noise, shape (T, K).
+    #: Standard deviation of satellite and atmospheric errors, and the part that `NominalErrors` assumes; shape (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
@@ -63,7 +63,7 @@ class CorrectionSource(Protocol):
 
     @property
     def second(self) -> Literal["none", "optional", "required"]:
-        """Whether second-frequency codes are not used, are used where available, or are required."""
+        """Use of second-frequency codes: not used, used where available, or required."""
 
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
@@ -101,7 +101,7 @@ class BroadcastSource:
     """Source with broadcast records, or precise orbits and clocks if the navigation data has them, and delay models."""
 
     navigation: Navigation
-    klobuchar: Floats | None  #: None leaves the ionosphere uncorrected; shape (8,).
+    klobuchar: Floats | None  #: Coefficients, shape (8,); None leaves the ionosphere uncorrected.
     #: Additional standard deviation of the vertical delay if the coefficients were not received.
     ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
@@ -129,7 +129,7 @@ class BroadcastSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites from navigation data; no satellite has a rejection reason."""
+        """Return the satellites from navigation data; this source adds no rejection reason."""
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s
         )

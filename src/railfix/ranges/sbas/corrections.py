@@ -1,4 +1,4 @@
-"""Satellite corrections at any epochs from one GEO's messages (DO-229D, A.4.4 and A.4.5)."""
+"""SBAS corrections for any epochs, computed from the messages of one GEO (DO-229D, A.4.4 and A.4.5)."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return the PRN with the most usable fast corrections (of several, the smallest), and a sentence on the choice.
+    """Return the PRN with the most usable fast corrections (the smallest of several), and a sentence on the choice.
 
-    The choice uses all messages, so it is made from recorded messages before positioning begins. For live messages the
-    PRN must be given.
+    The choice depends on all messages of a log, so that it is made before positioning begins. For live messages the PRN
+    must be given.
     """
     limits, scores = limits or SbasLimits(), []
     for number in messages.prns:
@@ -63,11 +63,11 @@ def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[
 
 
 class SbasCorrections:
-    """Corrections from one GEO's messages at any epochs; the tables are built once, then searched.
+    """SBAS corrections for any epochs, computed from the messages of one GEO; the tables are built once, then searched.
 
     A message is used from its time of reception on (`SbasMessages.time`), never before. Results are independent of the
-    other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn`, which is
-    chosen beforehand (`best_prn`), are left out; `notes` on the messages precede the notes on the corrections.
+    other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn` are left
+    out. `notes` are notes on the messages; they precede the notes on the corrections.
     """
 
     def __init__(
@@ -76,18 +76,18 @@ class SbasCorrections:
         self.prn, self.limits = prn, limits or SbasLimits()
         of_prn = messages.of(prn)
         never = np.datetime64("NaT", "ns")
-        #: Reception of the first and the last message of that GEO; NaT without messages.
+        #: Reception of the first and the last message of the GEO; NaT without messages.
         self.span: tuple[np.datetime64, np.datetime64] = (
             (of_prn.time.min(), of_prn.time.max()) if len(of_prn) else (never, never)
         )
         self._tables = SatelliteTables(of_prn, self.limits)
         self._grid = GridTables(of_prn, self.limits, self._tables.stops)
         self._service = ServiceTable(of_prn, self.limits)
-        #: Number of corrections without a mask of their issue, by kind.
+        #: Numbers of unused corrections, by kind and reason.
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
-        #: Corrections requested and used, one sentence each; for a whole log (`from_log`) also its unused messages.
+        #: One sentence on each correction that was requested and used; after `from_log`, also on unused messages.
         self.notes: tuple[str, ...] = (*notes, self._settings_note())
 
     @classmethod
@@ -122,10 +122,11 @@ class SbasCorrections:
     def satellites(
         self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None
     ) -> SatelliteCorrections:
-        """Return the fast and long-term corrections of T epochs by K satellites; NOT_IN_MASK where not in the mask.
+        """Return the fast and long-term corrections for T epochs by K satellites; NOT_IN_MASK outside the mask.
 
-        A long-term correction is applied only if a record of `navigation` has its issue of data; otherwise the previous
-        correction, of another issue, is tried. Without navigation data the newest correction is applied unchecked.
+        A long-term correction is applied only if a record of `navigation` has the issue of data of the correction;
+        otherwise the last correction with another issue is tried. Without navigation data, the newest correction is
+        applied unchecked.
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]

@@ -1,6 +1,7 @@
 """Decoders of SBAS messages by tables of bit fields (RTCA DO-229D, A.4.4), in SI units.
 
-Every decoder returns arrays by name, all with n rows; `row` is the index of the message of each row.
+Every decoder returns arrays by name, all with n rows; the array `row` has the index of the message from which each row
+was decoded.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
 from railfix.ranges.sbas.messages import SbasMessages
 
-Decoded = dict[str, NDArray[Any]]  #: Arrays by the name of their field.
-SLOTS: Final = 51  #: Largest number of satellites of a PRN mask; corrections refer to its slots 0 to 50.
+Decoded = dict[str, NDArray[Any]]  #: Decoded arrays by the name of the field.
+SLOTS: Final = 51  #: Largest number of satellites of a PRN mask; corrections refer to the slots 0 to 50 of the mask.
 BLOCK: Final = 13  #: Number of slots of one message of types 2 to 5.
 #: Largest number of regions of one message of type 27.
 _REGIONS: Final = 5
@@ -26,7 +27,7 @@ _UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
-    """Number in a message, or `number` numbers whose first bits are `step` bits apart (default `length`)."""
+    """Bit field of a message: one number, or `number` numbers that begin `step` bits apart (by default `length`)."""
 
     first: int
     length: int
@@ -35,7 +36,7 @@ class BitField(NamedTuple):
     signed: bool = False
     number: int | None = None
     step: int | None = None
-    least: float = 0.0  #: Value added to a scaled number.
+    least: float = 0.0  #: Value added to the number after scaling.
 
 
 def _read_signed(first: int, length: int, scale: float | None = None, number: int | None = None) -> BitField:
@@ -45,7 +46,8 @@ def _read_signed(first: int, length: int, scale: float | None = None, number: in
 #: Fields of a message or of a part of a message; a sequence of fields becomes one array with a column per field.
 Layout = Mapping[str, BitField | Sequence[BitField]]
 
-#: Complete messages by type, and parts of messages, whose bits are counted from the beginning of the part.
+#: Layouts of complete messages, by type, and of parts of messages. The bits of a part are counted from the beginning of
+#: the part.
 LAYOUTS: Final[dict[str, Layout]] = {
     "type 1": {"member": BitField(14, 1, number=210), "iodp": BitField(224, 2)},
     "type 2": {
@@ -123,7 +125,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "square": BitField(70, 1, number=_REGIONS, step=35),
     },
     "type 28": {"iodp": BitField(14, 2)},
-    # Half of type 25 with velocity code 0: two satellites, then the issue of their mask.
+    # Half of a message of type 25 with velocity code 0: two satellites, then the issue of the PRN mask.
     "half of type 25": {"velocity_code": BitField(0, 1), "iodp": BitField(103, 2)},
     "satellite of type 25": {
         "slot": BitField(0, 6),
@@ -131,8 +133,8 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "position_m": _read_signed(14, 9, 0.125, 3),
         "clock_s": _read_signed(41, 10, 2.0**-31),
     },
-    # Half of type 25 with velocity code 1: one satellite.
-    "moving satellite of type 25": {
+    # Half of a message of type 25 with velocity code 1: one satellite, with velocity.
+    "satellite with velocity of type 25": {
         "slot": BitField(1, 6),
         "iode": BitField(7, 8),
         "position_m": _read_signed(15, 11, 0.125, 3),
@@ -152,7 +154,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
 
 
 def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
-    """Decode the fields of a layout from messages, shape (n, 32), from the bit `offset` on.
+    """Decode the fields of a layout, which begins at the bit `offset`, from the bytes of messages, shape (n, 32).
 
     Arrays have shape (n,) or (n, number) and type int64, or float64 where the field has a scale.
     """
@@ -175,12 +177,12 @@ def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
 
 
 def find_rows(messages: SbasMessages, *types: int) -> Integers:
-    """Return the rows of messages of some types."""
+    """Return the rows of the messages of the given types."""
     return np.flatnonzero(np.isin(messages.type, types)).astype(np.int64)
 
 
 def decode(messages: SbasMessages, kind: int) -> Decoded:
-    """Return the fields of all messages of a type, by its layout."""
+    """Return the fields of all messages of one type, decoded with the layout of this type."""
     row = find_rows(messages, kind)
     return {"row": row, **read_fields(messages.bits[row], LAYOUTS[f"type {kind}"])}
 
@@ -226,7 +228,7 @@ def has_data(bits: Bytes) -> Masks:
 
 
 def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
-    """Return fast corrections with one row per slot, from slot `first` of each message."""
+    """Return fast corrections with one row per slot; `first` is the first slot of each message."""
     slot = first[:, None] + np.arange(fields["prc_m"].shape[1])
     message, column = np.nonzero(slot < SLOTS)
     return {
@@ -266,7 +268,7 @@ def long_term(messages: SbasMessages) -> Decoded:
                     "reference": np.full(len(still), np.datetime64("NaT", "ns"), dtype="datetime64[ns]"),
                 }
             )
-        part = read_fields(messages.bits[moving], LAYOUTS["moving satellite of type 25"], start)
+        part = read_fields(messages.bits[moving], LAYOUTS["satellite with velocity of type 25"], start)
         reference = time_near(part.pop("time_of_day_s"), messages.time[moving])
         code = np.ones(len(moving), dtype=np.int64)
         parts.append({"row": moving, **part, "slot": part["slot"] - 1, "velocity_code": code, "reference": reference})

@@ -3,21 +3,22 @@
 Messages have 250 bits and preambles of four bits. Types 31 (mask), 32 (orbit and clock with covariance), 34 to 36
 (integrity) and 37 (degradation and the scale of the integrity indicator) are decoded. The corrections are for
 ionosphere-free ranges. For L1 C/A and L5, and for E1 and E5a, the clock correction includes biases between the signals;
-from ranges of B1C and B2a, the group delays of B-CNAV1 must be subtracted. GLONASS has slots, but its corrections are
-for L1OC and L3OC, which are not read.
+from ranges of B1C and B2a, the group delays of B-CNAV1 must be subtracted. GLONASS has slots in the mask, but its
+corrections are for the signals L1OC and L3OC, which are not read.
 
-The standard was not available. Layouts are taken from cssrlib (sbas.py), least values and degradation from MAAST
-(L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots from both and from Wireshark (packet-sbas_l5.c). An hour of
-SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that slot and fraction of the rate have 8 and 4 bits, as in cssrlib, and
-that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres. Group delays differ
-by metres, so that its corrections do not include them.
+The standard was not available. Message layouts are taken from cssrlib (sbas.py), the least values of sigma and the
+degradation from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask from both and
+from Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that the slot
+has 8 bits and the fraction of the rate 4 bits, as in cssrlib, and that the issue of data for BeiDou is the IODE of
+B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Since group delays differ by metres, these corrections do
+not include group delays.
 
 Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), are used for a note
-only. Layouts and scales are common to cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of three days
-(`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370 km, and the node from
-the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is 7 pi / 6 or
-7 pi times 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit with another rate. BDSBAS has a
-different layout and is left out.
+only. Layouts and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN
+messages of three days (`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370
+km, and the node from the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the
+inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit
+with another rate. Orbits of BDSBAS have a different layout and are left out.
 """
 
 from __future__ import annotations
@@ -43,12 +44,13 @@ from railfix.ranges.sbas.standard import first_that_holds, system_name
 AUGMENTED: Final = 92  #: Largest number of satellites of a mask.
 FIRST: Final = 53  #: Number of satellites in type 35; the others are in type 36.
 DO_NOT_USE: Final = 15  #: Indicator of "do not use", without a sigma; unmonitored satellites are absent from type 32.
-#: Sigma by indicator 0 to 14: least value and step [m].
+#: Least sigma by indicator 0 to 14 [m].
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
+#: Step of the sigma by indicator 0 to 14, which is multiplied by the scale of type 37 [m].
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
-_ONE_MORE: Final = -2  #: Value of an indicator that type 34 increases by one.
-_DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 in order.
-#: Validity of a mask and of an indicator, and time for which type 0 stops the use of its sender [s].
+_ONE_MORE: Final = -2  #: Placeholder for an indicator that type 34 increases by one.
+_DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations in the order of type 37.
+#: Validity of a mask, validity of an indicator, and time for which type 0 stops the use of the SBAS satellite [s].
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
 #: Time, covariance and indicator, which have equal bit positions in types 32 and 40.
@@ -89,7 +91,7 @@ LAYOUTS: Final[dict[int, Layout]] = {
 
 
 class DfmcState(IntEnum):
-    """State of a satellite's correction: in force (OK), or the reason why there is none."""
+    """State of a satellite's correction: in force (OK), or the reason why no correction is in force."""
 
     OK = 0
     STOPPED = 1  #: Type 0 was received: the service must not be used.
@@ -104,14 +106,14 @@ class DfmcState(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class DfmcCorrections:
-    """Corrections of T epochs by K satellites."""
+    """Corrections by SBAS on L5 for T epochs by K satellites."""
 
     state: Integers  #: `DfmcState`, shape (T, K).
     issue: Integers  #: Issue of data of the record to which the correction refers; -1 if none does; shape (T, K).
     record: Integers  #: Row of `navigation.kepler` with that issue, -1 if no record has it; shape (T, K).
     position_m: Floats  #: Correction added to the broadcast position, shape (T, K, 3).
     clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
-    sigma_m: Floats  #: Sigma by the indicator and its scale, before covariance and degradation; shape (T, K).
+    sigma_m: Floats  #: Sigma from the indicator and the scale, before covariance and degradation; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
     growth_m: Floats  #: Degradation of the correction since it was sent, shape (T, K).
     constant: Floats  #: Constant added to the factor along a line of sight, shape (T, K).
@@ -121,7 +123,7 @@ class DfmcCorrections:
         sight = np.concatenate([line_of_sight, np.ones((*self.state.shape, 1))], axis=-1)
         projected = np.einsum("tkij,tkj->tki", self.factor, sight)
         ratio = np.sqrt(np.einsum("tki,tki->tk", projected, projected)) + self.constant
-        # the sum of sigma and degradation is never less than the root of the sum of squares
+        # sigma and degradation are added; the sum is never less than the root of the sum of squares
         return np.asarray(self.sigma_m * ratio + self.growth_m)
 
 
@@ -150,9 +152,9 @@ def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
 
 
 class DfmcService:
-    """Corrections from the L5 messages of one SBAS satellite at any epochs; a message is used from its reception on.
+    """Corrections for any epochs from the L5 messages of one SBAS satellite; a message is used from its reception on.
 
-    Messages of other PRNs are left out; `notes` on their origin precede the notes on the corrections.
+    Messages of other PRNs are left out. `notes` are notes on the messages; they precede the notes on the corrections.
     """
 
     def __init__(self, messages: SbasMessages, *, prn: int, notes: tuple[str, ...] = ()) -> None:
@@ -192,7 +194,7 @@ class DfmcService:
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
         """Return the corrections of K satellites at T epochs.
 
-        A correction is used only if a navigation record has its issue of data, or if no navigation data are given.
+        A correction is used only if a navigation record has the same issue of data, or if no navigation data are given.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -369,10 +371,12 @@ class SbasOrbits:
     provider: Integers  #: Provider number of the service, 8 for SouthPAN; shape (n,).
     reference: Datetimes  #: Reference time of each orbit, shape (n,).
     orbits: Orbits
-    usable: Masks  #: Whether the inclination rate is 0, shape (n,).
+    usable: Masks  #: True where the inclination rate is 0, so that a position can be computed, shape (n,).
 
     def position_ecef_m(self, time: Datetimes) -> Floats:
-        """Compute each satellite's position at its element of `time`, shape (n, 3) [m]; NaN where not `usable`."""
+        """Compute the satellites' positions at the times `time`, shape (n,), as an array (n, 3) [m]; NaN where not
+        `usable`.
+        """
         position = np.stack(kepler_state(self.orbits, seconds(time - self.reference))[0], axis=1)
         return np.where(self.usable[:, None], position, np.nan)
 
@@ -387,7 +391,7 @@ class SbasOrbits:
 
 
 def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
-    """Return the ephemerides of one sender, from pairs of types 39 and 40 of one issue, at most `valid_s` apart."""
+    """Return the ephemerides of one SBAS satellite, from types 39 and 40 of one issue at most `valid_s` apart."""
     rows = {kind: np.flatnonzero(messages.type == kind) for kind in (39, 40)}
     sent = {kind: read_fields(messages.bits[at], _ORBIT_LAYOUTS[kind]) for kind, at in rows.items()}
     newest: dict[tuple[int, int], int] = {}

@@ -34,13 +34,13 @@ _RTKLIB: Final = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+(\d+)\s+(\d+)\s*:\s*([0-
 _EMS: Final = re.compile(r"(\d+)((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)\s+(\d+)\s+([0-9A-Fa-f]+)")
 _RINEX_HEAD: Final = re.compile(r"(\d{1,3})((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)(?:\s+([A-Z]\d)\s+(\d+)\b.*)?")
 _RINEX_BYTES: Final = 18
-#: Time from the first bit, to which RINEX type B refers, to the reception of the complete message.
+#: Time from the first bit, to which RINEX type B refers, to the reception of the complete message [s].
 _RINEX_SHIFT_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class RawMessage:
-    """Message as in a file: GPS time in nanoseconds since 1980-01-06, PRN, type (-1 if absent), hexadecimal digits."""
+    """Message as read from a file; `time_ns` is GPS time since 1980-01-06, `kind` the message type (-1 if absent)."""
 
     line: int
     time_ns: int
@@ -76,7 +76,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
 
 
 def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iterator[RawMessage | InputFileError]:
-    """Yield the messages of a file in their order, and for a broken message the error that describes it."""
+    """Yield the messages of a file in their order, and for a malformed message the error that describes it."""
     if kind == "rinex":
         yield from _parse_rinex(path, lines, band)
         return
@@ -115,12 +115,16 @@ def _ems(path: str, number: int, line: str, band: Band) -> RawMessage | InputFil
 
 
 def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMessage | InputFileError]:
-    """Yield the records of RINEX type B: PRN and epoch, then lines of up to 18 bytes, the type before the first."""
+    """Yield the messages of RINEX type B, or an error for each malformed record.
+
+    A record has a line with PRN and epoch, then lines of up to 18 bytes; the first of these lines begins with the
+    message type.
+    """
     end = next((i for i, text in enumerate(lines) if text[60:].startswith("END OF HEADER")), None)
     if end is None:
         raise InputFileError(path, "the header has no END OF HEADER; the file is incomplete; give the complete file")
     rest = [(i, text) for i, text in enumerate(lines[end + 1 :], start=end + 2) if text.strip()]
-    at, broken = 0, False  # after a broken record or line, all lines up to the next header are skipped
+    at, broken = 0, False  # after a malformed record or line, all lines up to the next record are skipped
     while at < len(rest):
         number, text = rest[at]
         at += 1
@@ -139,7 +143,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
         head = body[0][1][:7].strip() if body else ""
         broken = len(digits) != 2 * count or not (re.fullmatch(r"[0-9A-Fa-f]+", digits) and re.fullmatch(r"\d*", head))
         if broken:
-            yield InputFileError(path, f"the record has no {count} bytes of two hexadecimal digits", line=number)
+            yield InputFileError(path, f"the record does not have {count} bytes of two hexadecimal digits", line=number)
             continue
         at += len(body)
         if sent_on not in (None, band):
@@ -150,7 +154,7 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
         except ValueError:
             yield InputFileError(path, f"{date.strip()} {second} is not a date and time", line=number)
             continue
-        # Before 2004 the satellite number was the PRN less 100.
+        # Before 2004, the satellite number was the PRN minus 100.
         number_of_geo = int(prn) + (100 if int(prn) < 100 else 0)
         yield _check_line(path, RawMessage(number, time, number_of_geo, int(head or -1), digits), band)
 
@@ -171,7 +175,9 @@ def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFil
     kind = (int(raw.digits[:4], 16) >> (2 if band == "L1" else 6)) & 0x3F
     if raw.kind not in (-1, kind):
         return InputFileError(
-            path, f"type {raw.kind} is stated, the message on {band} has {kind} (setting sbas_band)", line=raw.line
+            path,
+            f"the stated message type is {raw.kind}, the type in the message on {band} is {kind} (setting sbas_band)",
+            line=raw.line,
         )
     return raw
 
@@ -187,7 +193,7 @@ def _instant(date: str, second: str) -> int:
     return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
 
 
-_SHORT: Final = 58  #: Number of digits of a message cut after its 226 data bits; 6 bits of parity or zeros follow.
+_SHORT: Final = 58  #: Number of digits of a message cut after the 226 data bits; 6 bits of parity or zeros follow.
 
 
 @dataclass
@@ -211,8 +217,8 @@ def read_sbas(
         RTKLIB (.sbs), EGNOS message server (.ems), RINEX broadcast data (type B) or a receiver's log (UBX with
         RXM-SFRBX of SBAS, SBF with GEORawL1 or GEORawL5), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
-        A line that is not a message raises an error, or is counted under "line" in `rejected` and named in `notes`. A
-        message with a wrong parity or preamble is left out and counted with either value.
+        With "stop", a line that is not a message raises an error. With "count", the line is counted under "line" in
+        `rejected` and named in `notes`. A message with a wrong parity or preamble is always left out and counted.
 
     band : {"L1", "L5"}
         Frequency of the messages; messages of other bands have different preambles and are left out.
@@ -226,7 +232,7 @@ def read_sbas(
     Raises
     ------
     InputFileError
-        A file is missing or of another kind, a line is broken (with "stop"), or no valid message is left.
+        A file is missing or of another kind, a line is not a message (with "stop"), or no valid message is left.
     """
     sources = tuple(path_names(paths))
     gathered = _Gathered()
@@ -326,7 +332,8 @@ def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integ
     """Return the number of parity bits of each message: 24 in complete messages, 6 or 0 in cut messages.
 
     A cut message ends with 6 bits that RTKLIB sets to zero and other programs leave as received. In files of other
-    programs these bits equal the first bits of the parity in most messages; by chance they are equal in 1 of 64.
+    programs, these bits equal the first bits of the parity in most messages; by chance alone, they would be equal in
+    only 1 of 64 messages.
     """
     carried = np.full(len(digits), 24, dtype=np.int64)
     short = digits == _SHORT
@@ -346,7 +353,11 @@ def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers)
             if messages:
                 notes.append(
                     f"{path}: {messages} messages have {words}; "
-                    + ("reception errors cannot be detected" if count == 0 else "1 damaged message in 64 passes")
+                    + (
+                        "reception errors cannot be detected"
+                        if count == 0
+                        else "1 of 64 damaged messages is not detected"
+                    )
                 )
     return notes
 
@@ -362,7 +373,7 @@ def _order_notes(log: SbasMessages) -> list[str]:
         counts = np.bincount(phase, minlength=turn)
         if counts.max() < counts.sum():
             notes.append(
-                f"PRN {prn}: the preambles of {int(counts.sum() - counts.max())} of {int(counts.sum())} messages are "
-                "not those of their seconds"
+                f"PRN {prn}: the preambles of {int(counts.sum() - counts.max())} of {int(counts.sum())} messages do "
+                "not match the second of reception"
             )
     return notes

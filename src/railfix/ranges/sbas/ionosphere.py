@@ -21,13 +21,12 @@ from railfix.ranges.sbas.tables import SatelliteTables, Series, Stops
 
 Answer = TypeVar("Answer", bound=np.generic)
 
-#: Number of bands, of bits of a mask, and of points of one message of type 26.
-BANDS: Final = 11
-BITS: Final = 201
-BLOCK: Final = 15
-#: Columns and rows of the 5-degree raster on which grid points are numbered, from 90 south, 180 west.
+BANDS: Final = 11  #: Number of bands of the ionospheric grid.
+BITS: Final = 201  #: Number of bits of the mask of a band.
+BLOCK: Final = 15  #: Number of grid points in one message of type 26.
+#: Number of columns of the 5-degree raster on which grid points are numbered, from 180 west.
 COLUMNS: Final = 72
-ROWS: Final = 37
+ROWS: Final = 37  #: Number of rows of this raster, from 90 south.
 
 _SHORT: Final = tuple(range(-55, 60, 5))
 _LONG: Final = (-75, -65, *_SHORT, 65, 75)
@@ -55,14 +54,14 @@ def _band(band: int) -> list[tuple[int, int]]:
 
 
 def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.generic]) -> Integers:
-    """Return the numbers of grid points; coordinates are multiples of 5 degrees, longitudes modulo 360."""
+    """Return the raster numbers of grid points; coordinates are multiples of 5 degrees, longitudes modulo 360."""
     row = np.rint((np.asarray(latitude_deg, dtype=np.float64) + 90.0) / 5.0).astype(np.int64)
     column = np.rint((np.asarray(longitude_deg, dtype=np.float64) + 180.0) / 5.0).astype(np.int64) % COLUMNS
     return row * COLUMNS + column
 
 
 def _layout() -> tuple[Integers, Integers]:
-    """Return the point of each bit of each band, and up to two (band, bit) cells of each point; -1 for none."""
+    """Return the grid point of each bit of each band, and up to two pairs of band and bit per point; -1 for none."""
     point = np.full((BANDS, BITS), -1, dtype=np.int64)
     cells = np.full((ROWS * COLUMNS, 2), -1, dtype=np.int64)
     for band in range(BANDS):
@@ -81,8 +80,8 @@ POINT_OF_BIT, CELLS_OF_POINT = _layout()
 class GridTables:
     """Masks and delays of the grid by point and time, spans in which they are constant, and a count of unused delays.
 
-    `delays` has, by grid point, the vertical `delay_m` (NaN for "do not use"), `givei`, and the `issue` of the mask
-    (4 band + IODI). `unused` counts delays without a mask of their issue.
+    `delays` has, by grid point, the vertical `delay_m` (NaN for "do not use"), `givei`, and the `issue` of the mask (4
+    * band + IODI). `unused` counts the delays for which no mask of the same issue was known.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
@@ -100,7 +99,7 @@ class GridTables:
         self.delays = self._delays(messages)
 
     def _delays(self, messages: SbasMessages) -> Series:
-        """Return delays by point; the k-th delay of block b belongs to point 15 b + k of the mask of its issue."""
+        """Return delays by point; the k-th delay of block b belongs to point 15 b + k of the mask of the same issue."""
         decoded = grid_delays(messages)
         kept = np.flatnonzero(decoded["band"] < BANDS)
         time, issue = messages.time[decoded["row"][kept]], 4 * decoded["band"][kept] + decoded["iodi"][kept]
@@ -125,7 +124,7 @@ class GridTables:
         return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
-        """Return whether points are in the newest mask of one of their bands that has not timed out."""
+        """Return whether points are in the newest mask of at least one of their bands, and this mask is still valid."""
         inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
@@ -147,9 +146,9 @@ class Spans:
 
 
 def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indices, Indices]:
-    """Return the first row of each combination of span (M,) and four points (M, 4), and the combination of each row.
+    """Return the first row of each distinct combination of span (M,) and points (M, 4), and each row's combination.
 
-    Points are from -1 to below `points`.
+    The number of a point is at least -1 and less than `points`.
     """
     # Successive rows of one span have one number; a span that occurs again later may have another number.
     key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
@@ -167,14 +166,16 @@ def look_up(
     time: Datetimes,
     points: int,
 ) -> NDArray[Answer]:
-    """Return the value of `answer` at four points and an instant, computed once per span and points, shape (M, ...)."""
+    """Return `answer` at the four points and the time of each row, shape (M, ...).
+
+    It is called once for all rows of one span with the same points.
+    """
     first, which = distinct_lookups(span, point, points)
     return np.asarray(answer(point[first], time[first])[which])
 
 
-#: Earth's radius and height of the layer [km] (DO-229D, A.4.4.10.1).
-EARTH_RADIUS_KM: Final = 6378.1363
-LAYER_HEIGHT_KM: Final = 350.0
+EARTH_RADIUS_KM: Final = 6378.1363  #: Radius of the Earth (DO-229D, A.4.4.10.1).
+LAYER_HEIGHT_KM: Final = 350.0  #: Height of the ionospheric layer (DO-229D, A.4.4.10.1).
 _POLAR_DEG: Final = 75.0
 _GIVE_VARIANCE: Final = np.array([*GIVE_VARIANCE_M2, np.nan])
 _NOT_MONITORED: Final = 15
@@ -200,9 +201,9 @@ def pierce_point(
 
 
 def triangle_weights(x: Floats, y: Floats, missing: int) -> Floats:
-    """Return the weights of SW, NW, SE and NE if one corner is missing, shape (..., 4).
+    """Return the weights of the corners SW, NW, SE and NE of a cell if one corner is missing, shape (..., 4).
 
-    One weight is negative outside the triangle.
+    Outside the triangle of the other corners, one weight is negative.
     """
     zero = np.zeros_like(x)
     weights = {
@@ -273,7 +274,7 @@ def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0
-    # Points at 85 degrees are 30 degrees apart where the polar band is sent, otherwise 90 degrees.
+    # Points at 85 degrees are 30 degrees apart if the GEO sends the polar band, otherwise 90 degrees.
     origin = np.where(north, -180.0, -170.0)
     fine = np.floor((longitude - origin) / 30.0) * 30.0 + origin
     pole = np.stack([point_number(sign * 85.0, fine), point_number(sign * 85.0, fine + 30.0)], axis=1)
@@ -353,7 +354,7 @@ def ionosphere(
 def _judge(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, point: Integers
 ) -> tuple[Integers, Integers]:
-    """Return the newest delay of each corner, and its `IonosphereState` (M, 4)."""
+    """Return the row of each corner's newest delay, and each corner's `IonosphereState`, shapes (M, 4)."""
     at, delays = time[:, None], grid.delays
     row = delays.newest(point, at)
     received = delays.received(row)
@@ -392,7 +393,7 @@ def _weights(
 def _values(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
-    """Return vertical delay and variance of corners, (M, 4), and a mask of type 10 in force, (M,), at epochs `t`."""
+    """Return vertical delay and variance of corners, (M, 4), and whether type 10 is in force, (M,), at epochs `t`."""
     newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
     of_ten, delays, ten = newest[t], grid.delays, tables.degradation
     variance = _GIVE_VARIANCE[delays["givei"][row]]

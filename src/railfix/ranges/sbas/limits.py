@@ -8,8 +8,8 @@ from pydantic import Field
 
 from railfix.core.settings import Settings
 
-#: Time since reception for which a message may be used [s], for precision approach, and for en route to non-precision
-#: approach (DO-229D, table A-25). Fast corrections have `FAST_TIMEOUT_S`.
+#: Time after reception for which a message may be used [s]: first for precision approach, then for en route to
+#: non-precision approach (DO-229D, table A-25). The times for fast corrections are in `FAST_TIMEOUT_S`.
 TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
     "mask": (600.0, 600.0),
     "udrei": (12.0, 18.0),
@@ -28,7 +28,7 @@ class SbasLimits(Settings):
 
     #: Time-outs of precision approach (shorter), or of en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
-    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops use of its GEO for 60 s, or is read as type 2.
+    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops the use of the GEO for 60 s, or is read as type 2.
     range_rate: Literal["mops", "off"] = "mops"  #: Range-rate part of fast corrections (DO-229D, A.4.4.3), or none.
     #: Satellites without degradation data are rejected, or used with the shortest time-out and a sigma increased by 8 m
     #: (DO-229D, J.2.2).

@@ -17,9 +17,8 @@ Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections
 #: Preambles of successive messages: three alternating patterns of eight bits (DO-229D, A.4.3.1); on L5 six patterns of
 #: four bits.
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
-#: Number of bits of preamble, type and data; bytes of a message in `SbasMessages.bits`.
-DATA_BITS: Final = 226
-ROW_BYTES: Final = 32
+DATA_BITS: Final = 226  #: Number of bits of preamble, type and data of a message.
+ROW_BYTES: Final = 32  #: Number of bytes of a message in `SbasMessages.bits`.
 #: A message that occurs twice within this time was forwarded by two receivers.
 _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
@@ -53,7 +52,7 @@ def with_parity(bits: Bytes) -> Bytes:
 
 
 def preamble_number(bits: Bytes, band: Band) -> Integers:
-    """Return the index of each message's preamble in `PREAMBLES` of its band, -1 for other values, shape (N,)."""
+    """Return the index of each message's preamble in `PREAMBLES` of the band, -1 for other values, shape (N,)."""
     number = np.full(len(bits), -1, dtype=np.int64)
     first = bits[:, 0] if band == "L1" else bits[:, 0] >> 4
     for i, preamble in enumerate(PREAMBLES[band]):
@@ -75,8 +74,8 @@ class SbasMessages(RowArrays, NotebookTable):
     time: Datetimes
     prn: Integers  #: PRN of the GEO, shape (N,).
     type: Integers  #: Message type, 0 to 63, shape (N,).
-    #: Message from its first preamble bit, eight bits per byte; parity from bit 226 on where the source contains it,
-    #: then zeros; shape (N, 32).
+    #: Bits of each message from the first preamble bit on, eight bits per byte, shape (N, 32). From bit 226 on they are
+    #: the parity, if the source contains it, then zeros.
     bits: Bytes
     parity_bits: Integers  #: Number of parity bits in the source, which were checked: 24, 6 or 0; shape (N,).
     source: Integers  #: Index in `sources`, shape (N,).
@@ -117,7 +116,7 @@ class SbasMessages(RowArrays, NotebookTable):
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
     def merge(self, later: SbasMessages) -> SbasMessages:
-        """Return the messages with later messages, in order of reception; counts are added, repeated notes dropped."""
+        """Return these and later messages in order of reception; counts are summed, and repeated notes are dropped."""
         if not len(later):
             return self
         both = join_rows([self, later])

@@ -26,30 +26,28 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 
 @dataclass(frozen=True, kw_only=True)
 class FastInForce:
-    """Fast corrections in force, all (T, K)."""
+    """Fast corrections in force; all arrays have shape (T, K)."""
 
-    #: True where, in this order: a fast correction is missing; it is too old, or of an inactive mask; type 7 is
-    #: missing; a required range rate is missing.
-    missing: Masks
-    timed_out: Masks
-    no_factor: Masks
-    no_rate: Masks
+    missing: Masks  #: True where no fast correction was received.
+    timed_out: Masks  #: True where the correction is too old, or of an inactive mask.
+    no_factor: Masks  #: True where type 7 is missing.
+    no_rate: Masks  #: True where a required range rate is missing.
     udrei: Integers  #: UDREI, -1 if it was not received.
     correction_m: Floats
     rate_mps: Floats
-    #: Degradation by the age of the correction (A.4.5.1.1). Degradation of the range rate per second, and the time
-    #: between the two corrections of the rate; 0 and infinite where the rate does not degrade (A.4.5.1.2).
-    growth_m: Floats
+    growth_m: Floats  #: Degradation by the age of the correction (A.4.5.1.1).
+    #: Degradation of the range rate per second; 0 where the rate does not degrade (A.4.5.1.2).
     rate_growth_mps: Floats
+    #: Time between the two corrections of the range rate; infinite where the rate does not degrade.
     rate_span_s: Floats
-    since_s: Floats  #: Time since the time of applicability.
+    since_s: Floats  #: Time since the time of applicability of the correction.
     aged: Masks  #: Corrections older than the time-out of precision approach.
 
 
 def fast_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> FastInForce:
-    """Find the fast corrections of PRN mask numbers (1, K), -1 for none, at epochs (T, 1)."""
+    """Find the fast corrections for satellites with numbers (1, K) in the PRN mask, -1 for none, at epochs (T, 1)."""
     fast, udre = tables.fast, tables.udre
     row, of_udre = fast.newest(number, time), udre.newest(number, time)
     missing = (row < 0) | (fast.time[row] <= stop)
@@ -81,7 +79,8 @@ def fast_in_force(
 def _factors(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Integers, Floats, Masks]:
-    """Return the indicator of type 7, the largest indicator of its message, the latency, and a mask of missing values.
+    """Return the indicator of type 7, the largest indicator in the same message, the latency, and a mask of missing
+    values.
 
     Where type 7 is missing, both indicators have the worst value.
     """
@@ -105,9 +104,11 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range rate, its degradation per second, the time between its corrections, and a mask of missing rates.
+    """Return the range rate, its degradation per second, the time between its two corrections, and a mask of missing
+    rates.
 
-    After an alarm (IODF 3) the earlier correction is the one nearest to half the time-out before the newest.
+    The rate is computed from the newest and the previous correction. After an alarm (IODF 3), the correction nearest to
+    half the time-out before the newest is used in place of the previous correction.
     """
     zero = np.zeros(row.shape)
     if limits.range_rate == "off":
@@ -130,7 +131,10 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Return the satellite's row nearest to the time `before` ahead of each row; of two equally near, the later."""
+    """Return, for each row, the same satellite's row received nearest to the time `before` earlier.
+
+    Of two rows that are equally near, the later row is returned.
+    """
     wanted = fast.time[row] - before
     first = fast["fresh"][row]
     low = np.maximum(fast.newest(fast.series[row], wanted), first)
@@ -141,13 +145,13 @@ def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> In
 
 @dataclass(frozen=True, kw_only=True)
 class LongTermInForce:
-    """Active long-term corrections, all (T, K): row in the table, row of the record, and reasons why one is missing."""
+    """Long-term corrections in force; all arrays have shape (T, K)."""
 
-    row: Integers
-    record: Integers
-    missing: Masks
-    timed_out: Masks
-    mismatch: Masks
+    row: Integers  #: Row of `SatelliteTables.long_term`, -1 for none.
+    record: Integers  #: Row of the navigation record, -1 for none.
+    missing: Masks  #: True where a required correction was not received.
+    timed_out: Masks  #: True where the correction is too old, or of an inactive mask.
+    mismatch: Masks  #: True where no record has the issue of data of the correction.
 
 
 def long_term_in_force(
@@ -159,9 +163,10 @@ def long_term_in_force(
     stop: Datetimes,
     navigation: Navigation | None,
 ) -> LongTermInForce:
-    """Find the newest long-term corrections with a record of their issue of data; SBAS satellites do not need any.
+    """Find the newest long-term corrections that match a navigation record; SBAS satellites do not need any.
 
-    `number`, shape (K,), is the number in the PRN mask. Without `navigation` the newest correction is used unchecked.
+    `number`, shape (K,), are the numbers in the PRN mask. Without `navigation`, the newest correction is used
+    unchecked.
     """
     table, limit = tables.long_term, limits.timeout_s("long_term")
     newest = table.newest(number[None, :], time[:, None])
@@ -196,7 +201,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the covariance in force, and a mask of satellites without one although the GEO sends some."""
+    """Return the row of the covariance in force, and a mask of satellites without one while the GEO sends others."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
@@ -210,7 +215,7 @@ def covariance_in_force(
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """Degradation terms [m], all (T, K); `missing` where there is no type 10, `rss` where squares are summed."""
+    """Degradation terms [m], all (T, K); `missing` is true without type 10, `rss` where the squares are summed."""
 
     fast_m: Floats
     rate_m: Floats
@@ -223,7 +228,7 @@ class Growth:
 def degradation_row(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the newest message of type 10 at epochs, and a mask of the epochs at which it is in force."""
+    """Return the row of the newest message of type 10 at epochs, and a mask of the epochs at which it is in force."""
     row = tables.degradation.newest(0, time)
     return row, tables.degradation.in_force(row, time, stop, limits.timeout_s("degradation"))
 
@@ -254,7 +259,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the degradation of long-term corrections (A.4.5.1.3), and which exceed the precision-approach time-out."""
+    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of ages beyond the precision time-out."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
@@ -293,7 +298,7 @@ class ServiceTable:
         """Return the factor on sigma UDRE at positions, NaN without type 27, and a mask of incomplete sets, shape (T,).
 
         The newest complete set of one issue is used. Inside several regions the factor of the highest priority applies,
-        or the smallest factor of equal priorities; outside all regions the factor of the outside applies.
+        or the smallest factor of equal priorities; outside all regions, the factor for other positions applies.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1
@@ -332,7 +337,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return whether positions are in a region: a rectangle, or its triangular half at (latitude 1, longitude 2)."""
+    """Return whether positions are in a rectangle, or the triangular half at the corner (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

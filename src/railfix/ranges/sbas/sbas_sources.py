@@ -36,7 +36,7 @@ class SbasSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites with long-term and fast corrections, from the records to which they refer."""
+        """Return satellites with long-term and fast corrections, from the records to which the corrections refer."""
         fixes = self.corrections.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -70,7 +70,7 @@ class DfmcSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites with the corrections applied, from the records to which they refer."""
+        """Return the satellites with the corrections applied, from the records to which the corrections refer."""
         fixes = self.service.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -99,7 +99,7 @@ _REASON_OF: Final = {
     SatelliteState.NOT_MONITORED: Reason.SBAS_DO_NOT_USE,
     SatelliteState.UDREI_TOO_LARGE: Reason.SBAS_DO_NOT_USE,
 }
-#: Reason of each state of a satellite, by its number.
+#: Rejection reason of each `SatelliteState`, by the number of the state.
 REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
 
 
@@ -111,7 +111,7 @@ _DFMC_REASON_OF: Final = {
     DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
     DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
 }
-#: Reason of each `DfmcState`, by its number.
+#: Rejection reason of each `DfmcState`, by the number of the state.
 DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
 
 

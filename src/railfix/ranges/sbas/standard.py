@@ -1,4 +1,4 @@
-"""Names, time-outs and variances of RTCA DO-229D, and classes of results."""
+"""Names, time-outs and variances of RTCA DO-229D, and classes of satellite and ionospheric corrections."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def mask_satellite(number: int) -> str:
     return ""
 
 
-#: Time-outs of fast corrections by degradation indicator ai (DO-229D, table A-8).
+#: Time-outs of fast corrections by degradation indicator ai [s] (DO-229D, table A-8).
 FAST_TIMEOUT_S: Final[dict[str, tuple[float, ...]]] = {
     "precision": (120, 120, 102, 90, 90, 78, 66, 54, 42, 30, 30, 18, 18, 18, 12, 12),
     "en_route": (180, 180, 153, 135, 135, 117, 99, 81, 63, 45, 45, 27, 27, 27, 18, 18),
 }
-#: Acceleration of the error of a fast correction by ai [m/s^2] (DO-229D, table A-8).
+#: Acceleration of the error of a fast correction by degradation indicator ai [m/s^2] (DO-229D, table A-8).
 FAST_DEGRADATION_MPS2: Final = (
     0.0, 0.00005, 0.00009, 0.00012, 0.00015, 0.00020, 0.00030, 0.00045,
     0.00060, 0.00090, 0.00150, 0.00210, 0.00270, 0.00330, 0.00460, 0.00580,
@@ -71,20 +71,19 @@ GIVE_VARIANCE_M2: Final = (
 )  # fmt: skip
 #: Factor on sigma UDRE by indicator of message type 27 (DO-229D, table A-20).
 SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0, 40.0, 50.0, 100.0)
-#: UDREI of a satellite that is not monitored, and of a satellite that must not be used.
-NOT_MONITORED: Final = 14
-DO_NOT_USE: Final = 15
-STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for this time [s] (DO-229D, A.4.4.1).
-#: Age above which messages are not used, even if type 6 renews a fast correction: the longest time-out, except for
-#: service messages [s].
+NOT_MONITORED: Final = 14  #: UDREI of a satellite that is not monitored.
+DO_NOT_USE: Final = 15  #: UDREI of a satellite that must not be used.
+STOP_S: Final = 60.0  #: A message of type 0 stops the use of the GEO for this time [s] (DO-229D, A.4.4.1).
+#: Age above which messages are not used, even if type 6 renews a fast correction [s]. It equals the longest time-out,
+#: except for service messages, which are used longer.
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
-#: Types that affect messages received later (stops and masks), and are therefore kept for twice `OLDEST_S`.
+#: Message types that affect messages received later (stops and masks), and are therefore kept for twice `OLDEST_S`.
 LEANT_ON: Final = (0, 1, 18)
 INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 
 
 class SatelliteState(IntEnum):
-    """State of a satellite: usable, or the first reason that applies, in this order."""
+    """State of a satellite: usable (OK), or the first of the following reasons that applies."""
 
     OK = 0
     GEO_STOPPED = 1  #: Type 0 was received within the last 60 s.
@@ -123,8 +122,8 @@ def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: i
 class SatelliteCorrections(FrozenArrays):
     """Corrections of T epochs by K satellites; NaN and -1 where `state` is not OK, except in `udrei` and `iode`.
 
-    The corrected code is ``code + fast_m``, with the satellite at ``broadcast + position_m`` and
-    its clock ``broadcast + clock_s``, both of the record with the issue of data `iode`.
+    The corrected code is ``code + fast_m``. The corrected satellite position is ``broadcast + position_m`` and the
+    corrected satellite clock ``broadcast + clock_s``, both from the record with the issue of data `iode`.
     """
 
     state: Integers  #: `SatelliteState`, shape (T, K).
@@ -133,10 +132,10 @@ class SatelliteCorrections(FrozenArrays):
     position_m: Floats  #: Correction of the satellite position, shape (T, K, 3).
     clock_s: Floats  #: Correction of the satellite clock, shape (T, K).
     iode: Integers  #: Issue of data of the long-term correction used, -1 if none is used; shape (T, K).
-    record: Integers  #: Row of `navigation.kepler` with that issue, -1 without navigation data; shape (T, K).
+    record: Integers  #: Row of `navigation.kepler` with this issue, -1 without navigation data; shape (T, K).
     udrei: Integers  #: UDREI, -1 where none was received; shape (T, K).
     sigma_udre_m: Floats  #: Sigma UDRE, shape (T, K).
-    #: Degradation terms (DO-229D, A.4.5.1); 0 where `inflated`; shape (T, K).
+    #: Degradation terms (DO-229D, A.4.5.1), shape (T, K). Where `inflated`, `fast_growth_m` is 8 m, and the others 0.
     fast_growth_m: Floats
     rate_growth_m: Floats
     long_term_growth_m: Floats
@@ -165,10 +164,10 @@ class IonosphereDelays(FrozenArrays):
     """Ionospheric delays of T epochs by K satellites from the grid."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).
-    #: Slant delay on L1, to be subtracted from the code (times (f1/f)^2 on other carriers), and its standard deviation;
-    #: NaN where unknown; shape (T, K).
+    #: Slant delay on L1, to be subtracted from the code after multiplication by (f1/f)^2 for other carriers; NaN where
+    #: unknown; shape (T, K).
     delay_m: Floats
-    sigma_uire_m: Floats
+    sigma_uire_m: Floats  #: Standard deviation of the slant delay on L1; NaN where unknown; shape (T, K).
     #: Pierce point, shape (T, K).
     latitude_deg: Floats
     longitude_deg: Floats

@@ -23,8 +23,8 @@ from railfix.ranges.sources import BroadcastSource, CorrectionSource
 class SbasState:
     """Messages of one GEO received so far; `add_messages` returns a new state with further messages.
 
-    Corrections at an epoch are the same as from the complete log, for any division into parts: a message is used from
-    its reception on, and `drop_before` drops only messages that no later epoch can use.
+    Corrections at an epoch are the same as from the complete log, however the messages are divided into parts: a
+    message is used from its reception on, and `drop_before` drops only messages that no later epoch can use.
 
     ::
 
@@ -34,12 +34,12 @@ class SbasState:
         state = state.drop_before(time[-1])  # what later epochs need
     """
 
-    prn: int  #: PRN of the GEO, given beforehand; the best is known only after all messages.
+    prn: int  #: PRN of the GEO, given beforehand, since the best PRN is known only after all messages.
     limits: SbasLimits = field(default_factory=SbasLimits)
-    #: Messages of that PRN, in the order of reception.
+    #: Messages of this PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
     band: Band = "L1"  #: Frequency of the messages.
-    #: For a recorded log, sentences on its messages and on the corrections from them; None for messages as they arrive.
+    #: For a recorded log, sentences on its messages and on the corrections from them; None for live messages.
     log_notes: tuple[str, ...] | None = None
 
     @classmethod
@@ -51,7 +51,7 @@ class SbasState:
         limits: SbasLimits | None = None,
         band: Band = "L1",
     ) -> SbasState:
-        """Return the state after the messages of a recorded log; ValueError if it has none of the requested PRN."""
+        """Return the state after the messages of a recorded log; ValueError without messages of the requested PRN."""
         limits = limits or SbasLimits()
         of_log: SbasCorrections | DfmcService = (
             DfmcService.from_log(messages, prn=prn)
@@ -104,7 +104,7 @@ class SbasState:
     def drop_before(self, time: np.datetime64) -> SbasState:
         """Return the state without the messages that no epoch from `time` on can use."""
         kind, age = self.messages.type, seconds(time - self.messages.time)
-        if self.band == "L5":  # keep the newest message of each type, and those of the last `MASK_S`
+        if self.band == "L5":  # keep the newest message of each type, and all messages of the last `MASK_S`
             newest = len(kind) - 1 - np.unique(kind[::-1], return_index=True)[1]
             kept = (age <= MASK_S) | np.isin(np.arange(len(kind)), newest)
             return self if kept.all() else replace(self, messages=self.messages.take(kept))

@@ -29,7 +29,7 @@ from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S
 
 LONG_AGO: Final = GPS_EPOCH  #: Time before every message.
 ALARM: Final = 3  #: IODF of an alarm.
-#: Longest time that is resolved [ms]: 278 years, all that `datetime64[ns]` reaches.
+#: Longest time that a key can represent [ms]: 278 years, the range of `datetime64[ns]` after the GPS epoch.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
 _OLDEST_MS: Final = np.int64(1000.0 * OLDEST_S)
@@ -47,7 +47,7 @@ class Series:
     series: Integers  #: Number of the series, shape (n,).
     time: Datetimes  #: Time of reception, shape (n,).
     columns: Mapping[str, NDArray[Any]]  #: Decoded values by name, shape (n, ...).
-    key: Integers  #: Series and time in one number, in ascending order; shape (n,).
+    key: Integers  #: Series and time of reception in one number, in ascending order; shape (n,).
 
     @classmethod
     def of(cls, series: Integers, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Series:
@@ -89,7 +89,7 @@ class Series:
         return np.where(row >= 0, self.time[row], LONG_AGO)
 
     def in_force(self, row: Integers, time: Datetimes, stop: Datetimes, limit_s: float) -> Masks:
-        """Return whether rows (-1 for none) were received after a stop of the GEO, and at most `limit_s` before."""
+        """Return whether rows (-1 for none) were received after the last stop of the GEO, and at most `limit_s` ago."""
         received = self.received(row)
         return np.asarray((row >= 0) & (received > stop) & (seconds(time - received) <= limit_s))
 
@@ -112,7 +112,7 @@ class Stops:
 
 
 class MaskTable:
-    """PRN masks (type 1), which give the satellite of each slot of a message with an IODP."""
+    """PRN masks (type 1), which assign a satellite to each slot of the messages with the same IODP."""
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
         masks = prn_masks(messages)
@@ -152,13 +152,14 @@ class MaskTable:
 
 
 class SatelliteTables:
-    """All messages of one GEO on satellites, by number of the PRN mask.
+    """Tables of all messages of one GEO on satellites, by number in the PRN mask.
 
-    `fast`: `fresh` is the first row since the satellite was last out of use. `udre`: UDREI from fast corrections and
-    type 6; `grows_from` is the reception time from which the degradation and the time-out are counted.
-    `fast_degradation` (type 7): `shortest` is the indicator of the smallest time-out of the message's satellites.
-    `long_term`: `other` is the last row with another IODE, -1 if none. `covariance` is type 28, `degradation`
-    type 10; `unused` counts corrections without a matching mask or fast correction.
+    `fast` has fast corrections; the column `fresh` is the first row since the satellite was last not monitored. `udre`
+    has the UDREI from fast corrections and type 6; `grows_from` is the reception time from which degradation and
+    time-out are counted. `fast_degradation` has type 7; `shortest` is the indicator with the shortest time-out in the
+    same message. `long_term` has long-term corrections; `other` is the last row with another IODE, -1 for none.
+    `covariance` has type 28, `degradation` type 10. `unused` counts corrections without a matching mask or fast
+    correction.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:
@@ -186,7 +187,7 @@ class SatelliteTables:
     def _udre(self, messages: SbasMessages) -> Series:
         """Return the UDREI from fast corrections and from type 6.
 
-        Type 6 updates the UDREI of the corrections with its IODF; an alarm updates the UDREI of all corrections.
+        Type 6 updates the UDREI of the corrections with the same IODF; an alarm updates the UDREI of all corrections.
         """
         fast, six = self.fast, decode(messages, 6)
         time = np.repeat(messages.time[six["row"]], SLOTS)
@@ -228,14 +229,14 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add the column `fresh`, the last row that is the first of its satellite or follows an unmonitored row."""
+    """Add the column `fresh`: the last row so far that is the first of the satellite or follows an unmonitored row."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
 
 
 def _with_other(table: Series) -> Series:
-    """Add the index of the last row of the same satellite with another issue of data; -1 without such a row."""
+    """Add the column `other`: the last earlier row of the satellite with another issue of data, -1 for none."""
     number, iode = table.series, table["iode"]
     changed = np.ones(len(number), dtype=bool)
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])

@@ -11,8 +11,8 @@ from railfix.core.arrays import Datetimes, Floats
 #: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravities [m/s^2].
 _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of table A-2 [deg].
-#: Mean, then seasonal variation, of pressure [mbar], temperature [K], vapour pressure [mbar], temperature lapse rate
-#: [K/m] and vapour lapse rate (table A-2).
+#: Mean pressure [mbar], temperature [K], vapour pressure [mbar], temperature lapse rate [K/m] and vapour lapse rate by
+#: latitude (table A-2).
 _RTCA_MEAN: Final = np.array(
     [
         [1013.25, 1017.25, 1015.75, 1011.75, 1013.00],
@@ -22,6 +22,7 @@ _RTCA_MEAN: Final = np.array(
         [2.77, 3.15, 2.57, 1.81, 1.55],
     ]
 )
+#: Seasonal variations of the same quantities (table A-2).
 _RTCA_SEASON: Final = np.array(
     [
         [0.0, -3.75, -2.25, -1.75, -0.50],
@@ -52,7 +53,7 @@ def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, 
     """Return the tropospheric slant delay of RTCA DO-229D (A.4.2.4) by latitude and day of year, shape (T, K) [m].
 
     The model is for heights above mean sea level; with ellipsoidal heights the delay changes by 1 mm per 3 m. The delay
-    is NaN below 2 degrees, and outside -100 m to 10 km.
+    is NaN below 2 degrees, and at heights outside -100 m to 10 km.
     """
     year = time.astype("datetime64[Y]").astype("datetime64[ns]")
     day = (time - year) / np.timedelta64(1, "D") + 1.0
