@@ -22,7 +22,7 @@ from railfix.tracking.limits import TrackingLimits
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Time between a constellation fault and the alert to users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: A kind has no sub-filters if faults of `MOST_SOURCES` such sources are less probable than this fraction of the risk.
+#: A kind of source has no sub-filters if faults of `MOST_SOURCES` of them are less probable than this part of the risk.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
 #: Risk of the speed bound as a fraction of the risk of the position level.
@@ -42,8 +42,8 @@ class SourceKind(IntEnum):
     ALL_IN_VIEW = 7
 
 
-#: Kinds of the other sources: all Dopplers, all phases, all codes of the satellites ahead or behind, and the map. The
-#: last sub-filter excludes no source.
+#: Kinds of the sources other than satellites, constellations and sensors: all Dopplers, all phases, all codes of the
+#: satellites ahead or behind, and the map. The last sub-filter excludes no source.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
     "phase": SourceKind.MOTION,
@@ -65,25 +65,25 @@ KINDS: Final = {
 class Budget:
     """Risk per independent error, fault probabilities, and the factors K computed from both."""
 
-    risk: float  #: Risk per independent error, less the fault probabilities of sources without a sub-filter.
+    risk: float  #: Risk per independent error, minus the fault probabilities of sources without a sub-filter.
     k: float  #: Two-sided normal quantile of the risk.
     #: Probability per `SourceKind` that a source is faulty or that a past fault still affects the filter; 0 for kinds
     #: without sub-filters.
     prior: tuple[float, ...]
     #: One-sided normal quantile of risk / prior, the minimum factor of a sub-filter's sigma; 0 without sub-filters.
     k_fault: tuple[float, ...]
-    #: Two-sided and one-sided quantiles for the speed bound, which has the additional fraction `SPEED_SHARE` of the
-    #: risk, divided equally among the sources.
+    #: Two-sided normal quantile for the speed bound, which has the additional fraction `SPEED_SHARE` of the risk,
+    #: divided equally among the sources.
     k_speed: float
-    k_speed_fault: tuple[float, ...]
+    k_speed_fault: tuple[float, ...]  #: One-sided normal quantiles for the speed bound, by kind as `k_fault`.
 
 
 @lru_cache(maxsize=8)
 def budget(limits: TrackingLimits) -> Budget:
     """Compute the risk budget of the level from the settings.
 
-    A fault is assumed to last for one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. A fault
-    affects the filter for `FORGOTTEN` further correlation times of codes, while its errors remain in the state.
+    A fault is assumed to last as long as one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. The
+    fault then affects the filter for `FORGOTTEN` correlation times of codes, while its errors remain in the state.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

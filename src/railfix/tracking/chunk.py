@@ -23,7 +23,7 @@ from railfix.tracking.state import TrackState
 _SHORTEST_S: Final = 1e-3
 #: Longest interval over which the filter continues [s]; it restarts after a longer interval.
 _APART_S: Final = 3600.0
-#: Minimum number of phases or Dopplers for a measured velocity and clock drift.
+#: Minimum number of phases or Dopplers from which velocity and clock drift can be computed.
 _MOTION: Final = 4
 #: Index of each clock in `ix.CLOCKS`.
 _OFFSETS: Final = {letter: k for k, letter in enumerate(ix.CLOCKS)}
@@ -35,7 +35,7 @@ FORGOTTEN: Final = 3.0
 class Chunk:
     """Inputs of the recursion for T epochs of K channels, with S satellite errors in the state."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time of each epoch, shape (T,).
     satellite: Strings  #: Satellite of each channel, shape (K,).
     epoch: Records  #: Records `railfix.kernels.tracking.layout.EPOCH`, shape (T,).
     channel: Records  #: Records `railfix.kernels.tracking.layout.CHANNEL`, shape (T, K).

@@ -23,38 +23,35 @@ class Kind(IntEnum):
     PLACE = 6  # position from a feature of the line
     BALISE = 7  # balises alternate with NEXT_BALISE, so that the protection level can exclude either
     NEXT_BALISE = 8
-    RANGE = 9  # to a ground unit
+    RANGE = 9  # two-way range to a ground unit
 
 
 @dataclass(frozen=True, kw_only=True)
 class GnssEpochs:
     """Corrected GNSS measurements of one antenna; NaN where absent or not to be used."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time of each epoch, shape (T,).
     satellite: Strings  #: Satellite of each channel, shape (K,).
     signal: Strings  #: Signal of each channel, shape (K,); satellite and signal identify a channel uniquely.
     clock: Strings  #: Letter of the receiver clock of each channel's codes, shape (K,).
-    #: Satellite position and velocity at transmission, shape (T, K, 3).
-    sat_ecef_m: Floats
-    sat_velocity_mps: Floats
-    #: Pseudorange corrected for satellite clock, group delay and atmosphere, and its standard deviation including the
-    #: receiver's noise scale, shape (T, K).
-    code_m: Floats
-    code_sigma_m: Floats
+    sat_ecef_m: Floats  #: Satellite position at transmission, shape (T, K, 3).
+    sat_velocity_mps: Floats  #: Satellite velocity at transmission, shape (T, K, 3).
+    code_m: Floats  #: Pseudorange corrected for satellite clock, group delay and atmosphere, shape (T, K).
+    code_sigma_m: Floats  #: Standard deviation of the code, including the receiver's noise scale, shape (T, K).
     phase_m: Floats  #: Carrier phase corrected for satellite clock and troposphere, shape (T, K).
     phase_joined: Masks  #: True where the phase continues from the previous epoch without a cycle slip, shape (T, K).
     #: Range rate from the Doppler, positive for an increasing range, shape (T, K). The rate may include the satellite
     #: clock drift and the tropospheric rate, some millimetres per second each.
     rate_mps: Floats
-    cn0_dbhz: Floats  #: Shape (T, K).
+    cn0_dbhz: Floats  #: Carrier-to-noise density, shape (T, K).
     #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
     #: measurement is used.
     off_map: Masks
-    #: Error of the ionospheric model in units of the error in a quiet ionosphere, shape (T,): more than 1 widens sigma
-    #: and level, 0 is for codes free of the ionosphere; None is 1.
+    #: Error of the ionospheric model divided by the error in a quiet ionosphere, shape (T,). Values above 1 widen sigma
+    #: and level; 0 is for ionosphere-free codes; None stands for 1.
     tilt_scale: Floats | None = None
     #: Position computed without the line, accurate to some hundred metres, shape (T, 3). The velocity across the line
-    #: is computed at this position, and is not used where it is NaN or None.
+    #: is computed at this position, and is not used where the position is NaN or None.
     near_ecef_m: Floats | None = None
 
     def __len__(self) -> int:
@@ -77,10 +74,9 @@ class GnssEpochs:
 class RangeEpochs:
     """Two-way ranges to ground units since the previous epoch, up to R per epoch; NaN where absent."""
 
-    #: Ranges, their standard deviations, and their ages at the epoch, shape (T, R).
-    range_m: Floats
-    sigma_m: Floats
-    age_s: Floats
+    range_m: Floats  #: Measured ranges, shape (T, R).
+    sigma_m: Floats  #: Standard deviations of the ranges, shape (T, R).
+    age_s: Floats  #: Ages of the ranges at the epoch, shape (T, R).
     unit_ecef_m: Floats  #: Position of each range's ground unit, shape (T, R, 3).
     #: Lever arm from the trajectory to the unit on the vehicle: along increasing arc length, right and up, shape (3,).
     lever_m: Floats
@@ -95,10 +91,9 @@ class RangeEpochs:
 class BaliseEpochs:
     """Balises read since the previous epoch, in two alternating columns; NaN where absent."""
 
-    time: Datetimes  #: Time at which each balise was passed, shape (T, 2); any value where absent.
-    #: Arc length of the train along the trajectory at this time, and its standard deviation, shape (T, 2).
-    place_m: Floats
-    sigma_m: Floats
+    time: Datetimes  #: Time at which each balise was passed, shape (T, 2); arbitrary where absent.
+    place_m: Floats  #: Arc length of the train along the trajectory at this time, shape (T, 2).
+    sigma_m: Floats  #: Standard deviation of the arc length, shape (T, 2).
 
     @classmethod
     def none(cls, epochs: int) -> BaliseEpochs:
@@ -107,8 +102,9 @@ class BaliseEpochs:
         return cls(time=np.zeros((epochs, 2), dtype="datetime64[ns]"), place_m=place_m, sigma_m=sigma_m)
 
     def find_latest(self, interval: Indices, intervals: int) -> BaliseEpochs:
-        """Return the last balise of each column in each of the `intervals` intervals; `interval`, shape (T,), is the
-        interval index of each epoch.
+        """Return the last balise of each column in each interval.
+
+        `interval`, shape (T,), is the index of the interval of each epoch; `intervals` is the number of intervals.
         """
         row = np.full((intervals, 2), -1, dtype=np.intp)
         epoch, turn = np.nonzero(np.isfinite(self.place_m))
@@ -125,10 +121,9 @@ class BaliseEpochs:
 class SensorEpochs:
     """Sensor measurements at the GNSS epochs, shape (T,) each; NaN where absent, None without the sensor."""
 
-    #: Wheel distance since the previous epoch, positive toward increasing chainage, and its standard deviation.
-    wheel_m: Floats | None = None
-    wheel_sigma_m: Floats | None = None
-    #: Whether the wheel distance is signed. If "unknown", the filter gives it the sign of the speed.
+    wheel_m: Floats | None = None  #: Wheel distance since the previous epoch, positive toward increasing chainage.
+    wheel_sigma_m: Floats | None = None  #: Standard deviation of the wheel distance.
+    #: Whether the wheel distance has a sign. If "unknown", the filter assigns the sign of the speed.
     wheel_sign: Literal["measured", "unknown"] = "measured"
     #: Radar distance since the previous epoch. Oscillations of the body cancel in a distance (P2 3.2).
     radar_m: Floats | None = None
@@ -136,11 +131,10 @@ class SensorEpochs:
     #: Mean specific force toward increasing chainage since the previous epoch, including gravity on the gradient.
     force_mps2: Floats | None = None
     force_sigma_mps2: Floats | None = None
-    #: Arc length measured by recognising a feature of the line, such as a curve, and its standard deviation.
-    place_m: Floats | None = None
-    place_sigma_m: Floats | None = None
-    balises: BaliseEpochs | None = None  #: Balises read.
-    ranges: RangeEpochs | None = None  #: Two-way ranges to ground units.
+    place_m: Floats | None = None  #: Arc length measured by recognising a feature of the line, such as a curve.
+    place_sigma_m: Floats | None = None  #: Standard deviation of the arc length.
+    balises: BaliseEpochs | None = None  #: Balises read since the previous epoch.
+    ranges: RangeEpochs | None = None  #: Two-way ranges to ground units since the previous epoch.
 
 
 @dataclass(frozen=True, kw_only=True)

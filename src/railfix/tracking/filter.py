@@ -40,7 +40,7 @@ class Step:
 
 
 class Recursion:
-    """Kernel inputs of a chunk; `start_state` is the state before the chunk, after `prepare_chunk`."""
+    """Kernel inputs of a chunk; `start_state` is the state before the chunk, as modified by `prepare_chunk`."""
 
     def __init__(
         self, chunk: Chunk, line: Line, sensors: SensorEpochs, limits: TrackingLimits, start_state: TrackState, *,
@@ -61,8 +61,9 @@ class Recursion:
         )  # fmt: skip
 
     def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
-        """Search positions for an epoch to which the hypotheses are predicted; if no hypothesis exists after the
-        search, finish the epoch and return None.
+        """Search positions for an epoch to which the hypotheses have been predicted.
+
+        If no hypothesis exists after the search, finish the epoch and return None.
         """
         if not state.hypotheses:
             state.code_bias = np.where(self.chunk.fresh[epoch], 0.0, state.code_bias)
@@ -151,7 +152,7 @@ def track(
     -------
     Tracked
     TrackState
-        State for the next epochs. Epochs processed in several calls give the same numbers as in a single call.
+        State for the next epochs. Results are the same whether epochs are processed in one call or in several.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
     state = TrackState() if state is None else copy_with(state)

@@ -1,8 +1,9 @@
 """Protection level of the filtered position at every epoch, from a second filter with sub-filters at a lower rate.
 
-The bank (`railfix.tracking.bank`) has at least one sub-filter per satellite, and codes of neighbouring epochs have
-nearly the same errors. The second filter therefore processes only one epoch per `level_period_s`, by default 1 s. The
-equations that propagate its level to the other epochs are in docs/filter-equations.md.
+The sub-filters, at least one per satellite (`railfix.tracking.bank`), require much computing time, and codes of
+neighbouring epochs have nearly the same errors. The second filter therefore processes only one epoch per
+`level_period_s`, by default 1 s. The equations that propagate its level to the other epochs are in
+docs/filter-equations.md.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus, is_bounded
 from railfix.tracking.state import TrackState
 
-#: Sensors whose values between two selected epochs are accumulated, and the mask of sensors whose values are averaged.
+#: Sensors whose values between two selected epochs are accumulated.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
-_MEAN: Final = np.array([False, False, True])
-#: Separation in standard deviations up to which a sub-filter is consistent with noise, for positions without and with a
-#: level. A sub-filter that excludes a faulty satellite has a larger separation.
+_MEAN: Final = np.array([False, False, True])  #: True for sensors whose values are averaged, not summed.
+#: Separation in standard deviations up to which a sub-filter is consistent with noise, for positions without a level,
+#: and with a level. A sub-filter that excludes a faulty satellite has a larger separation.
 _EXPLAINED: Final = (3.0, 4.0)
 #: Larger levels count as infinite [m], because they result from a sub-filter without measurements.
 LARGEST_LEVEL_M: Final = 1000.0
@@ -45,7 +46,7 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first.
     epochs: int = 0  #: Number of epochs since the last selected epoch.
-    #: Channels whose carrier phase has continued at all epochs since the selected epoch; None without such epochs.
+    #: Channels whose carrier phase has continued at all epochs since the last selected epoch; None without epochs.
     unbroken: frozenset[str] | None = None
     #: Sums of wheel distances [m], radar distances [m] and forces [m/s2], and of their variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
@@ -56,11 +57,11 @@ class AccumulatedIncrement:
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return indices and measurements of one epoch per period, and what is accumulated after the last selected epoch.
+    """Return indices and measurements of one epoch per period, and the remainder after the last selected epoch.
 
-    A carrier phase continues if it continues at all epochs between two selected epochs. Distances between selected
-    epochs are summed, forces averaged, and balises assigned to the next selected epoch. Positions from features and
-    ranges to ground units are used at selected epochs only. `since` is what the previous chunk has left over.
+    A carrier phase must continue at all epochs between two selected epochs. Distances between selected epochs are
+    summed, forces averaged, and balises assigned to the next selected epoch. Positions from features and ranges to
+    ground units are used at selected epochs only. `since` is the remainder of the previous chunk.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
@@ -172,10 +173,11 @@ def carried_levels(
     state: LevelState,
     limits: TrackingLimits,
 ) -> tuple[Tracked, LevelState]:
-    """Return the main filter's positions with levels propagated from the epochs of the filter with sub-filters.
+    """Return the main filter's positions, with levels propagated from the epochs at which the second filter ran.
 
-    `tracked` contains the main filter's results. `taken` contains the indices of the epochs of the filter with
-    sub-filters, `with_bank` its results at these epochs (None without any), and `state` its state before the chunk.
+    `tracked` are the main filter's results. `taken` are the indices of the epochs at which the second filter, which has
+    sub-filters, ran. `with_bank` are the second filter's results at these epochs (None without such epochs), and
+    `state` is its state before the chunk.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
@@ -184,7 +186,7 @@ def carried_levels(
         columns[:, _KEPT.index("level_m")] = np.where(is_bounded(with_bank.status), with_bank.level_m, np.inf)
         times, values = np.concatenate([times, with_bank.time]), np.concatenate([values, columns])
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
-    tau = seconds(tracked.time - times[number])  # NaN before the first
+    tau = seconds(tracked.time - times[number])  # NaN before the first epoch of the second filter
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
     # Growth of the position error since that epoch: V tau + a tau^2 / 2.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
@@ -201,7 +203,7 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # If doubtful, the most distant sub-filter may be correct; otherwise, only a sub-filter inconsistent with noise.
+    # If doubtful, sigma includes the largest separation; otherwise, only the part of it that noise does not explain.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
@@ -222,7 +224,7 @@ def _useful(level_m: Floats) -> Floats:
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Return the statuses of positions, none of which is tracking or coasting without a finite level."""
+    """Return the statuses of positions; a position without a finite level is neither tracking nor coasting."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)

@@ -1,4 +1,4 @@
-"""Settings of the filter along the track, each with the reason of its default."""
+"""Settings of the filter along the track, each with the reason for its default."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class TrackingLimits(Settings):
     #: Standard deviation of the displacement by orbit and ionospheric errors, which last for hours. The errors are
     #: about 1 m per satellite, with a dilution of one; averaging over epochs does not reduce them.
     slow_code_m: float = Field(default=1.0, ge=1e-6)
-    #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler; C/N0 at most 50 dB-Hz, 45 if not given.
+    #: Doppler noise: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2``; C/N0 at most 50 dB-Hz, 45 if unknown.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
     #: Floor and zenith value of the same formula for the change of a carrier phase over an epoch.
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
-    #: Mean innovation over half a minute, in sigmas, above which the map's length error is larger than assumed.
+    #: Mean innovation over half a minute, in sigmas, above which the map's length error is taken to exceed its sigma.
     map_misfit_sigmas: float = Field(default=3.0, gt=0)
     most_hypotheses: int = Field(default=24, ge=1)  #: Largest number of hypotheses; the most probable are kept.
     start_separation_m: float = Field(default=60.0, gt=0)  #: Distance within which positions of a search are merged.
@@ -73,15 +73,15 @@ class TrackingLimits(Settings):
     level: Literal["on", "off"] = "on"
     #: Interval of the epochs processed by the bank. Codes of neighbouring epochs have the same errors.
     level_period_s: float = Field(default=1.0, gt=0)
-    #: Largest acceleration between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes). The
-    #: value also limits the next speed after an epoch whose speed was not accepted.
+    #: Largest acceleration assumed between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes).
+    #: The value also limits the next speed after an epoch whose speed was not accepted.
     level_acceleration_mps2: float = Field(default=3.0, ge=0)
     #: Probability per hour that the error exceeds the level without warning. P1 2.4 requires 1e-7.
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Number of independent errors per hour. Code errors last about a minute.
     level_samples_per_hour: float = Field(default=60.0, gt=0)
-    #: Probability that a satellite is faulty in one independent sample, by city multipath beyond its assumed error; for
-    #: two satellites, its square is used. The value is an assumption.
+    #: Probability that a satellite is faulty in one independent sample, because city multipath exceeds the assumed
+    #: error. For two satellites, the square of this probability is used. The value is an assumption.
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
     #: Probability of a fault common to a constellation. The ARAIM milestone 3 report has 1e-4 for Galileo.
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
@@ -95,7 +95,7 @@ class TrackingLimits(Settings):
     #: Probability that the codes of all satellites ahead, or of all satellites behind, are late together, as for the
     #: low satellites of one side in single epochs. The value is an assumption.
     level_side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Probability that the map is wrong by more than its sigma, and sigma of a wrong map. Both values are assumed.
+    #: Probability that the map is wrong by more than the stated sigma, and sigma of a wrong map. Both are assumptions.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
     #: Probability that a storm or the equatorial anomaly tilts the ionosphere over the sky by more than `slow_code_m`

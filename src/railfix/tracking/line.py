@@ -1,4 +1,4 @@
-"""Trajectory as used by the filter: points, smooth tangents and axes at arc lengths, even beyond its ends."""
+"""Trajectory as used by the filter: points, smooth tangents and axes at any arc length, even beyond the ends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.track.trajectory import Trajectory
 
 #: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude [m]: 2/9 of the
 #: vertical-delay sigma without SBAS in DO-229D J.2.3, which is 9 m up to 20 deg, 4.5 m up to 55 deg, and 6 m beyond. At
-#: middle latitudes the displacement equals `slow_code_m`. `GnssEpochs.tilt_scale` multiplies both at each epoch.
+#: middle latitudes the displacement equals `slow_code_m`. `GnssEpochs.tilt_scale` multiplies both sigmas at each epoch.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
@@ -29,7 +29,7 @@ class Line:
         self.ecef_m: Floats = trajectory.ecef_m  #: Points, shape (V, 3).
         self.segment: Floats = trajectory.tangent  #: Unit vectors of the segments, shape (V - 1, 3).
         self.joins_m = trajectory.joins_m
-        #: Standard deviations of the map, across and up [m].
+        #: Standard deviations of the map across the line, and in height [m].
         self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
     @cached_property
@@ -67,8 +67,8 @@ class Line:
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift [m] from each position beyond an end of a closed line to its equivalent on the line; 0 for
-        positions on the line or on an open line.
+        """Return the shift [m] of positions beyond an end of a closed line to the same points on it; 0 for other
+        positions.
         """
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]

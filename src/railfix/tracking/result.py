@@ -28,43 +28,39 @@ def is_bounded(status: Codes) -> Masks:
 class Tracked(NotebookTable):
     """Filter results of T epochs with K channels; NaN where unknown."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time of each epoch, shape (T,).
     status: Codes  #: `TrackStatus`, shape (T,).
     #: Arc length and standard deviation of the most probable hypothesis, shape (T,). The standard deviation includes
     #: the straight distance to the other hypotheses, and separations that noise does not explain.
     arc_m: Floats
     sigma_m: Floats
-    #: Speed along the line, its standard deviation, and acceleration, shape (T,).
-    speed_mps: Floats
-    speed_sigma_mps: Floats
-    acceleration_mps2: Floats
+    speed_mps: Floats  #: Speed along the line, shape (T,).
+    speed_sigma_mps: Floats  #: Standard deviation of the speed, shape (T,).
+    acceleration_mps2: Floats  #: Acceleration along the line, shape (T,).
     probability: Floats  #: Probability of the reported hypothesis, shape (T,).
     hypotheses: Integers  #: Number of hypotheses, shape (T,).
-    #: Mean weight of the codes that are not left out, and mean weight of Dopplers and phases, shape (T,).
-    code_weight: Floats
-    motion_weight: Floats
-    #: Estimated scale-factor error of the wheel, accelerometer offset, and scale-factor error of the radar, shape (T,).
-    wheel_scale: Floats
-    force_offset_mps2: Floats
-    radar_scale: Floats
+    code_weight: Floats  #: Mean weight of the codes that are not left out, shape (T,).
+    motion_weight: Floats  #: Mean weight of Dopplers and phases, shape (T,).
+    wheel_scale: Floats  #: Estimated scale-factor error of the wheel, shape (T,).
+    force_offset_mps2: Floats  #: Estimated accelerometer offset, shape (T,).
+    radar_scale: Floats  #: Estimated scale-factor error of the radar, shape (T,).
     map_scale: Floats  #: Factor on the error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
-    #: Protection levels of the error along the line, of the straight distance (including all branches and a laterally
-    #: displaced map), and of the fault-free noise of a single branch, shape (T,); NaN where levels are off.
-    level_m: Floats
+    level_m: Floats  #: Protection level of the error along the line, shape (T,); NaN where levels are off.
+    #: Protection level of the straight distance, which includes all branches and a laterally displaced map, shape (T,).
     ground_level_m: Floats
-    level_noise_m: Floats
+    level_noise_m: Floats  #: Protection level of the fault-free noise of a single branch, shape (T,).
     #: Bound of the speed error, used to propagate the level to the next epochs, shape (T,).
     level_speed_mps: Floats
     #: Largest separation of a sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
-    #: Probability of faults that the level does not bound (common to the only constellation), shape (T,).
+    #: Probability of faults that the level does not bound, such as a fault of the only constellation; shape (T,).
     unchecked_prior: Floats
     #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the level, but at least the scale bound times the
     #: distance since codes were used.
     amount_m: Floats
     used: Integers  #: Number of measurements of each kind with a weight above a half, shape (T, len(Kind)).
     innovation: Floats  #: Innovations of codes, phase changes and Dopplers, shape (T, 3, K).
-    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); the last of several two-way ranges.
+    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); of several ranges, the last.
     sensed: Floats
     weight: Floats  #: Weights of codes, phase changes and Dopplers, shape (T, 3, K); 0 for codes that are left out.
     faulty: Masks  #: True for codes that are left out (`railfix.kernels.tracking.adaptation`), shape (T, K).
@@ -87,8 +83,9 @@ class Tracked(NotebookTable):
         return cls(time=time, **columns, faulty=np.ascontiguousarray(results.channel["faulty"]))
 
 
-#: Types of the columns, and the shapes of columns with more than one number per epoch.
+#: Types of the columns.
 _TYPES: Final = {"Codes": np.int8, "Integers": np.int64, "Floats": np.float64}
+#: Shapes of columns with more than one number per epoch.
 _SHAPES: Final = {"used": (len(Kind),), "sensed": (len(Kind) - 3,)}
 _OF_CHANNELS: Final = ("innovation", "weight", "faulty")
 #: Record types of one epoch and of one channel of `Tracked` in the recursion.

@@ -18,25 +18,22 @@ from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
 #: Largest spacing of the points at which the line is searched [m]. A Gaussian of `START_SIGMA_M` covers the positions
-#: between two points, and the code variance includes the error of such a position.
+#: between two points, and the code variance includes the distance to the nearest point.
 _SPACING_M: Final = 15.0
-#: Minimum redundancy of codes for a search. With a single redundant code, a wrong position can fit as well.
+#: Minimum redundancy of codes for a search. With a single redundant code, a wrong position can fit equally well.
 REDUNDANT: Final = 2
-#: A position becomes no hypothesis if its log likelihood is farther below the largest log likelihood.
+#: Largest difference from the maximum log likelihood with which a position becomes a hypothesis.
 _WORSE: Final = 25.0
-#: Prior standard deviations of speed and clock drift [m/s]; no train is faster than twice the former.
-_ANY_SPEED_MPS: Final = 50.0
-_ANY_DRIFT_MPS: Final = 1e3
+_ANY_SPEED_MPS: Final = 50.0  #: Prior standard deviation of the speed [m/s]; no train is faster than twice this speed.
+_ANY_DRIFT_MPS: Final = 1e3  #: Prior standard deviation of the clock drift [m/s].
 _FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement over the interval before the first epoch [m].
-#: Prior standard deviations of the scale errors of wheel and radar, and of the accelerometer offset with its mounting.
-WHEEL_PRIOR: Final = 0.02
-FORCE_PRIOR_MPS2: Final = 0.1
-RADAR_PRIOR: Final = 0.02
-#: Neighbouring positions of a hypothesis: distances in units of `BEND_M`, number, standard deviation added to the speed
-#: [m/s], and total probability as a fraction of the probability of the hypothesis.
-_BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])
-_BESIDE: Final = len(_BESIDE_STEPS)
-_BEND_SPEED_MPS: Final = 10.0
+WHEEL_PRIOR: Final = 0.02  #: Prior standard deviation of the wheel's scale-factor error.
+FORCE_PRIOR_MPS2: Final = 0.1  #: Prior standard deviation of the accelerometer offset, including its mounting.
+RADAR_PRIOR: Final = 0.02  #: Prior standard deviation of the radar's scale-factor error.
+_BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])  #: Distances to neighbouring hypotheses, in units of `BEND_M`.
+_BESIDE: Final = len(_BESIDE_STEPS)  #: Number of neighbouring hypotheses that are added to a hypothesis.
+_BEND_SPEED_MPS: Final = 10.0  #: Standard deviation added to the speed of neighbouring hypotheses [m/s].
+#: Total probability of the neighbouring hypotheses as a fraction of the probability of the hypothesis.
 _BESIDE_SHARE: Final = 0.01
 #: Unknowns that a new hypothesis takes from a lost track; the position error of the track affects all other unknowns.
 _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
@@ -89,7 +86,7 @@ def begin(
     """Return means (H, N) and covariances (H, N, N) of new hypotheses at positions `arc_m`, shape (H,).
 
     `satellites` is the number of satellite errors in the state. `known` are mean (N,) and covariance (N, N) of a lost
-    track, of which the sensor unknowns are kept; clocks and satellite errors restart.
+    track. Its sensor unknowns are kept; clocks and satellite errors restart.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
@@ -140,7 +137,7 @@ class Sought(NamedTuple):
 
     lost: bool  #: True if the track was lost.
     parent: Indices  #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
-    #: Split of each hypothesis, None if it is not split; None for no split.
+    #: Split that produced each hypothesis, None for other hypotheses; None if no hypothesis was split.
     splits: list[SplitHypothesis | None] | None
 
 
@@ -250,7 +247,7 @@ def _split_wide(
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
-    """Return hypotheses at positions away from a lost track; `weak` if weights have been low for a long time."""
+    """Return hypotheses at positions away from a lost track; `weak`: weights have been low for a long time."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
@@ -267,7 +264,7 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
 
 
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
-    """Add hypotheses slightly ahead of and behind separate hypotheses, and return the number of added hypotheses.
+    """Add hypotheses a short way ahead of and behind each separate hypothesis; return the number of added hypotheses.
 
     Where a line turns back within some tens of metres, the Dopplers agree equally with travel forward on one leg and
     backward on the other leg, and equations linearised before the bend are not valid beyond it. Every lap gets

@@ -59,20 +59,18 @@ class BackwardInformation:
     """Information of all later epochs on the unknowns after an epoch."""
 
     place_m: float  #: Arc length of the hypothesis that later epochs continue; NaN for none.
-    #: Information vector (N,) and information matrix (N, N) of the unknowns.
-    vector: Floats
-    matrix: Floats
-    satellite: Strings  #: Satellites whose errors are unknowns, shape (N - ix.SATELLITES,).
+    vector: Floats  #: Information vector of the unknowns, shape (N,).
+    matrix: Floats  #: Information matrix of the unknowns, shape (N, N).
+    satellite: Strings  #: Satellites whose errors are among the unknowns, shape (N - ix.SATELLITES,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothed:
     """Smoothed positions of T epochs; NaN where the filter has no position."""
 
-    #: Arc length, its standard deviation, and speed, shape (T,).
-    arc_m: Floats
-    sigma_m: Floats
-    speed_mps: Floats
+    arc_m: Floats  #: Arc length, shape (T,).
+    sigma_m: Floats  #: Standard deviation of the arc length, shape (T,).
+    speed_mps: Floats  #: Speed along the line, shape (T,).
 
 
 def smooth_steps(

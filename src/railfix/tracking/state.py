@@ -20,38 +20,36 @@ ANY_SPEED: Final = (-np.inf, np.inf)
 class Monitors:
     """Scalars of the state: adapted parameters, and monitors of contradictions."""
 
-    #: Times for which the mean weights of motion measurements and of codes have been low [s].
-    weak_motion_s: float = 0.0
-    weak_code_s: float = 0.0
-    #: Logarithms of the ratios of Doppler and phase variances to the variances of `TrackingLimits`.
+    weak_motion_s: float = 0.0  #: Time for which the mean weight of Dopplers and phases has been low [s].
+    weak_code_s: float = 0.0  #: Time for which the mean weight of codes has been low [s].
+    #: Logarithm of the estimated Doppler variance divided by the variance of `TrackingLimits`.
     log_doppler_scale: float = 0.0
-    log_phase_scale: float = 0.0
-    #: Mean position shift implied by the codes of the last epochs, in standard deviations, and its variance.
+    log_phase_scale: float = 0.0  #: The same for carrier phases.
+    #: Mean position shift implied by the codes of the last epochs, in standard deviations.
     code_shift: float = 0.0
-    code_shift_variance: float = 0.0
+    code_shift_variance: float = 0.0  #: Variance of `code_shift`.
     #: Logarithm of the factor by which the variance of map lengths exceeds the assumed variance, at least 0.
     map_log_variance: float = 0.0
-    #: Cumulative sum of velocity contradictions, along and across (`railfix.kernels.tracking.monitors`).
+    #: Cumulative sum of contradictions in the velocity along and across the line (`kernels.tracking.monitors`).
     contradiction: float = 0.0
-    #: 1 - recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
+    #: One minus the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
     step_s: float = 0.0  #: Time for which all codes have implied a different position [s].
-    #: Remaining times for which all levels are withheld, and for which the level along the line is withheld because
-    #: other positions were more probable than the risk [s].
-    level_hold_s: float = 0.0
+    level_hold_s: float = 0.0  #: Remaining time for which all levels are withheld [s].
+    #: Remaining time for which the level along the line is withheld, because other positions were more probable than
+    #: the risk [s].
     ambiguity_hold_s: float = 0.0
-    #: Time [s] and distance [m] since the hypotheses began.
-    branch_s: float = 0.0
-    branch_m: float = 0.0
+    branch_s: float = 0.0  #: Time since the hypotheses began [s].
+    branch_m: float = 0.0  #: Distance since the hypotheses began [m].
     distance_since_code_m: float = 0.0  #: Distance since the last used codes [m].
     direction: float = 0.0  #: Sign of the last speed with a known direction.
-    #: Range of possible speeds after the measured speeds (`railfix.kernels.tracking.model.narrow_speed_range`);
+    #: Least and largest speed that the measured speeds permit (`railfix.kernels.tracking.model.narrow_speed_range`);
     #: unbounded with several hypotheses.
     least_speed_mps: float = ANY_SPEED[0]
     most_speed_mps: float = ANY_SPEED[1]
-    #: Times since `TrackState.origin` of the last epoch with used measurements (NaN before the first), and of the last
-    #: epoch with used codes (`TrackingLimits.code_period_s`; -inf if the next codes are used in any case).
+    #: Time from `TrackState.origin` to the last epoch with used measurements; NaN before the first such epoch.
     measured_s: float = np.nan
+    #: Time from `TrackState.origin` to the last epoch with used codes; -inf if the next codes are used in any case.
     coded_s: float = -np.inf
 
 
@@ -82,12 +80,14 @@ HYPOTHESIS: Final = record_of({
 
 @dataclass(kw_only=True)
 class TrackState:
-    """State after an epoch: H hypotheses of N unknowns. Its arrays are replaced, never modified in place."""
+    """State after an epoch: H hypotheses of N unknowns. The arrays are replaced, never modified in place."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
     origin: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the first epoch.
-    mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))  #: Shape (H, N), units as in `index.py`.
-    covariance: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES, ix.SATELLITES)))  #: Shape (H, N, N).
+    #: Means of the unknowns, shape (H, N), in the units of `railfix.kernels.tracking.index`.
+    mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))
+    #: Covariances of the unknowns, shape (H, N, N).
+    covariance: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES, ix.SATELLITES)))
     hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: `HYPOTHESIS`, shape (H,).
     #: Satellites whose errors are in the state, shape (N - ix.SATELLITES,).
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
@@ -99,7 +99,7 @@ class TrackState:
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
     previous: Previous | None = None
     monitors: Monitors = field(default_factory=Monitors)
-    bank: Bank | None = None  #: None without levels.
+    bank: Bank | None = None  #: Sub-filters; None without levels.
 
     @property
     def hypotheses(self) -> int:
