@@ -252,7 +252,7 @@ def test_the_command_writes_a_model_and_says_what_it_lacks(done_run: Path, tmp_p
     ("arguments", "code", "said"),
     [
         (["--out", "nodir/m.toml"], 8, "the folder nodir does not exist"),
-        (["--out", "m.toml", "--elevations", "0,90,45"], 4, "rising edges"),
+        (["--out", "m.toml", "--elevations", "0,90,45"], 4, "ascending order"),
         (["--out", "m.toml", "--cn0", "x"], 4, "--cn0: Input should be a valid number"),
         (["--out", "m.toml", "--reference", "b"], 4, "1 runs and 2 references"),
         (["--out", "m.toml", "--base-position", "1,2"], 4, "--base-position '1,2'"),

@@ -282,7 +282,7 @@ RisingEdges = Annotated[tuple[Positive, ...], Field(min_length=1), AfterValidato
 
 
 class EvaluationInputs(Settings):
-    """Files of an evaluation in addition to the runs, and names of the configurations."""
+    """Files of an evaluation, other than the folders of the runs, and names of the configurations."""
 
     reference: tuple[str, ...] = option(
         "File of reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs, or one for each run "

@@ -1,7 +1,7 @@
 """Errors of one antenna along the line, as differences of chainage or along the trajectory.
 
-The error is the distance along the map from the reference's point on the map to the position, positive toward the end
-of the line (P1 3.3).
+The error is the distance along the map from the reference position's nearest point on the map to the evaluated
+position. It is positive toward the end of the line (P1 3.3).
 """
 
 from __future__ import annotations

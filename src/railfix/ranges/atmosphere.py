@@ -101,14 +101,12 @@ class SeenFrom:
     """Directions to satellites from receiver positions accurate to hundreds of metres, T epochs by K channels."""
 
     receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
-    #: Geodetic coordinates of the receiver, shape (T,).
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
+    latitude_deg: Floats  #: Geodetic latitude of the receiver, shape (T,).
+    longitude_deg: Floats  #: Longitude of the receiver, shape (T,).
+    height_m: Floats  #: Ellipsoidal height of the receiver, shape (T,).
     satellite_ecef_m: Floats  #: Positions of the satellites, shape (T, K, 3).
-    #: Direction from the receiver to each satellite, shape (T, K).
-    elevation_deg: Floats
-    azimuth_deg: Floats
+    elevation_deg: Floats  #: Elevation of each satellite, shape (T, K).
+    azimuth_deg: Floats  #: Azimuth of each satellite, shape (T, K).
 
     @classmethod
     def of(cls, receiver_ecef_m: Floats, satellite_ecef_m: Floats) -> SeenFrom:

@@ -135,7 +135,7 @@ class Cn0Curve:
         return [self._by_key.get((satellite_kind(name), code)) for name, code in pairs]
 
     def covers(self, satellite: Strings, signal: Strings) -> Masks:
-        """Return whether there is a curve for each channel, shape (M,)."""
+        """Return a mask of the channels that have a curve, shape (M,)."""
         return np.array([mean is not None for mean in self._find(satellite, signal)], dtype=bool)
 
     def mean_dbhz(self, elevation_deg: ArrayLike, *, satellite: Strings, signal: Strings) -> Floats:

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 
-#: Sets of samples from which the statistics of a bin can be computed, from its own samples to the samples of all bins.
+#: Sets of samples from which the statistics of a bin can be computed, from the bin's own samples to those of all bins.
 POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
 
 
@@ -60,7 +60,7 @@ class ErrorBins(Settings):
     @classmethod
     def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
         if len(value) < 2 or not (np.diff(value) > 0).all():
-            raise ValueError("at least two rising edges are needed")
+            raise ValueError("at least two edges in ascending order are needed")
         return value
 
     @property
@@ -96,12 +96,10 @@ class BinStatistics:
     #: Number of blocks in the bin. A block has the samples of one satellite in a time interval
     #: (`ErrorModelFit.block_s`), whose errors are correlated.
     blocks: Integers
-    #: Mean and standard deviation of the samples used for the bin.
-    bias_m: Floats
-    sigma_m: Floats
-    #: Bias and sigma of the overbound of these samples (`error_model_fit.gaussian_overbound`).
-    bound_bias_m: Floats
-    bound_sigma_m: Floats
+    bias_m: Floats  #: Mean of the samples used for the bin.
+    sigma_m: Floats  #: Standard deviation of these samples.
+    bound_bias_m: Floats  #: Bias of the overbound of these samples (`error_model_fit.gaussian_overbound`).
+    bound_sigma_m: Floats  #: Sigma of this overbound.
     pooled: Integers  #: Index into `POOLED`: own samples, or a wider set if the bin has too few blocks.
 
 
@@ -166,7 +164,7 @@ class ErrorModel:
     #: "local": only multipath and receiver noise, because a reference station removed satellite and atmospheric errors.
     #: "satellite_and_atmosphere": in addition, satellite and atmospheric errors of the recorded days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    #: Settings under which the model is valid; None if unknown; they are then not compared with a run's settings.
+    #: Settings under which the model is valid. If None, they are unknown and not compared with a run's settings.
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
     #: Rate of local faults among the ranges to which the model was fitted; None if not measured.

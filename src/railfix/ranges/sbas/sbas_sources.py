@@ -1,7 +1,7 @@
 """SBAS on L1 and on L5 as sources of corrections.
 
-The variances are summed as in DO-229D (J.2.2), without airborne receiver noise: ``sigma_flt^2 + sigma_UIRE^2 +
-sigma_tropo^2``; the variance of multipath and receiver noise on a railway is added (P1 2.4).
+The variances are summed as in DO-229D (J.2.2), but without the noise of airborne receivers: ``sigma_flt^2 +
+sigma_UIRE^2 + sigma_tropo^2``; the variance of multipath and receiver noise on a railway is added (P1 2.4).
 """
 
 from __future__ import annotations
