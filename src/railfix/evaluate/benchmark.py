@@ -226,7 +226,7 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, evaluate them and the other programs, and write the tables.
+    """Run the cases of a folder with one configuration, evaluate railfix and the other programs, and write the tables.
 
     Return the table (`BENCHMARK_COLUMNS`) and notes. The row of a failed case states the reason of the failure in
     ``error``. Raise InputFileError if a file has a wrong hash, MismatchError if settings were derived from a held-out

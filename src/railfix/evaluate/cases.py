@@ -96,7 +96,7 @@ class Case:
 def read_case(folder: Path) -> Case:
     """Read the case in a folder.
 
-    Raise InputFileError if ``case.toml`` cannot be read, SettingsError if it is not a valid case.
+    Raise InputFileError if ``case.toml`` cannot be read, SettingsError if the content is not a valid case.
     """
     path = folder / CASE_FILE
     content = load_settings(CaseFile, path, what="a case of a benchmark")

@@ -50,7 +50,7 @@ class RunAndReference:
     #: Reference file, or reference trajectories by antenna. If None, the folder of the run's log must have a file with
     #: one of the names `BESIDE_THE_LOG`.
     reference: Reference = None
-    configuration: str | None = None  #: Name of the configuration; if None, it is made from the settings.
+    configuration: str | None = None  #: Name of the configuration; if None, a name is made from the settings.
     table: str = POSITIONS_TABLE  #: Name of the table, see `railfix.evaluate.evaluation_inputs.list_position_tables`.
     #: Folder of another run on the same log; its conventional positions replace those of `run`. For the comparison of
     #: P1, that other run has only the elevation and C/N0 screens.
@@ -138,9 +138,9 @@ def evaluate_runs(
     `sections` is a CSV file of the environment by chainage (``from_m,to_m,environment``), used where a reference does
     not state the environment. `files` replaces the track and the vehicle that ``run.json`` names.
 
-    Raise InputFileError if a file is missing or its content is not as expected; raise MismatchError if a run and its
-    reference do not overlap in time, or the errors cannot be computed as requested; raise SettingsError if no run is
-    given, or a run is given twice.
+    Raise InputFileError if a file is missing or has unexpected content; raise MismatchError if a run and its reference
+    do not overlap in time, or the errors cannot be computed as requested; raise SettingsError if no run is given, or a
+    run is given twice.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:

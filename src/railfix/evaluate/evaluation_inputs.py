@@ -249,14 +249,14 @@ def _table(file: Path, columns: cs.Selector | None) -> pl.DataFrame:
 
 
 def floats(table: pl.DataFrame, name: str) -> Floats:
-    """Return a column as numbers; NaN where it is null, and everywhere if the table has no such column."""
+    """Return a column as numbers; NaN where the column is null, and everywhere if the table does not have it."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
 def words(table: pl.DataFrame, name: str) -> Strings:
-    """Return a column as text; blank where it is null, and everywhere if the table has no such column."""
+    """Return a column as text; blank where the column is null, and everywhere if the table does not have it."""
     if name not in table.columns:
         return np.full(len(table), "")
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)

@@ -30,7 +30,7 @@ STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
 #: Columns of the table of epochs that a Stanford diagram requires, in addition to the level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
-#: Statuses of a position with which its protection level bounds the error; a coasting filter has a level, too.
+#: Statuses with which the protection level of a position bounds the error, including that of a coasting filter.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -42,7 +42,7 @@ _REGIONS: Final = {
     Region.NO_POSITION: "no_position",
 }
 
-#: Columns of the table of counts in addition to its keys, with their meaning.
+#: Columns of the table of counts in addition to `KEYS`, with their meaning.
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
@@ -110,8 +110,8 @@ def level_name(kind: str) -> str:
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
     """Return the levels that are compared with errors, shape (T,) [m].
 
-    A level is infinite if it is missing, or if it is not usable and `levels_of` is "usable". It is NaN without a
-    position (mask `has`). `status` is the status of the position, `verdict` the status of the level.
+    A level is infinite if it is missing, or if it is not usable and `levels_of` is "usable". It is NaN where the mask
+    `has` is false: no position. `status` is the status of the position, `verdict` the status of the level.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":

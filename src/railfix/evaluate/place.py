@@ -104,7 +104,7 @@ def along_track_error(
     reference_ecef_m : ndarray, shape (T, 3) [m]
         Reference positions.
     same_place_m : float [m]
-        Largest distance from the reference position at which the map counts as passing it.
+        Largest distance from the map to a reference position at which the map counts as passing this position.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))

@@ -74,7 +74,7 @@ _LARGEST_REFERENCE_SIGMA_M: Final = 0.5
 _LARGEST_REFERENCE_GAP_S: Final = 2.5
 #: Longest gap of the reference station's log over which its range errors are interpolated [s].
 _LARGEST_BASE_GAP_S: Final = 35.0
-#: Minimum number of ranges of a constellation, after the screens, from which its receiver clock is estimated.
+#: Minimum number of ranges of a constellation, after the screens, from which the receiver clock is estimated.
 _LEAST_RANGES: Final = 4
 
 

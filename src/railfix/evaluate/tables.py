@@ -64,7 +64,7 @@ def _name_kind(kind: str) -> str:
 
 
 def _text(value: str) -> str:
-    """Return a text unchanged; as the format of a column it makes the column right-aligned, like numbers."""
+    """Return a text unchanged; a column with this format is right-aligned, like a column of numbers."""
     return value
 
 

@@ -19,7 +19,7 @@ from railfix.core.timescale import SECONDS_PER_DAY, to_week
 #: coefficients were received. The vertical delay of this model is 2.8 m RMS over time of day and latitude; the models
 #: of five other days from 2005 to 2024 differ from it by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
-#: Ratio of the radii of the Earth and of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
+#: Radius of the Earth divided by the radius of the ionosphere's thin shell, 350 km higher (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 

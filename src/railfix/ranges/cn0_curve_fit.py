@@ -85,7 +85,7 @@ def fit_cn0_curve(
 
 
 def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
-    """Return the curve of one kind and signal; None with too few bins."""
+    """Return the curve of one kind of satellites and one signal; None with too few bins."""
     which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
     bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
     if len(bins) < fit.least_bins:

@@ -131,7 +131,8 @@ def find_satellites(
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Largest difference between an epoch and the reference time of the record used, if less than its validity.
+        Largest difference between an epoch and the reference time of the record used, if less than the record's
+        validity.
     """
     code = observations.code_m[:, channels.columns]
     reason = _reasons_of_codes(channels.satellite, code)

@@ -94,7 +94,7 @@ class BinStatistics:
 
     count: Integers  #: Number of samples in the bin.
     #: Number of blocks in the bin. A block has the samples of one satellite in a time interval
-    #: (`ErrorModelFit.block_s`), whose errors are correlated.
+    #: (`ErrorModelFit.block_s`); their errors are correlated.
     blocks: Integers
     bias_m: Floats  #: Mean of the samples used for the bin.
     sigma_m: Floats  #: Standard deviation of these samples.

@@ -68,7 +68,7 @@ class ErrorSamples:
     elevation_deg: Floats  #: Elevation of the satellite, shape (n,).
     relative_azimuth_deg: Floats  #: Azimuth of the satellite, clockwise from the car's front, shape (n,).
     cn0_dbhz: Floats  #: Carrier-to-noise density, shape (n,).
-    #: Number of the sample's block, shape (n,). A block has the samples of one satellite in a time interval, whose
+    #: Number of the sample's block, shape (n,). A block has the samples of one satellite in a time interval; their
     #: errors are correlated.
     block: Integers
     used: Masks  #: Samples that passed every screen, shape (n,).
@@ -229,9 +229,10 @@ def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
 def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
     """Return stretches of the line, chainages from and to [m], with more frequent local faults than the whole line.
 
-    A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of its fraction of faulty blocks exceeds
-    the upper limit of the fraction on the whole line; neighbouring stretches are joined. The prior of the line does not
-    bound local faults on these stretches, and the setting `Config.no_level_m` excludes protection levels on them.
+    A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of the fraction of faulty blocks on the
+    stretch exceeds the upper limit of this fraction on the whole line; neighbouring stretches are joined. The prior of
+    the line does not bound local faults on these stretches, and the setting `Config.no_level_m` excludes protection
+    levels on them.
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)

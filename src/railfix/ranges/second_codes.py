@@ -72,7 +72,7 @@ def _correct_second_codes(corrected: CorrectedRanges, navigation: Navigation, no
 def _delays(
     navigation: Navigation, channels: Channels, states: SatelliteStates, choice: int
 ) -> tuple[Floats, Floats, Masks]:
-    """Return group delay and its sigma [m], and whether the chosen second signals are unhealthy, shapes (T, K)."""
+    """Return group delay, sigma of it [m], and whether the chosen second signals are unhealthy, shapes (T, K)."""
     shape = states.record.shape
     delay, sigma = np.full(shape, np.nan), np.zeros(shape)
     sick = np.zeros(shape, dtype=bool)

@@ -22,7 +22,7 @@ from railfix.tracking.limits import TrackingLimits
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Time between a constellation fault and the alert to users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: A kind of source has no sub-filters if faults of `MOST_SOURCES` of them are less probable than this part of the risk.
+#: A kind of source has no sub-filters if faults of `MOST_SOURCES` sources are less probable than this part of the risk.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
 #: Risk of the speed bound as a fraction of the risk of the position level.

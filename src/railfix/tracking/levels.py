@@ -2,7 +2,7 @@
 
 The sub-filters, at least one per satellite (`railfix.tracking.bank`), require much computing time, and codes of
 neighbouring epochs have nearly the same errors. The second filter therefore processes only one epoch per
-`level_period_s`, by default 1 s. The equations that propagate its level to the other epochs are in
+`level_period_s`, by default 1 s. The equations that propagate the level to the other epochs are in
 docs/filter-equations.md.
 """
 
@@ -46,7 +46,7 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first.
     epochs: int = 0  #: Number of epochs since the last selected epoch.
-    #: Channels whose carrier phase has continued at all epochs since the last selected epoch; None without epochs.
+    #: Channels whose carrier phase has continued since the last selected epoch; None if no epoch has followed.
     unbroken: frozenset[str] | None = None
     #: Sums of wheel distances [m], radar distances [m] and forces [m/s2], and of their variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
@@ -177,7 +177,7 @@ def carried_levels(
 
     `tracked` are the main filter's results. `taken` are the indices of the epochs at which the second filter, which has
     sub-filters, ran. `with_bank` are the second filter's results at these epochs (None without such epochs), and
-    `state` is its state before the chunk.
+    `state` is the state of the second filter before the chunk.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
@@ -203,7 +203,7 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # If doubtful, sigma includes the largest separation; otherwise, only the part of it that noise does not explain.
+    # If doubtful, sigma includes the largest separation; otherwise, only the separation that noise does not explain.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)

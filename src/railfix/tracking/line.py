@@ -21,7 +21,7 @@ _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
 class Line:
-    """Trajectory of V points with smooth axes, continued straight beyond its ends or, if closed, along its loop."""
+    """Trajectory of V points with smooth axes, continued straight beyond the ends or, if closed, along the loop."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -67,9 +67,7 @@ class Line:
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift [m] of positions beyond an end of a closed line to the same points on it; 0 for other
-        positions.
-        """
+        """Return the shift [m] that moves positions beyond an end of a closed line back onto it; 0 for others."""
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):

@@ -46,8 +46,8 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
     """Return the PRN with the most usable fast corrections (the smallest of several), and a sentence on the choice.
 
-    The choice depends on all messages of a log, so that it is made before positioning begins. For live messages the PRN
-    must be given.
+    The choice depends on all messages of a log, and must be made before positioning begins. For live messages, the PRN
+    must therefore be given.
     """
     limits, scores = limits or SbasLimits(), []
     for number in messages.prns:

@@ -110,12 +110,12 @@ class DfmcCorrections:
 
     state: Integers  #: `DfmcState`, shape (T, K).
     issue: Integers  #: Issue of data of the record to which the correction refers; -1 if none does; shape (T, K).
-    record: Integers  #: Row of `navigation.kepler` with that issue, -1 if no record has it; shape (T, K).
+    record: Integers  #: Row of `navigation.kepler` with this issue, -1 without such a record; shape (T, K).
     position_m: Floats  #: Correction added to the broadcast position, shape (T, K, 3).
     clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
     sigma_m: Floats  #: Sigma from the indicator and the scale, before covariance and degradation; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
-    growth_m: Floats  #: Degradation of the correction since it was sent, shape (T, K).
+    growth_m: Floats  #: Degradation of the correction since the reception, shape (T, K).
     constant: Floats  #: Constant added to the factor along a line of sight, shape (T, K).
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:
@@ -258,12 +258,14 @@ class DfmcService:
         own["growth_m"][good] = np.floor(age / interval) * scale["step_m"][ten, kind] + rate * age
 
     def _newest(self, kind: int, time: Datetimes, longest_s: float) -> Integers:
-        """Return the row of the newest message of a type; -1 if it is older than `longest_s`."""
+        """Return the row of the newest message of a type; -1 if the message is older than `longest_s`."""
         row, age = _newest(self._time[kind], time)
         return np.where(age <= longest_s, row, -1)
 
     def _slots(self, name: str, mask: Integers) -> tuple[Masks, Integers]:
-        """Return whether a satellite is in the mask in force, and its rank among the satellites of the mask."""
+        """Return whether a satellite is in the mask in force, and the rank of the satellite among the satellites of the
+        mask.
+        """
         slot = SLOT_OF.get(name, 0)
         if not slot or not len(self._time[31]):
             return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
@@ -296,7 +298,7 @@ class DfmcService:
         return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
 
     def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
-        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 if it is too old."""
+        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 if too old."""
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)

@@ -363,7 +363,7 @@ def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers)
 
 
 def _order_notes(log: SbasMessages) -> list[str]:
-    """Return notes on messages whose preamble does not match their second, which indicates a wrong time tag."""
+    """Return notes on messages whose preamble does not match the second of reception: time tags may be wrong."""
     notes = []
     second = log.time.astype("datetime64[s]").astype(np.int64)
     number, turn = preamble_number(log.bits, log.band), len(PREAMBLES[log.band])

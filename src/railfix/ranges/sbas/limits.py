@@ -35,7 +35,8 @@ class SbasLimits(Settings):
     incomplete: Literal["reject", "inflate"] = "reject"
     #: Largest UDREI used; None is 11 for precision approach and 13 en route.
     max_udrei: int | None = Field(default=None, ge=0, le=13)
-    message_s: float = Field(default=1.0, ge=0.0, le=2.0)  #: Time from the first bit of a message to its reception.
+    #: Time from the first bit of a message to the end of reception.
+    message_s: float = Field(default=1.0, ge=0.0, le=2.0)
 
     def timeout_s(self, kind: str) -> float:
         """Return the time-out of a kind of message in this mode [s]."""

@@ -29,7 +29,7 @@ class FastInForce:
     """Fast corrections in force; all arrays have shape (T, K)."""
 
     missing: Masks  #: True where no fast correction was received.
-    timed_out: Masks  #: True where the correction is too old, or of an inactive mask.
+    timed_out: Masks  #: True where the correction is too old, or the mask is not active.
     no_factor: Masks  #: True where type 7 is missing.
     no_rate: Masks  #: True where a required range rate is missing.
     udrei: Integers  #: UDREI, -1 if it was not received.
@@ -150,7 +150,7 @@ class LongTermInForce:
     row: Integers  #: Row of `SatelliteTables.long_term`, -1 for none.
     record: Integers  #: Row of the navigation record, -1 for none.
     missing: Masks  #: True where a required correction was not received.
-    timed_out: Masks  #: True where the correction is too old, or of an inactive mask.
+    timed_out: Masks  #: True where the correction is too old, or the mask is not active.
     mismatch: Masks  #: True where no record has the issue of data of the correction.
 
 

@@ -96,7 +96,7 @@ class SatelliteState(IntEnum):
     UDREI_TOO_LARGE = 8  #: UDREI above `SbasLimits.largest_udrei`.
     NO_LONG_TERM = 9
     IODE_MISMATCH = 10  #: No navigation record has the issue of data of the long-term correction.
-    NO_DEGRADATION = 11  #: Degradation data (types 7, 10; 28 where it is sent) are missing.
+    NO_DEGRADATION = 11  #: Degradation data (types 7 and 10, and 28 if the GEO sends it) are missing.
     NO_RANGE_RATE = 12  #: No two fast corrections determine a rate.
 
 
