@@ -199,7 +199,7 @@ def test_preambles_out_of_turn_are_told(tmp_path: Path) -> None:
     rows = [f"2353 {s} 137 63 : {digits(cases.message(63, s + (s > 7)), 64)}" for s in range(10)]
     path = tmp_path / "turn.sbs"
     path.write_text("\n".join(rows))
-    assert "2 of 10 messages are not those" in " ".join(read_sbas(path).notes)
+    assert "2 of 10 messages do not match" in " ".join(read_sbas(path).notes)
 
 
 def test_the_same_message_from_two_files_counts_once(tmp_path: Path) -> None:
@@ -241,7 +241,7 @@ def test_a_broken_line_is_named(tmp_path: Path, fault: str) -> None:
         ("# only a comment\n", "contains no SBAS message"),
         (f"{2.10:9.2f}           {'N: GPS NAV DATA':40s}RINEX VERSION / TYPE\n", "is a RINEX navigation file"),
         (as_rinex(a_log()).replace("END OF HEADER", "COMMENT"), "no END OF HEADER"),
-        (as_rinex(a_log()).rsplit("\n", 2)[0], "no 32 bytes"),
+        (as_rinex(a_log()).rsplit("\n", 2)[0], "not have 32 bytes"),
         (as_rinex(a_log()).replace("L1", "L5", 1), "band L5"),
         (as_ems(a_log()).replace("25 02 15", "25 02 31", 1), "not a date and time"),
     ],
