@@ -29,7 +29,7 @@ class JoinedChannels:
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
-        """Return values of a state, channels on the last axis, for all U channels; `fill` for channels not in it."""
+        """Arrange values of a state, channels on the last axis, for all U channels; `fill` where there is no value."""
         place = self.places[state]
         known = place >= 0
         out: NDArray[Value] = np.full((*values.shape[:-1], len(place)), fill, dtype=values.dtype)

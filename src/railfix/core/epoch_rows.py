@@ -12,9 +12,9 @@ import numpy as np
 from railfix.core.arrays import Indices
 
 Value = TypeVar("Value")
-#: Names of fields without rows, which depend on the channels only.
+#: Names of the fields that have no rows because they depend only on the channels.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
-EVERY: Final = slice(None)  #: All rows.
+EVERY: Final = slice(None)  #: Slice of all rows.
 
 
 class OnDemand:
@@ -35,7 +35,7 @@ class OnDemand:
 
 @cache
 def _members(kind: Any) -> dict[str, bool]:
-    """Return, for each field of a dataclass, whether it can have rows; an empty dictionary for other types."""
+    """Return, for each field of a dataclass, whether the field can have rows; an empty dictionary for other types."""
     return {f.name: f.name not in _OF_CHANNELS for f in fields(kind)} if is_dataclass(kind) else {}
 
 

@@ -81,7 +81,7 @@ _MAKERS: Final = {
 
 
 def check_type(value: object, expected: type, what: str) -> None:
-    """Raise SettingsError if the argument `what` is not of the expected type, and name the function that returns it."""
+    """Raise SettingsError, which names the function to use, if the argument `what` is not of the expected type."""
     if not isinstance(value, expected):
         maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")

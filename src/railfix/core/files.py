@@ -1,4 +1,4 @@
-"""Reading of plain, compressed and Hatanaka files; commit of the source code of railfix.
+"""Read plain, compressed and Hatanaka files, and find the commit of railfix's source code.
 
 Compressed files are gzip, compress (.Z), bzip2, xz, zstd and zip files. The first bytes of a file, not its name,
 determine how it is read. Memory is bounded: plain files and most compressed files are streamed, a compress file is
@@ -40,7 +40,7 @@ Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation
 #: Last clause of the message about a malformed line, with the option that skips these lines.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
-#: Endings of the names of compressed files; the ending before them shows the kind of file.
+#: Name endings of compressed files. The ending before them shows the kind of file, as in ``log.csv.gz``.
 _SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
@@ -48,7 +48,7 @@ _COPY_BYTES: Final = 1 << 20
 #: Largest ratio of decompressed to compressed size of a file that is read as a whole. Text compresses by a factor of 20
 #: to 50; a file with a much larger factor is not text, and could fill the memory.
 _LARGEST_RATIO: Final = 100
-_LARGEST_BYTES: Final = 64_000_000  #: Size that decompressed content may always have [bytes].
+_LARGEST_BYTES: Final = 64_000_000  #: Decompressed size up to which any ratio is accepted [bytes].
 
 
 class ByteStream(io.BufferedIOBase):
@@ -138,8 +138,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
     """Open a file as a stream of its decompressed bytes.
 
     Line ends are as in the file. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed. Raise
-    InputFileError if the file is missing, a folder, unreadable, empty, an archive of a kind that is not read, or, with
-    "text", binary.
+    InputFileError if the file is missing, a folder, unreadable, empty, an unsupported archive, or, with "text", binary.
     """
     held = ExitStack()
     with held:
@@ -332,7 +331,7 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the Hatanaka decoder on an open file and return the output as a stream; closing it releases `held`."""
+    """Start the Hatanaka decoder on an open file; return its output as a stream that releases `held` when closed."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:

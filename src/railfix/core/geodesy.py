@@ -1,4 +1,4 @@
-"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges with the Earth rotation.
+"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges with Earth rotation.
 
 Where an input is NaN, the result is NaN.
 """
@@ -50,9 +50,9 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
 
 
 def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
-    """Compute the unit vectors east, north and up in ECEF as the rows of (..., 3, 3).
+    """Compute the unit vectors east, north and up in ECEF as the rows of matrices, shape (..., 3, 3).
 
-    ``axes @ (ecef - origin)`` is the position relative to an origin in east, north and up.
+    ``axes @ (ecef - origin)`` gives the east, north and up components of a position relative to `origin`.
     """
     lat = np.radians(np.asarray(latitude_deg, dtype=np.float64))
     lon = np.radians(np.asarray(longitude_deg, dtype=np.float64))

@@ -22,7 +22,7 @@ class Message(Checked):
     @model_validator(mode="before")
     @classmethod
     def _truth_for_a_number(cls, values: Any) -> Any:
-        """Reject a truth value where a number is expected; pydantic would accept it as 1 or 0."""
+        """Reject a boolean where a number is expected; pydantic would accept the boolean as 1 or 0."""
         for name, value in values.items() if isinstance(values, dict) else ():
             if (value is True or value is False) and name in cls._numbers:
                 raise ValueError(f"{name}: a number was expected")

@@ -1,4 +1,4 @@
-"""Indices of nearest times, and times of day or week resolved by a reference time."""
+"""Find nearest times, and complete times of day or week by means of a reference time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indic
 
 
 def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Return the times with given seconds of day [s] nearest to reference times, which are in the same time scale."""
+    """Return, for each second of day [s], the time nearest to a reference time in the same time scale."""
     other = np.asarray(near, dtype="datetime64[ns]")
     same_day = other.astype("datetime64[D]").astype("datetime64[ns]") + timedelta(second_of_day)
     days = np.rint(seconds(other - same_day) / SECONDS_PER_DAY).astype(np.int64)
@@ -32,7 +32,7 @@ def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
-    """Return the GPS times with given seconds of week [s] nearest to reference times within half a week."""
+    """Return, for each second of week [s], the GPS time within half a week of a reference time."""
     week, sow = to_week(near)
     shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)
     return from_week(week + shift.astype(np.int64), seconds_of_week)

@@ -1,4 +1,4 @@
-"""HTML for objects in a notebook, and short texts of values."""
+"""HTML for objects in a notebook, and short descriptions of values."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class NotebookTable:
 
 
 def html_table(rows: Sequence[Mapping[str, str]], *, caption: str) -> str:
-    """Return rows of texts as an HTML table; the keys of the first row are the header."""
+    """Return rows of strings as an HTML table; the keys of the first row are the header."""
     heads = "".join(f"<th>{escape(name)}</th>" for name in rows[0]) if rows else ""
     body = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row.values())}</tr>" for row in rows)
     return f"<table><caption>{escape(caption)}</caption><tr>{heads}</tr>{body}</table>"
 
 
 def html_list(lines: Sequence[str]) -> str:
-    """Return lines as an HTML list; "" without lines."""
+    """Return lines as an HTML list; "" if there are no lines."""
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
@@ -58,7 +58,7 @@ def median_text(values: Floats) -> str:
 
 
 def value_text(value: Any) -> str:
-    """Return a short text of a value: type, shape and range of an array, items or keys of a container.
+    """Describe a value briefly: an array by type, shape and range, a container by its items or keys.
 
     >>> value_text(np.array([1.0, np.nan, 3.0]))
     'float64 (3), 1 to 3, 33 % NaN'

@@ -1,4 +1,4 @@
-"""Names of rejection reasons, and reasons of screens that are added to the package."""
+"""Names of rejection reasons, and registration of the reasons of additional screens."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Integers
 from railfix.core.reasons import Reason
 
-_ADDED: dict[str, Reason] = {}  #: Reasons of screens that are added to the package, by name in lower case.
+_ADDED: dict[str, Reason] = {}  #: Reasons of screens added to the package, by lower-case name.
 
 #: First bit that no reason of railfix uses.
 _FIRST_FREE_BIT: Final = 23
@@ -21,7 +21,7 @@ _LAST_BIT: Final = 30
 def screen_reason(name: str) -> Reason:
     """Return the rejection reason of a screen, given the lower-case name of the reason.
 
-    A name that `Reason` does not have receives the next free bit; raise ValueError if no bit is left.
+    A name that `Reason` lacks is assigned the next free bit; raise ValueError if no bit is left.
     """
     if name.upper() in Reason.__members__:
         return Reason[name.upper()]

@@ -36,7 +36,7 @@ class Reason(IntFlag):
     NO_CORRECTION = 1 << 9
     #: SBAS: the satellite is not in the PRN mask.
     SBAS_NOT_COVERED = 1 << 10
-    #: SBAS: fast or long-term correction, degradation, or the record to which the correction refers is missing.
+    #: SBAS: the fast or long-term correction, the degradation, or the record that the correction refers to is missing.
     SBAS_NO_CORRECTION = 1 << 11
     #: SBAS: the corrections have timed out.
     SBAS_TIMED_OUT = 1 << 12
@@ -91,7 +91,7 @@ class Status(IntEnum):
     #: A position, but the 3-D positions of the last minutes lie off the line: the map is wrong here, or the
     #: train is on another track.
     MAP_OFFSET = 10
-    #: A position that passed every check, but interference with the signals is suspected: jamming.
+    #: A position that passed every check, but jamming of the signals is suspected.
     JAMMING_SUSPECTED = 11
     #: A position, but the signals may be from a spoofer, so that the position error has no bound.
     SPOOFING_SUSPECTED = 12
@@ -106,7 +106,7 @@ class Status(IntEnum):
 
 #: Statuses of positions that failed a check; `Config.failed_checks` keeps or drops their coordinates.
 CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN, Status.SPOOFING_SUSPECTED)
-#: Statuses with coordinates; positions with a status of `CHECK_FAILED` have none if `Config.failed_checks` drops them.
+#: Statuses with coordinates; for a status in `CHECK_FAILED`, `Config.failed_checks` may drop the coordinates.
 POSITIONED: Final = (
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, Status.MAP_END,
     *CHECK_FAILED,

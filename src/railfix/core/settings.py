@@ -81,9 +81,9 @@ class Settings(Checked):
     @field_validator("*", mode="before")
     @classmethod
     def _as_written(cls, value: Any, info: ValidationInfo) -> Any:
-        """Reject a truth value for a number (pydantic would accept it as 1 or 0); accept a path or a text for a list.
+        """Reject a boolean for a number (pydantic would accept it as 1 or 0); accept a path or a string for a list.
 
-        The items in a text are separated by commas, as in ``systems=G,E``.
+        The items in a string are separated by commas, as in ``systems=G,E``.
         """
         if not isinstance(value, (bool, str, Path)):
             return value
@@ -97,7 +97,7 @@ class Settings(Checked):
 
 
 def is_number(kind: Any) -> bool:
-    """Return whether the type of a field allows numbers, or numbers and None, but no truth value."""
+    """Return whether the type of a field allows numbers, or numbers and None, but no booleans."""
     parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
     return bool not in parts and (int in parts or float in parts)
 
@@ -118,7 +118,7 @@ def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> M
 
 
 def first_fault(model: type[BaseModel], error: ValidationError) -> str:
-    """Return a message on the first fault: the setting and the expected value, or the known names and a similar one."""
+    """Describe the first fault: a setting and its expected value, or an unknown name and the known names."""
     # an unknown name is reported first, because it may be the misspelt name of a setting that is reported as missing
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"] if part != "[key]")

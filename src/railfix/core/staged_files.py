@@ -25,7 +25,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 @contextmanager
 def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a path of a temporary file in the same folder; it replaces the file if the block ends without an error.
+    """Yield the path of a temporary file in the same folder, which replaces `path` if the block ends without an error.
 
     Raise OutputError if a system error occurs in the block or while replacing the file.
     """
@@ -42,7 +42,7 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
         raise write_error(target, error, what=f"the {what} ") from error
 
 
-#: Remedy for each error number of a full file system.
+#: Remedy for each error number that means a full file system.
 _FULL: Final = {
     errno.ENOSPC: "free some space on the disk, or give a folder on another disk",
     errno.EDQUOT: "free some of your quota, or give a folder elsewhere",

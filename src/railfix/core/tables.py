@@ -1,4 +1,4 @@
-"""Tables for the terminal and HTML pages, and errors of reading table files."""
+"""Tables for the terminal and HTML pages, and errors raised while table files are read."""
 
 from __future__ import annotations
 
@@ -76,17 +76,18 @@ class Table:
 def plain_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", *, texts: int = 1, boxed: bool = False
 ) -> Table:
-    """Return a table without a name, for the terminal; all columns but the first `texts` are numbers."""
+    """Return a table without a name, for the terminal; all columns except the first `texts` contain numbers."""
     return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 
-Column = tuple[str, str, Callable[[Any], str]]  #: Header, column of the frame, and format of a table column.
+#: Column of a table: its header, the name of the data frame's column, and the function that formats a value.
+Column = tuple[str, str, Callable[[Any], str]]
 
 
 def listing(
     name: str, rows: pl.DataFrame, columns: Sequence[Column], caption: str = "", *, marked: Sequence[int] = ()
 ) -> Table:
-    """Return a table with the rows of a frame; a column whose format is not `str` is a column of numbers."""
+    """Return a table with the rows of a data frame; a column counts as numeric unless its format is `str`."""
     return Table(
         name=name,
         head=[head for head, _, _ in columns],

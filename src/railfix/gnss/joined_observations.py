@@ -1,4 +1,4 @@
-"""Join the parts of one log with their signals and problems, and stack the observations of several antennas."""
+"""Join the parts of one log, including their signals and problems, and stack the observations of several antennas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; fu
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
-    """Return whether each channel has a value in an array of `kinds` (T, M) or a loss-of-lock digit, shape (M,)."""
+    """Return whether each channel has a value in any array of `kinds` (T, M), or a loss-of-lock digit; shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
         used |= ~np.isnan(array[:1]).all(axis=0)  # nearly all channels have data in the first epoch
@@ -37,7 +37,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Parameters
     ----------
     parts : sequence of Observations
-        At least one, in order of time.
+        At least one part, in order of time.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def _join_headers(headers: Sequence[ObservationHeader]) -> ObservationHeader:
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
-    """Return the observations of several antennas stacked as rows, with all channels, and the rows of each antenna."""
+    """Stack the epochs of several antennas, with the channels of all; return the stack and the rows of each antenna."""
     first, *others = observations
     if not others:
         return first, (EVERY,)
@@ -138,6 +138,6 @@ def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[st
 
 
 def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """Return the first `MAX_PROBLEMS` messages, and a message with the number of further faults, `count` in total."""
+    """Return the first `MAX_PROBLEMS` messages on `count` faults, and a message with the number of further faults."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

@@ -98,7 +98,7 @@ class Observations(NotebookTable):
     #: Messages on faults of the file that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then a message with
     #: the number of further faults. A slice of epochs has no messages.
     problems: tuple[str, ...] = ()
-    problem_count: int = 0  #: Number of faults.
+    problem_count: int = 0  #: Number of all faults, with and without a message.
     #: Number of items skipped, by kind: malformed epochs and satellite lines, duplicate epochs, external events,
     #: satellites of unknown or unselected constellations.
     skipped: Mapping[str, int] = field(default_factory=dict)
@@ -138,8 +138,8 @@ class Observations(NotebookTable):
     def __getitem__(self, key: slice | tuple[slice, str | Sequence[str]]) -> Observations:
         """Select epochs (a view), or epochs and satellites: ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
 
-        Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day, on the day of
-        the first epoch or the day after. The upper bound is not included. Satellites are names ("G06") or
+        Bounds are epoch indices, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day, which may be on the
+        day of the first epoch or the day after. The upper bound is not included. Satellites are names ("G06") or
         constellations ("G"), one or several.
 
         Raises
@@ -168,7 +168,7 @@ class Observations(NotebookTable):
         return part
 
     def _epoch_at(self, bound: str | datetime | np.datetime64) -> int:
-        """Return the number of the first epoch at or after a time; raise KeyError if the bound is not a time."""
+        """Return the index of the first epoch at or after a time; raise KeyError if the bound is not a time."""
         text = str(bound).replace(" ", "T")
         try:
             if "-" in text or not len(self):

@@ -26,10 +26,10 @@ _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "C": ((27.5e6, 28.3e6), (41.8e6, 42.5e6)),
     "J": ((41.8e6, 42.5e6),),
 }
-#: Largest eccentricities, for GPS by IS-GPS-200 (20.3.3.4.1). E14 and E18 have 0.17, and QZSS satellites have 0.075.
+#: Largest plausible eccentricities; that of GPS is from IS-GPS-200 (20.3.3.4.1). E14 and E18 have 0.17, QZSS 0.075.
 _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "J": 0.12}
-#: Limits of GLONASS radii, and of semi-major axes computed from position and velocity [m]. The 2,104 records have
-#: 25,416 to 25,602 km.
+#: Limits of GLONASS radii, and of semi-major axes computed from position and velocity [m]. In the 2,104 records, the
+#: range is 25,416 to 25,602 km.
 _GLONASS_M: Final = (25.3e6, 25.7e6)
 #: Largest difference of the reference times of orbit and clock of a record; they are equal in the 2,104 records.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0

@@ -32,7 +32,7 @@ FileEpochs: TypeAlias = tuple[str, Observations, Integers]
 
 
 class EpochOrder:
-    """Sorter of the epochs of one log; the result does not depend on the division of the log into runs."""
+    """Sorter of the epochs of one log; the result does not depend on the division of the log into parts."""
 
     def __init__(self, broken_lines: BrokenLines) -> None:
         self._broken_lines = broken_lines
@@ -182,7 +182,8 @@ def _where(path: str, line: int) -> str:
 
 
 def _passed(time: Datetimes) -> tuple[Integers, Integers]:
-    """Return the numbers of preceding epochs with later tags and of following epochs with earlier tags, for each epoch.
+    """Return, for each epoch, how many preceding epochs have later tags, and how many following epochs have earlier
+    tags.
 
     Only the nearest 2 * `MOST_PASSED` epochs on each side are counted.
     """
@@ -203,7 +204,7 @@ def _is_repeated(time: Datetimes) -> Masks:
 
 
 def _is_lone(time: Datetimes) -> Masks:
-    """Return whether each time tag is over `_LONE` later or earlier than both neighbours, which are in order."""
+    """Return whether each time tag is over `_LONE` later or earlier than both neighbours, if these are in order."""
     lone = np.zeros(len(time), dtype=np.bool_)
     before, this, after = time[:-2], time[1:-1], time[2:]
     lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))

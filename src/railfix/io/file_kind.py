@@ -63,7 +63,7 @@ _ROOTS: Final[dict[str, FileKind]] = {
     "kml": "kml", "gpx": "gpx", "osm": "osm", "rdf": "rdf", "featurecollection": "gml",
 }  # fmt: skip
 _RINEX: Final[dict[str, FileKind]] = {"O": "observations", "B": "sbas", "M": "rinex", "C": "rinex"}
-#: Kinds by the ending of the name, where the content is ambiguous.
+#: Kind by the ending of the file name, used where the content is ambiguous.
 _ENDINGS: Final[dict[str, FileKind]] = {
     ".csv": "table", ".pos": "rtklib", ".nmea": "nmea", ".gpx": "gpx", ".kml": "kml", ".osm": "osm", ".pbf": "pbf",
     ".geojson": "geojson", ".json": "geojson", ".xml": "xml", ".landxml": "xml", ".railml": "xml", ".ifc": "ifc",
@@ -105,7 +105,7 @@ def find_kind(path: FilePath) -> FileKind:
     return _ENDINGS.get(ending(path), "unknown")
 
 
-#: Words in the header of a position table that do not occur in a track map.
+#: Words that occur in the header of a position table but not in the header of a track map.
 _OF_POSITIONS: Final = ("time", "unix", "tow", "quality", "sigma_north", "antenna")
 
 
@@ -115,7 +115,7 @@ def wrong_kind(path: FilePath, expected: str) -> InputFileError:
 
 
 def has_times(path: FilePath) -> bool:
-    """Return whether a table or GPX file has times, qualities or other columns that a track map lacks."""
+    """Return whether a table or GPX file has times, quality numbers or other columns that a track map lacks."""
     head = read_head(path)
     names = _header_line(head).lower()
     return b"time>" in head or any(word in names for word in _OF_POSITIONS)

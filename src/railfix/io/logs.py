@@ -50,7 +50,7 @@ def read_observations(
     Parameters
     ----------
     path : path or sequence of path
-        RINEX observation files, logs in UBX, SBF or RTCM 3 (other protocols in between are skipped), or EGNSS MATE
+        RINEX observation files, logs in UBX, SBF or RTCM 3 (messages of other protocols are skipped), or EGNSS MATE
         tables S_GNSS_SAT; plain or compressed. Several files must be of one kind, and are read in order of time.
     broken_lines : {"stop", "count"}
         With "stop", a malformed RINEX line raises InputFileError. With "count", the values or epochs that the line
@@ -83,7 +83,7 @@ def read_observations(
 def _by_georinex(
     paths: list[str], systems: list[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
 ) -> list[Observations]:
-    """Read RINEX files with georinex, and return them in order of time without overlaps."""
+    """Read RINEX files with georinex, and return their observations in order of time without overlaps."""
     import georinex
 
     from railfix.io.georinex_layout import observations_from_xarray

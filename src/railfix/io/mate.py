@@ -185,7 +185,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Return the rows as epochs by channels; of several rows of one signal at one epoch, the last is used."""
+    """Arrange the rows as epochs by channels; of several rows of one signal at one epoch, the last is used."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)

@@ -16,8 +16,8 @@ from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Number of rows converted together to columns.
 _SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
-#: Column names that other programs often use in tables of positions and maps, by railfix's name. They are reduced to
-#: lower-case letters and digits. A height without a unit is in metres.
+#: Column names that other programs often use in tables of positions and maps, by railfix's name. Only lower-case
+#: letters and digits of a name are compared. A height without a unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
     "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
     "longitude_deg": ("lon", "long", "lng", "longitude", "londeg", "longitudedegrees", "gpslongitude"),
@@ -67,13 +67,13 @@ class NamedColumns:
         return InputFileError(self.path, message, line=self.header_line)
 
     def texts(self, name: str, *, absent: str) -> Strings:
-        """Return a column as texts, or `absent` in every row if the table has no such column."""
+        """Return a column as strings, or `absent` in every row if the table has no such column."""
         return np.array(self.cells[name].to_list(), dtype=np.str_) if name in self else np.full(len(self), absent)
 
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse a column as numbers, shape (n,); raise InputFileError for a cell that is not a finite number.
 
-        Without `blank`, an empty cell is an error. With `blank`, empty cells get this value, and cells ``nan`` are
+        Without `blank`, an empty cell is an error. With `blank`, empty cells get this value, and cells with ``nan`` are
         accepted. If `blank` is infinite, infinite cells are accepted, too.
         """
         given = self.cells[name].str.len_bytes().to_numpy() > 0
@@ -97,7 +97,7 @@ class NamedColumns:
 
 
 def fails(parse: Callable[[Any], object], text: object) -> bool:
-    """Return whether parsing a text raises ValueError."""
+    """Return whether parsing a string raises ValueError."""
     try:
         parse(text)
     except ValueError:
@@ -106,13 +106,13 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
 
 
 def is_named(theirs: str, name: str) -> bool:
-    """Return whether a column name of a file is railfix's `name`, or a usual name for it in the same unit."""
+    """Return whether a column name of a file is railfix's `name`, or a usual name of it in the same unit."""
     plain = "".join(c for c in theirs.lower() if c.isalnum())
     return plain in _USUAL.get(name, ()) or theirs.lower() == name
 
 
 def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
-    """Return the table with columns of usual names ("Latitude", "lon", "alt") renamed to railfix's `names`.
+    """Return the table after renaming columns that have usual names ("Latitude", "lon", "alt") to railfix's `names`.
 
     Raise InputFileError if such a column is in another unit ("height_ft").
     """

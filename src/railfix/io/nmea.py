@@ -20,7 +20,7 @@ from railfix.core.timescale import SECONDS_PER_DAY, timedelta, utc_to_gpst
 from railfix.gnss.joined_observations import first_problems
 from railfix.io.position_log import PositionLog
 
-#: Names of counted lines that are not errors.
+#: Names of the counts of lines that are not errors.
 _OTHER_LINES, _UNCHECKED = (
     "lines skipped that are not NMEA 0183 sentences",
     "sentences without checksum",
@@ -58,7 +58,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     ----------
     path : path
         Text file, plain or compressed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the
-        ``$`` of a sentence is ignored; a sentence may lack its checksum.
+        ``$`` of a sentence is ignored. A sentence may lack its checksum.
     broken_lines : {"stop", "count"}
         With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", the
         sentence is skipped and noted. A malformed last line is always skipped and noted.
@@ -68,8 +68,8 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Returns
     -------
     PositionLog
-        Times in GPS time; qualities as RTKLIB numbers them (`QUALITY`). A position without height or geoid separation
-        is NaN in `ecef_m`, and has latitude and longitude in `plan_deg`.
+        Times are in GPS time, and quality is numbered as by RTKLIB (`QUALITY`). A position without height or geoid
+        separation is NaN in `ecef_m`, and has latitude and longitude in `plan_deg`.
 
     Raises
     ------
@@ -210,7 +210,7 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix from the date sentence before it, or, if `chained`, by counting days from the
+    """Compute the GPS time of each fix from the preceding date sentence, or, if `chained`, by counting days from the
     first date.
     """
     of_day = np.array([fix.of_day_s for fix in fixes])

@@ -36,7 +36,7 @@ _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PositionLog(NotebookTable):
-    """Positions of a log, n rows in the order of the file, or of time (`railfix.io.positions.read_positions`)."""
+    """Positions of a log, n rows in the order of the file or sorted by time (`railfix.io.positions.read_positions`)."""
 
     path: str
     time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).
@@ -110,7 +110,7 @@ def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, 
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Return the positions in a table; columns of heights, sigmas, times and qualities may be absent.
+    """Return the positions in a table; the columns of heights, sigmas, times and quality may be absent.
 
     Raise InputFileError if the table has no position columns or no rows, or a value is not a number or out of range.
     """
@@ -161,15 +161,15 @@ def numbers_or_nan(table: NamedColumns, name: str) -> Floats:
 
 
 def qualities_in_words(log: PositionLog) -> str:
-    """Return the number of rows of each quality as text: "1155 of quality 2, 3 of quality 5"."""
+    """Return the number of rows of each quality as a string: "1155 of quality 2, 3 of quality 5"."""
     numbers, counts = np.unique(log.quality, return_counts=True)
     return ", ".join(f"{count} of quality {number}" for number, count in zip(numbers, counts, strict=True))
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the column names in the file by railfix's names, from texts ``NAME=COLUMN``.
+    """Return the file's column names by railfix's names, parsed from strings ``NAME=COLUMN``.
 
-    Raise SettingsError for a text of another form.
+    Raise SettingsError for a string of another form.
     """
     columns: dict[str, str] = {}
     for pair in pairs:

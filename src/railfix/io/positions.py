@@ -22,7 +22,7 @@ from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtkl
 from railfix.io.receiver.log import read_receiver_positions
 from railfix.io.xml_lines import read_gpx_lines
 
-#: RTKLIB's quality by words in NovAtel's position type.
+#: RTKLIB's quality by word that occurs in NovAtel's position type.
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
 
 
@@ -181,7 +181,7 @@ def read_positions(
 
 
 def _in_order(log: PositionLog) -> PositionLog:
-    """Return the log sorted by time if rows are only slightly late, with a note on times that go back."""
+    """Sort the log by time if its rows are only slightly late; add a note if times go back."""
     known = np.flatnonzero(~np.isnat(log.time))
     time = log.time[known]
     back = np.flatnonzero(np.diff(time) < np.timedelta64(0, "ns")) + 1

@@ -58,7 +58,7 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 def style_file(path: Path) -> Path | None:
     """Return the path of the QGIS style to write for a file.
 
-    Return None if the format has no style or the file exists with the same content.
+    Return None if the format has no style, or the style file exists with the same content.
     """
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):

@@ -30,7 +30,7 @@ COLUMNS: Final = (
     "time_gpst", "antenna", "chainage_m", "x_m", "y_m", "z_m", "speed_mps", "sigma_m", "source", "environment",
 )  # fmt: skip
 SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Source of a reference position; blank where the file has none.
-#: A CSV with these columns and no source is ground truth from the simulator.
+#: A CSV file with these columns and without a source column is taken as ground truth from the simulator.
 _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
 _FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 
@@ -81,7 +81,7 @@ def read_reference(
     antennas : sequence of str
         Antennas to read. A file without the column ``antenna`` has the positions of one antenna.
     quality : collection of int
-        Accepted qualities (`PositionLog.quality`); not applied to a log without qualities.
+        Accepted values of `PositionLog.quality`; ignored for a log without quality numbers.
     columns : mapping of str, optional
         For CSV with other column names, as in `read_positions`.
     broken_lines, date
@@ -180,7 +180,8 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
     )
 
 
-LONGEST_STEP_S = 1.0  #: Longest interval between rows [s]; a longer interval is a gap, in which values are unknown.
+#: Longest interval between rows [s]; a longer interval counts as a gap, in which values are unknown.
+LONGEST_STEP_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +239,7 @@ class Acceleration:
 
 
 def read_pulses(path: FilePath) -> Pulses:
-    """Read a tachometer table, CSV or Parquet, with ``time_gpst`` and the count.
+    """Read a tachometer table (CSV or Parquet) with ``time_gpst`` and a count.
 
     The count is in the column ``count`` (reading of a counter, which falls when the train runs backward and never
     wraps), ``pulse`` (number of a pulse, as for `railfix run`) or ``distance_m`` (distance run). Without these columns,
@@ -261,7 +262,7 @@ def read_pulses(path: FilePath) -> Pulses:
 
 
 def read_acceleration(path: FilePath) -> Acceleration:
-    """Read a table of accelerations toward the front, CSV or Parquet, with ``time_gpst`` and one column of values.
+    """Read a table (CSV or Parquet) of accelerations toward the front, with ``time_gpst`` and one column of values.
 
     ``specific_force_mps2``, and ``force_forward_mps2`` in tables of the simulator, are measured by an accelerometer and
     include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the train's acceleration

@@ -32,7 +32,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "pulses": ("[count]", "[pulse]", "[distance_m]", "[direction]"),
     "acceleration": ("[specific_force_mps2]", "[force_forward_mps2]", "[acceleration_mps2]"),
 }  # fmt: skip
-#: Sensors whose tables may have rows with only a time, where the sensor has no output.
+#: Sensors whose tables may have rows with a time alone; such a row means that the sensor had no output.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 _TIMELESS: Final = ("ranging_units", "list of balises")  #: Tables without times.
 #: Tables without empty values, with strictly rising times and at least two rows.
@@ -42,7 +42,7 @@ _WHOLE: Final = ("pulse", "direction")  #: Integer columns.
 
 
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
-    """Read a sensor table of a kind in `COLUMNS`; names are text, and times are GPS time in order.
+    """Read a sensor table of a kind in `COLUMNS`, with names as text and with GPS times in ascending order.
 
     Rows with only a time are dropped. Raise InputFileError if the file is not such a table or has no rows, or if a
     value is missing or wrong; the message names the row.
@@ -88,7 +88,7 @@ def find_sensor_table(names: Collection[str]) -> str | None:
     present = set(names)
     for kind, columns in COLUMNS.items():
         needed = {name for name in columns if not name.startswith("[")}
-        if not needed:  # one of the columns that may be absent alone is required
+        if not needed:  # a table of optional columns needs one of them
             needed = (present & set(names_of_columns(kind)) - {"direction"}) or {""}
         if needed <= present and ("time_gpst" in present) == (kind not in _TIMELESS):
             return kind
@@ -190,7 +190,7 @@ def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
 
 
 def _group() -> pl.Expr:
-    """Return the expression of a balise group's identity, "NID_C-NID_BG"."""
+    """Return the polars expression of a balise group's identity, "NID_C-NID_BG"."""
     parts = [pl.col(name).cast(pl.Int64).cast(pl.String) for name in ("NID_C", "NID_BG")]
     return pl.concat_str(parts, separator="-").alias("balise")
 

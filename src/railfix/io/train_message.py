@@ -40,7 +40,7 @@ class MessageStatus(IntEnum):
 
 
 class Source(IntFlag):
-    """Source of a position."""
+    """Sensors and other sources from which a position was computed."""
 
     FRONT_RECEIVER = 1
     REAR_RECEIVER = 2
@@ -84,7 +84,7 @@ class TrainMessage(Message):
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
     speed_cmps: Signed | None = None  #: Speed, positive toward rising chainage; None where unknown.
-    speed_bound_cmps: Unsigned | None = None  #: Bound of the speed error.
+    speed_bound_cmps: Unsigned | None = None  #: Bound on the speed error.
     #: Running direction: 1 toward rising chainage, -1 toward falling chainage, 0 where unknown.
     direction: Annotated[int, Field(ge=-1, le=1)] = 0
     facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Direction of the front end, coded as `direction`.
@@ -192,7 +192,7 @@ def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
 
 
 def to_json(message: TrainMessage) -> str:
-    """Return a message as one line of JSON by field names; statuses and sources are written as names."""
+    """Return a message as one line of JSON with the field names as keys; statuses and sources are written as names."""
     values = message.model_dump()
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]

@@ -22,7 +22,7 @@ class XmlLine:
     fields: dict[str, str]  #: ``name``, blank where the file has none, and ``ExtendedData`` of KML.
     points: Floats  #: Longitude, latitude [deg] and height as written [m], NaN where missing; shape (n, 3).
     geoid_m: Floats  #: ``geoidheight`` of GPX, NaN where missing; shape (n,).
-    time: tuple[str, ...]  #: UTC as written, blank where missing; n texts.
+    time: tuple[str, ...]  #: UTC as written, blank where missing; n strings.
 
 
 def read_root(path: FilePath) -> Element:
@@ -44,7 +44,7 @@ def tag(element: Element) -> str:
 
 
 def _texts(element: Element) -> dict[str, str]:
-    """Return the texts of the children by their names."""
+    """Return the text of each child element by the element's name."""
     return {tag(child): (child.text or "").strip() for child in element}
 
 

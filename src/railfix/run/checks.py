@@ -25,7 +25,8 @@ _SECOND: Final = np.timedelta64(1, "s")
 #: Number of conventional positions after which a run is stopped if all these positions are farther from the line than
 #: `ANOTHER_PLACE_M`.
 ENOUGH_TO_STOP: Final = 10
-#: Largest time between a log and its navigation records; if the time is longer, the records are of another day.
+#: Largest time between a log and its navigation records; if the time is longer, the records are taken to be of another
+#: day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: Sensors with samples only at events. They have no samples for a long time if the train is at rest, or passes no
 #: balise or ground unit.

@@ -118,12 +118,12 @@ _APPROXIMATED: Final = 1
 
 
 def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates of a table of positions as ROS 2 messages in an MCAP file; return their number.
+    """Write the rows with coordinates of a table of positions as ROS 2 messages in an MCAP file; return the row count.
 
     Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix), ``/ANTENNA/row`` (all columns) and, for the
     filter only, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time stamps are UTC. Absent numbers are NaN, and
-    absent texts are empty. `description` is a text on the kind of positions and the frame of the coordinates, which is
-    stored in the file. Raise NoPositionError if no row has coordinates. Raise SettingsError if mcap-ros2-support is not
+    absent strings are empty. `description`, a text on the kind of positions and the frame of the coordinates, is stored
+    in the file. Raise NoPositionError if no row has coordinates. Raise SettingsError if mcap-ros2-support is not
     installed.
     """
     with needs_extra():
@@ -198,8 +198,8 @@ def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Tra
     """Return the EGNSS MATE tables R_TRACK and R_ETCS_TPR of the first antenna of a run.
 
     `train` and `passings` are tables of the run. The last relevant balise group (LRBG) of a row is the group that was
-    read last according to `passings`; it is empty before the first reading. Each section of the track is one track edge
-    of the tables.
+    read last according to `passings`; the LRBG is empty before the first reading. Each section of the track is one
+    track edge of the tables.
     """
     rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
     chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()
@@ -270,5 +270,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return a table with the columns of the EGNSS MATE schema in their order; columns without values are null."""
+    """Return a table with the columns of the EGNSS MATE schema, in order; columns without values are null."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

@@ -104,8 +104,8 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
 def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
     """Return the properties of a file.
 
-    The file is read as each kind that its content suggests, until a reader accepts it. If no reader accepts the file,
-    the first error is returned as its problem.
+    The file is read as each kind that its content suggests, until a reader accepts the file. If no reader accepts the
+    file, the first error is returned as its problem.
     """
     errors: list[str] = []
     kinds = _find_kinds(path)

@@ -31,13 +31,13 @@ TABLE_KINDS: Final[tuple[TableKind, ...]] = get_args(TableKind)
 _OF_MATE: Final[Mapping[str, TableKind]] = {
     "S_IMU": "inertial", "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "list of balises",
 }  # fmt: skip
-#: For each kind, the option that accepts the table; the options of other commands than `railfix run` with the command.
+#: For each kind, the option that accepts the table, preceded by the command if the command is not `railfix run`.
 _OPTIONS: Final[Mapping[TableKind, str]] = {
     **{kind: f"--{kind.replace('_', '-')}" for kind in TABLE_KINDS},
     "list of balises": "--balise-list or --virtual-balises", "pulses": "railfix reference --pulses",
     "acceleration": "railfix reference --acceleration", "sections": "railfix evaluate --sections",
 }  # fmt: skip
-#: Table without which another table is not used.
+#: For each kind of table that is used only with another table, the kind of the other table.
 PAIRS: Final[Mapping[TableKind, TableKind]] = {
     "ranging": "ranging_units", "ranging_units": "ranging", "balises": "list of balises", "list of balises": "balises",
 }  # fmt: skip
@@ -63,12 +63,13 @@ def find_table_kind(path: Path) -> TableKind | Literal["other"] | None:
         return "sections"
     if names & {"chainage_m", "kilometrage_m"} and names & {"height_m", "elevation_m"}:
         return "heights"
-    found = None if names & {"antenna", "read"} else find_sensor_table(columns)  # results and ground truth have these
+    # results and ground truth have these columns
+    found = None if names & {"antenna", "read"} else find_sensor_table(columns)
     return next((kind for kind in TABLE_KINDS if kind == found), "other")
 
 
 def read_table_facts(path: Path, kind: TableKind) -> tuple[str, Span | None]:
-    """Return a phrase on the content of a table, and the span of its times; raise InputFileError as its reader does."""
+    """Return a phrase on the content of a table, and the span of its times; raise the errors of the table's reader."""
     if kind in SENSORS:
         samples = read_sensors(**{kind: path}).tables[kind]
         return _phrase(kind, plural(len(samples), "reading")), _span(samples.time)
@@ -101,7 +102,7 @@ def _span(time: Datetimes) -> Span | None:
 
 
 def sensor_options(tables: Mapping[TableKind, Path]) -> list[str]:
-    """Return the options of `railfix run` for tables of sensors by kind; a table whose pair is missing is left out."""
+    """Return the options of `railfix run` for tables of sensors by kind; tables without their partner are omitted."""
     words = []
     for kind, path in tables.items():
         of_run = kind in SENSORS or kind in PAIRS.values()

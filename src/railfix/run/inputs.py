@@ -184,7 +184,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Check the inputs, add the files that settings name, and replace "stream" in the settings; return both."""
+        """Check inputs, add the files that settings name, replace "stream" in settings; return inputs and settings."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)

@@ -137,8 +137,9 @@ _BEIDOU_S: Final = 14
 #: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
-#: Largest error of a height offset that is compared with a cause [m], and smallest height of the geoid compared [m].
+#: Largest difference between a height offset and the offset that a cause would explain [m].
 _CAUSE_M: Final = 15.0
+#: Minimum distance of the geoid from the ellipsoid at which a wrong height datum is considered [m].
 _GEOID_M: Final = 10.0
 
 
@@ -178,7 +179,7 @@ def _shifts_s() -> Iterator[int]:
 def _offset_m(
     observations: Observations, received: Received, config: Config, line: Trajectory
 ) -> tuple[float, float, float, float] | None:
-    """Return the median position's offset from the line in plan and height, the line's height, and the geoid's [m].
+    """Return the median position's offset from the line in plan and height, and the heights of line and geoid [m].
 
     The result is None if no epoch has a position.
     """

@@ -37,7 +37,7 @@ READY: Final = "ready"
 
 @dataclass(frozen=True, kw_only=True)
 class Staging:
-    """Hidden folder inside a results folder, and its lock file, which is open and has the identifier of the process."""
+    """Hidden folder inside a results folder, and its lock file, which stays open and holds the process identifier."""
 
     path: Path
     lock: IO[str]

@@ -160,7 +160,7 @@ def track_key(track: Track) -> str:
 
 
 def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the fields of an object that are not arrays, and the fields that are; both without the provenance."""
+    """Return the fields of an object that are not arrays, and the array fields; both exclude the provenance."""
     values = {item.name: getattr(value, item.name) for item in fields(value) if item.name != "provenance"}
     arrays = {name: array for name, array in values.items() if isinstance(array, np.ndarray)}
     return {name: v for name, v in values.items() if name not in arrays}, arrays

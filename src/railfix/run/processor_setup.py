@@ -1,4 +1,4 @@
-"""Epoch processor of a run with the files named by its settings, and the log of a base station."""
+"""Set up the epoch processor of a run with the files named by its settings, and read the log of a base station."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Limits [m] for which the record has the number of the filter's protection levels within the limit.
+#: Limits [m]; for each, the record has the number of the filter's protection levels that do not exceed the limit.
 WITHIN_M: Final = (20, 50)
 #: Statistics of an antenna without rows in the tables.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
@@ -282,9 +282,9 @@ def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFr
 
 
 Facts = Mapping[str, Any]
-#: Keys of the statistics of the standard deviation in the record, by label in the tables.
+#: Keys of the statistics of the standard deviation in the record, by their labels in the tables.
 _OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
-#: Keys of the statistics of the protection level in the record, by label in the tables.
+#: Keys of the statistics of the protection level in the record, by their labels in the tables.
 _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
@@ -391,7 +391,7 @@ def _ratio(part: float, whole: float) -> float | None:
 
 
 def _metres(what: str, found: Sequence[Facts | None], fields: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a row of lengths [m] for each field of the antennas' figures, with a dash if an antenna has none."""
+    """Yield a row of lengths [m] for each field of the antennas' figures, with a dash for a missing figure."""
     for label, field in fields.items():
         yield [f"{what}, {label}", *(number(None if each is None else each[field], 2, " m") for each in found)]
 

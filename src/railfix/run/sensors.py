@@ -123,7 +123,7 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
 
 
 def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
-    """Return the start and end chainages [m] of each track, by source, name or file, and of the line, by None."""
+    """Return start and end chainage [m] of each track by its source, name or file, and of the whole line under None."""
     spans: dict[str | None, tuple[float, float]] = {None: (0.0, float(track.chainage_m[-1]))}
     for source, (begin, end) in zip(track.sections, section_spans(track), strict=True):
         file, _, name = source.removesuffix(")").partition(" (")

@@ -27,11 +27,11 @@ from railfix.ranges.atmosphere import thin_shell_obliquity
 _SHARE: Final = 0.9
 #: Standard deviation of satellite and atmospheric errors that remain with a base station at most 10 km away [m].
 _BESIDE_BASE_M: Final = 0.05
-#: Distance in plan between the median positions of the thirds of a log up to which an antenna counts as at rest [m].
+#: An antenna counts as at rest if the median positions of the thirds of its log differ by at most this in plan [m].
 _AT_REST_M: Final = 8.0
 #: Change of a double difference between epochs that indicates a cycle slip [wavelengths].
 _SLIP: Final = 0.25
-#: Minimum fraction of the epochs that the longest part of a double difference without a slip must have.
+#: Minimum length of the longest part of a double difference without a slip, as a fraction of the epochs.
 _UNBROKEN: Final = 0.5
 #: Bits of the loss-of-lock indicator (RINEX): a slip since the previous epoch, and half-cycle ambiguity.
 _LOST, _HALF_CYCLE = 1, 2

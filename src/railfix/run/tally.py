@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
-#: Results of the interference checks with which an offset from the map is still attributed to the map.
+#: Results of the interference checks for which an offset of the positions is still attributed to the map.
 _MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
@@ -275,7 +275,7 @@ class Tally:
 
     min_satellites: int = 3  #: Minimum number of satellites per epoch.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    #: The notes are the keys, in the order in which they were added.
+    #: Notes of all chunks as keys, in the order in which they were added.
     notes: dict[str, None] = field(default_factory=dict)
     #: For each chunk, its first epoch, its number of epochs of all antennas, and the elapsed time of positioning [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
@@ -339,7 +339,8 @@ TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
 
 
 def make_tables(result: Result, *, passings: bool) -> dict[str, pl.DataFrame]:
-    """Return the tables of a chunk by name: positions, with the filter also its positions and, if wanted, passings.
+    """Return the tables of a chunk by name: positions, and with the filter, filtered positions and, on request,
+    passings.
 
     The table of passings may have no rows.
     """

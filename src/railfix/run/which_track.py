@@ -67,9 +67,8 @@ def prior_of_last_place(
 ) -> TrackPrior:
     """Return the prior of tracks from the file written by `write_last_place` and the distance moved since then [m].
 
-    `missed_move` is the probability that the train was moved to any track without being noticed; `unmapped` is the
-    prior of an unmapped track in that case. Raise InputFileError if the file has no probabilities of tracks of this
-    network.
+    `missed_move` is the probability that the train was moved to any track unnoticed; `unmapped` is the prior of an
+    unmapped track in that case. Raise InputFileError if the file has no probabilities of tracks of this network.
     """
     record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")

@@ -115,7 +115,8 @@ class Alignment(Knots):
     def point_chainage_m(self) -> Floats:
         """Return the chainages of the points of the track map.
 
-        The points are the ends of the elements, and evenly spaced points between them, or the points of the track file.
+        The points are the ends of the elements and evenly spaced points between the ends. For a line from a track file,
+        they are the points of the file.
         """
         if self.file is not None:
             return self.file.point_m

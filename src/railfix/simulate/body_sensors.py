@@ -34,7 +34,7 @@ _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Return the given and the drawn slips and slides of the run in order of time.
+    """Return the slips and slides of the run in order of time: those given in the settings, and those drawn at random.
 
     A drawn slip or slide that overlaps another is left out.
     """
@@ -115,7 +115,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
     """Return the times at which the wheel has rolled the given distances, with constant acceleration between nodes."""
     step = np.diff(node_s)
     cell = np.clip(np.searchsorted(turned_m, target_m, side="left") - 1, 0, len(step) - 1)
-    # s = v t + a t^2 / 2, with an acceleration that gives the distance of the cell.
+    # s = v t + a t^2 / 2, with the acceleration at which the wheel rolls the distance of the cell.
     start = speed_mps[cell]
     bend = 2.0 * (turned_m[cell + 1] - turned_m[cell] - start * step[cell]) / step[cell] ** 2
     ahead = target_m - turned_m[cell]
@@ -174,7 +174,7 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
     return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
 
 
-_HALF_S: Final = 0.02  #: Upper limit of half the interval of the differences in time [s].
+_HALF_S: Final = 0.02  #: Upper limit of half the time interval over which differences are formed [s].
 _BLOCK: Final = 50_000  #: Number of samples computed in one step.
 #: Lever arm from which the attitude is computed, so long that rounding of positions is negligible [m].
 _LEVER_M: Final = 10.0
@@ -214,7 +214,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
     """
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now
-    # Positions are subtracted before they are summed, which avoids loss of digits.
+    # The differences of positions are formed before the sum, which avoids a loss of digits.
     acceleration = ((after[0] - place) - (place - before[0])) / half_s**2
     velocity = (after[0] - before[0]) / (2.0 * half_s)
     latitude, longitude, height = geodetic_from_ecef(place)

@@ -5,7 +5,7 @@ zenith at the start of the run. All records of a satellite describe the same orb
 Signals are computed from the newest transmitted record, as in a receiver.
 
 `links` computes the states at every instant; `SatelliteTable` computes the states of all satellites at nodes, and
-interpolates them.
+interpolates the states between the nodes.
 """
 
 from __future__ import annotations
@@ -316,7 +316,7 @@ def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> In
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Return the signals that a receiver receives from a satellite `late_s` before T time tags.
+    """Return the geometry of the signals received from a satellite at instants that precede T time tags by `late_s`.
 
     The light-time equation is solved by iteration.
     """
@@ -380,7 +380,7 @@ class SatelliteTable:
         self._powers = np.einsum("kn,pnsc->kpsc", to_powers, values)
 
     def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-        """Return the signals of all satellites at a receiver, as `links` does, shapes (T, S).
+        """Return the geometry of the signals of all satellites at a receiver, as `links` does, shapes (T, S).
 
         Raise ValueError if a tag is outside the span of the table.
         """

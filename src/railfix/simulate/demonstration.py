@@ -58,7 +58,7 @@ def demo_inputs() -> RunInputs:
 
 
 def demo_truth() -> Path:
-    """Return the file with the ground truth of the demonstration run; raise InputFileError if it is missing."""
+    """Return the path of the ground truth of the demonstration run; raise InputFileError if it is missing."""
     return demo_files()["truth"]
 
 

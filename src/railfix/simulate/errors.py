@@ -51,7 +51,7 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return the values of the four nodes around each time, shape (T, C), and the fraction of the cell, (T, 1)."""
+        """Return the values at the four nodes around each time, (T, C), and the elapsed part of its cell, (T, 1)."""
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
@@ -170,7 +170,8 @@ class RandomFunction:
         return self.amplitude * total
 
 
-#: Spacing of the nodes between which the axes of an orbit are interpolated [s]; the axes turn by half a degree.
+#: Spacing of the nodes between which the axes of an orbit are interpolated [s]; in this time, the axes turn by half a
+#: degree.
 _AXES_S: Final = 60.0
 #: Streams of random numbers: clock, three axes, group delay, ionosphere, troposphere.
 _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
@@ -201,7 +202,7 @@ class CommonErrors:
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
     def _of_satellites(self, stream: int, sigma: str, time: str) -> list[tuple[list[int], GaussMarkov]]:
-        """Return the processes of an error per constellation, each with the columns of its satellites.
+        """Return, for each constellation, the process of an error and the columns of the constellation's satellites.
 
         `sigma` and `time` are the names of the settings; constellations with a sigma of 0 are left out.
         """

@@ -1,4 +1,4 @@
-"""Settings of the simulated line, and lines made from a track file, which are smooth curves through its points.
+"""Settings of the simulated line, and smooth curves through the points of a track file.
 
 The curve is a cubic spline in space (not-a-knot), whose arc length is the chainage. Cant is linear between points; the
 outer side follows from the file's radii, or from the curvature of the spline if the file has no radii. A file with a
@@ -125,7 +125,7 @@ class MapError(ScenarioSettings):
 
 
 def _length_m(given: dict[str, Any]) -> float:
-    """Return the default length of a line of the given settings; NaN for a track file."""
+    """Return the default length of a line with the given settings; NaN for a track file."""
     total = math.fsum(item.length_m for item in given.get("elements", ()))
     by_kind = {"pattern": PATTERN_LENGTH_M, "generated": GENERATED_LENGTH_M, "elements": total}
     return by_kind.get(given.get("kind", "file"), math.nan)
@@ -180,9 +180,9 @@ class LineSettings(ScenarioSettings):
 
 #: Distance between the contact points of a wheelset on generated lines [m], for the equilibrium cant.
 _CONTACT_M: Final = 1.137
-#: Change of direction from which the next curve of a generated line turns back [rad].
+#: Change of direction above which the next curve of a generated line turns back [rad].
 _FAR_RAD: Final = np.radians(50.0)
-_HIGH_M: Final = 150.0  #: Height difference from which the next gradient of a generated line leads back [m].
+_HIGH_M: Final = 150.0  #: Height difference above which the next gradient of a generated line leads back [m].
 _CANT_STEP_M: Final = 0.005  #: Step to which cant is rounded [m].
 
 

@@ -1,4 +1,4 @@
-"""Simulated receiver: channels, clocks, time-correlated noise and loss of lock, with the state between chunks."""
+"""Simulated receiver: channels, clocks, time-correlated noise and loss of lock, continued from chunk to chunk."""
 
 from __future__ import annotations
 
@@ -121,7 +121,8 @@ class TrackingNoise:
         weak = cn0_dbhz < threshold
         if again is None:
             return np.asarray(weak)
-        # The later of both events determines the state; without an event, the state before the first epoch remains.
+        # The later of the two events (falling below, rising above) determines the state; without an event, the state
+        # before the first epoch remains.
         epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
         fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
         risen = np.maximum.accumulate(

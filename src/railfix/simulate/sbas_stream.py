@@ -1,4 +1,4 @@
-"""Stream of simulated SBAS messages, one per second, and its file; messages of dual-frequency SBAS on L5."""
+"""Simulated SBAS messages, one per second, and the file with these messages; messages of dual-frequency SBAS on L5."""
 
 from __future__ import annotations
 

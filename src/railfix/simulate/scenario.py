@@ -96,7 +96,7 @@ class VehicleSettings(ScenarioSettings):
     rear: Three = (-9.1, 0.25, 3.95)
     length_m: Positive = 23.2  #: Overall length; the ends are equally far from the middle between the bogies.
     #: Standard deviation of the random roll at 20 m/s and more; below this speed, proportional to the speed. The
-    #: vehicle file does not have it, because it is unknown in practice.
+    #: vehicle file does not contain this value, because it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
     sway_period_s: Positive = 1.5  #: Mean period of the roll.
     #: Standard deviation of the random pitch at 20 m/s and more; below this speed, proportional to the speed.
@@ -154,8 +154,8 @@ class ReceiverSettings(ScenarioSettings):
     phase_sigma_m: NotNegative = 0.002  #: Standard deviation of the carrier-phase noise.
     doppler_sigma_hz: NotNegative = 0.05  #: Standard deviation of the Doppler noise.
     cn0_sigma_dbhz: NotNegative = 0.7  #: Standard deviation of the C/N0 noise.
-    #: Time constant of the low-pass filter of the code's multipath error while locked, as with carrier smoothing; 0 for
-    #: none.
+    #: Time constant of the low-pass filter that smooths the code's multipath error while the signal is locked, like
+    #: carrier smoothing; 0 for no filter.
     code_smoothing_s: NotNegative = 0.0
     cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ  #: C/N0 of an unobstructed signal at the horizon.
     #: Increase of C/N0 from the horizon to the zenith, proportional to the sine of the elevation.

@@ -65,7 +65,7 @@ AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 
 def _gps_time(value: Any) -> np.datetime64:
-    """Return the GPS time of a TOML time, a text or a datetime64.
+    """Return the GPS time of a TOML time, a string or a datetime64.
 
     Raise ValueError for other values.
     """
@@ -301,19 +301,19 @@ class InertialSettings(ScenarioSettings):
 
 
 class Dropout(Interval):
-    """Interval without radar measurements, as with snow on the antenna (P2 3.2)."""
+    """Interval without radar measurements, for example due to snow on the antenna (P2, section 3.2)."""
 
     end_s: Finite
 
 
 class RadarSettings(ScenarioSettings):
-    """Doppler radar directed at the track (P2 3.1)."""
+    """Doppler radar directed at the track (P2, section 3.1)."""
 
     rate_hz: Positive = 10.0
     bias_mps: Finite = 0.0
     scale: Finite = 0.0  #: Scale-factor error, measured / true - 1, as caused by an error of the mounting angle.
     noise_sigma_mps: NotNegative = 0.0  #: Standard deviation of the white noise.
-    #: Standard deviation of the Gauss-Markov part of the scale-factor error, which pitching of the body causes.
+    #: Standard deviation of the Gauss-Markov part of the scale-factor error, caused by pitching of the body.
     sway_ratio_sigma: NotNegative = 0.0
     sway_time_s: Positive = 0.5  #: Correlation time of the Gauss-Markov part.
     lowest_mps: NotNegative = 0.0  #: Lowest speed that is measured.
@@ -335,7 +335,7 @@ class GroundUnit(ScenarioSettings):
 
 
 class RangingSettings(ScenarioSettings):
-    """Two-way ranging to units near the track (P2, table 3: every 200 ms, about 100 m; 3.3: sigma 0.19 to 0.24 m)."""
+    """Two-way ranging to units near the track (P2, table 3: 5 Hz, about 100 m; section 3.3: sigma 0.19 to 0.24 m)."""
 
     units: tuple[GroundUnit, ...] = ()
     interval_s: Positive = 0.2

@@ -335,7 +335,7 @@ def _disturb(
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
-    """Return range errors caused by faults of satellites and a station's receiver [m], and rates [m/s], (T, M)."""
+    """Return range errors due to faults of satellites and a station's receiver [m], and their rates [m/s], (T, M)."""
     names = receiver.names.tolist()
     fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:

@@ -68,7 +68,7 @@ class Orbits(RowArrays):
     crs: Floats
     cic: Floats
     cis: Floats
-    relativity: Floats  #: F e sqrt(A), the factor of sin E [s].
+    relativity: Floats  #: F e sqrt(A), the factor of sin E in the relativistic clock correction [s].
     a_dot: Floats
     delta_n_dot: Floats
 
@@ -119,7 +119,7 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
 
 
 def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Compute sine and cosine after adding a small angle; below 1e-3 rad, they are exact to rounding."""
+    """Compute the sine and cosine after adding a small angle; exact to rounding for an angle below 1e-3 rad."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
     small_cosine = 1.0 - square * (0.5 - square / 24.0)
@@ -234,7 +234,7 @@ class GlonassStates:
     #: States, with the reference time in the middle column, shape (3, records, 2 steps + 1) [m, m/s].
     position: Floats
     velocity: Floats
-    luni_solar: Floats  #: Acceleration by Moon and Sun, shape (3, records) [m/s^2].
+    luni_solar: Floats  #: Acceleration due to Moon and Sun, shape (3, records) [m/s^2].
 
     @classmethod
     def from_records(cls, records: GlonassRecords, reach_s: float) -> GlonassStates:
@@ -253,7 +253,7 @@ class GlonassStates:
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
         """Compute positions and velocities (3, n) of the records `row` at times since their reference times (n,) [s].
 
-        Times are within `reach_s`.
+        The times are between -`reach_s` and `reach_s`.
         """
         middle = self.position.shape[2] // 2
         node = np.trunc(since_toe_s / STEP_S)
@@ -294,9 +294,9 @@ def precise_state(
     """Compute positions and velocities (3, n), and clocks (n,) of satellites at ``time + offset``.
 
     `column` is -1 where the ephemeris lacks a satellite; `offset_s` is a fraction of a second. The result is NaN where
-    a node is missing, and where the time is outside the file or in a gap. The clock includes the relativistic
-    correction -2 r.v / c^2, which SP3 clocks do not contain. Raise ValueError if the ephemeris has fewer than `POINTS`
-    epochs.
+    a position for the interpolation is missing, and where the time is outside the file or in a gap. The clock includes
+    the relativistic correction -2 r.v / c^2, which SP3 clocks do not contain. Raise ValueError if the ephemeris has
+    fewer than `POINTS` epochs.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
@@ -318,11 +318,11 @@ def _state(
     windows, which = np.unique(begin, return_inverse=True)
     index = windows + np.arange(POINTS)[:, None]
     since = seconds(nodes[index] - nodes[windows])
-    # Rotate the nodes into the Earth-fixed frame of the first node, an inertial frame, in which the orbit is smooth.
+    # Rotate the nodes into one inertial frame, the Earth-fixed frame at the first node; there, the orbit is smooth.
     place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
     rotated = np.stack(_rotate_axes(EARTH_ROTATION_RATE * since[..., None], place))
     own = seconds(time - nodes[begin]) + offset_s
-    difference = since[:, None] - since[None]  # difference of each node from the other nodes of its window
+    difference = since[:, None] - since[None]  # time differences between the nodes of each window
     difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
     weight, slope = _lagrange_at_zero(since[:, which] - own, difference.prod(axis=1)[:, which])
     chosen = rotated[:, :, which, column]
@@ -331,7 +331,7 @@ def _state(
     velocity[0] += EARTH_ROTATION_RATE * position[1]
     velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
-    # r.v is the same with the Earth-fixed velocity: the difference of the velocities is perpendicular to r.
+    # r.v is the same for inertial and Earth-fixed velocities, which differ only by a vector perpendicular to r.
     x, y, z = position * velocity
     relativity = -2.0 * (x + y + z) / SPEED_OF_LIGHT**2
     clock = precise_clock_s(ephemeris, column, time, offset_s) + relativity
@@ -357,7 +357,7 @@ def _rotate_axes(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def _lagrange_at_zero(nodes: Floats, node_products: Floats) -> tuple[Floats, Floats]:
-    """Compute the Lagrange weights of value and slope at 0 of the polynomial through nodes, shape (P, n)."""
+    """Compute the Lagrange weights, shape (P, n), for a polynomial's value and slope at 0, given its nodes."""
     points = len(nodes)
     start = (np.ones(nodes.shape[1]), np.zeros(nodes.shape[1]))
     before, after = [start], [start]

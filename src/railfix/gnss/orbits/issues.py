@@ -1,4 +1,4 @@
-"""Select navigation records by satellite and issue of data, as SBAS corrections refer to them."""
+"""Select navigation records by satellite and issue of data, by which SBAS corrections refer to a record."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 class _Issues:
     """Index of records by satellite and issue.
 
-    Each record is used from the time half-way between the previous toe and the toe of the record.
+    Each record is used from the time half-way between the previous record's toe and its own toe.
 
-    With the same toe, F/NAV takes precedence over I/NAV.
+    Of two records with the same toe, F/NAV takes precedence over I/NAV.
     """
 
     def __init__(self, kepler: KeplerRecords) -> None:
@@ -54,10 +54,10 @@ def _index_issues(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Return the row of `navigation.kepler` with the given issue and the nearest toe, shape (T, M); -1 if invalid.
+    """Return the row of `navigation.kepler` with a given issue and the nearest toe, shape (T, M); -1 if it is not
+    valid.
 
-    `time` has the epochs of reception, shape (T,), for which the records are selected; the times of transmission are
-    not computed.
+    The records are selected for the times of reception `time`, shape (T,), not for the times of transmission.
     """
     table = _index_issues(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)

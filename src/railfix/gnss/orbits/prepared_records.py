@@ -24,13 +24,13 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 
-#: Longest time between an epoch and toe [s]. GPS and QZSS records are valid for half the broadcast fit interval, and at
-#: least for this time (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour). Galileo does not broadcast data
-#: older than 4 h (Galileo OS SDD 1.3, 2.4.2). BeiDou (renewed every hour) and GLONASS (renewed every 30 min) do not
-#: broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
+#: Longest permitted time between an epoch and toe [s]. GPS and QZSS records are valid for half the broadcast fit
+#: interval, and at least for this time (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour). Galileo does not
+#: broadcast data older than 4 h (Galileo OS SDD 1.3, 2.4.2). BeiDou (renewed every hour) and GLONASS (renewed every 30
+#: min) do not broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: A transmission time is wrong if it is outside the validity of the record by more than this [s].
+#: A transmission time counts as wrong if it is outside the record's validity by more than this [s].
 _EARLY_S: Final = 3600.0
 #: Time span that a lookup key can hold [ms]: 34 years, so that records of another year are kept apart.
 _SPAN: Final = np.int64(2**40)
@@ -41,13 +41,13 @@ _MILLISECOND: Final = np.timedelta64(1, "ms")
 class Lookup:
     """Records of all satellites in two lists for bisection, sorted by time of availability and by start of use."""
 
-    number: Mapping[str, int]  #: Number in the lists by satellite, or by satellite and message ("E01 INAV").
+    number: Mapping[str, int]  #: Lookup number by satellite, or by satellite and message ("E01 INAV").
     first: Integers  #: First record of each satellite in both lists, shape (satellites,).
     #: Satellite and time of availability [ms since `origin`] as one ascending number, and the row of the record table;
     #: shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: The same for the start of use, half-way between the previous and the record's reference time; shape (n,).
+    #: The same with the start of use, which is half-way between the previous record's and its own reference time; (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -57,10 +57,10 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return records by satellite and time, whether they are valid, and whether they are sent later, shapes (M, T).
+        """Return the record for each satellite and time, whether it is valid, and whether it is future; shapes (M, T).
 
-        The record is a row of the record table, -1 without records. The record is valid if its toe differs from the
-        epoch by at most `limit`, which has one value per row of the table.
+        The record is a row of the record table; -1 for a satellite without records. The record is valid if its toe
+        differs from the epoch by at most `limit`, which has one value per row of the table.
         """
         shape = (len(number), len(time))
         if not len(self.sent_key):
@@ -114,12 +114,12 @@ def make_lookup(label: Strings, toe: Datetimes, transmitted: Datetimes, validity
 
 
 def validity_s(records: KeplerRecords) -> Floats:
-    """Compute the longest time between an epoch and toe for each record, shape (n,) [s]."""
+    """Compute the longest permitted time between an epoch and toe for each record, shape (n,) [s]."""
     base = np.array([VALIDITY_S[s[0]] for s in records.satellite.tolist()], dtype=np.float64)
     return np.fmax(base, records.fit_interval_h * 1800.0)
 
 
-#: Galileo: data validity and signal health by band, E1-B, E5a, E5b (RINEX 3.05, table A8; OS SIS ICD 5.1.9.3).
+#: Galileo: bits of data validity and signal health by band: E1-B, E5a, E5b (RINEX 3.05, A8; OS SIS ICD 5.1.9.3).
 GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
 #: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
 #: from the most significant bit. Satellites with L1C/A have broadcast the value 1 (no L1C/B) since 2022.
@@ -128,7 +128,7 @@ QZSS_HEALTH: Final[Mapping[str, int]] = {
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
 }  # fmt: skip
 #: Largest accuracy of a healthy record [m]. URA indices of 8 and more exceed this accuracy (15 means no prediction;
-#: IS-GPS-200, 20.3.3.3.1.3); such a signal is marginal by the GPS performance standard.
+#: IS-GPS-200, 20.3.3.3.1.3); the GPS performance standard calls such a signal marginal.
 LARGEST_ACCURACY_M: Final = 48.0
 #: Columns of `KeplerRecords.inter_signal_s` by GPS and QZSS signal; the mean is used for combined data and pilot codes.
 _ISC: Final[Mapping[str, list[int]]] = {
@@ -253,19 +253,19 @@ _CACHED_SETS: Final = 64  #: Number of channel sets cached per navigation.
 
 @dataclass(frozen=True)
 class ChannelRecords:
-    """Record rows, group delays and health of a set of channels."""
+    """Rows of the navigation records, group delays and health of a set of channels."""
 
     #: Indices of the channels with Keplerian records, shape (K,), and of the GLONASS channels, shape (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers of the message with the signal's clock and delay, and of another message; -1 for none; shape (K,).
+    #: Lookup numbers of the message with the signal's clock and delay, and of the alternative; -1 if absent; (K,).
     preferred: Integers
     other: Integers
 
     any_other: bool
     signal: Integers  #: Row of each channel in `group_delay_s` and `unhealthy`, shape (K,).
     group_delay_s: Floats  #: Group delay by signal and record, shape (signals, records).
-    unhealthy: Masks  #: Whether a signal is unhealthy by record, shape (signals, records).
+    unhealthy: Masks  #: Whether a record flags a signal as unhealthy, shape (signals, records).
     glonass_number: Integers  #: Lookup number of GLONASS channels, -1 for none; shape (R,).
 
 
@@ -329,7 +329,7 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
     return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
 
 
-#: Message with a signal's group delay, by constellation and signal, if it is not LNAV, D1, D2 or a Galileo message.
+#: Message with the group delay of each constellation's signals whose delay is not in LNAV, D1, D2, I/NAV or F/NAV.
 _MESSAGE_OF: Final = {
     **dict.fromkeys(("G2S", "G2L", "G2X", "G5I", "G5Q", "G5X", "J2S", "J2L", "J2X", "J5I", "J5Q", "J5X"), "CNAV"),
     **dict.fromkeys(("G1S", "G1L", "G1X", "J1S", "J1L", "J1X"), "CNV2"),
@@ -340,7 +340,7 @@ _MESSAGE_OF: Final = {
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return the preferred and the alternative lookup label; F/NAV clocks are of E1/E5a, I/NAV clocks of E1/E5b."""
+    """Return the preferred and the alternative lookup label; F/NAV clocks refer to E1/E5a, I/NAV clocks to E1/E5b."""
     if satellite[0] == "E":
         messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
         return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"

@@ -95,8 +95,7 @@ def satellite_states(
         Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
         Rows of `navigation.kepler` to use, because corrections refer to one issue of data (`issue_records`); -1 for the
-        usual selection. A satellite is also unhealthy where the record of the usual selection flags it. Ignored for
-        GLONASS.
+        usual selection. A satellite is unhealthy also where the usual selection's record flags it. Ignored for GLONASS.
 
     Raises
     ------

@@ -58,8 +58,8 @@ class Unfinished:
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     #: Issue of the last record by satellite and message, which identifies repetitions.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    #: First epoch after the last string (NaT if not yet received) by GLONASS satellite, for satellites with all four
-    #: strings. The strings may be from different frames.
+    #: For each GLONASS satellite with all four strings, the first epoch after the last string; NaT if not yet received.
+    #: The strings may be from different frames.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
@@ -101,7 +101,7 @@ def assemble_records(
 def assemble_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides of RTCM 3 messages without repetitions, and the state after them.
+    """Return the ephemerides of RTCM 3 messages without repetitions, and the decoder's state after the messages.
 
     `messages` is from `rtcm.ephemeris_fields`, and `time` is the time of reception of each message, shape (N,).
     """

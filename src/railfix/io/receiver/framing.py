@@ -57,9 +57,7 @@ class Frames:
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
     def structures(self, protocol: str, kinds: Iterable[int], layout: np.dtype) -> tuple[Indices, np.ndarray]:
-        """Return the indices of frames of the given kinds that are long enough for a layout, and the fields of the
-        layout.
-        """
+        """Return the indices of frames of the given kinds that are long enough for a layout, and the frames' fields."""
         chosen = self.of(protocol, *kinds)
         chosen = chosen[self.end[chosen] - self.start[chosen] >= layout.itemsize]
         return chosen, gather_structures(self.data, self.start[chosen], layout)
@@ -207,7 +205,7 @@ def _sbf(data: Bytes) -> _FrameCandidates:
 
 def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     dollar = np.flatnonzero(data == ord("$"))
-    # An address begins with a letter, and a letter or digit; any other ``$`` is part of a damaged message.
+    # An address begins with a letter, followed by a letter or digit; any other ``$`` is part of a damaged message.
     dollar = dollar[_ADDRESS[0, _at(data, dollar + 1)] & _ADDRESS[1, _at(data, dollar + 2)]]
     star = np.flatnonzero(data == ord("*"))
     after = np.searchsorted(star, dollar)
@@ -313,7 +311,7 @@ def join_subframes(first: Subframes, second: Subframes) -> Subframes:
     return both.take(np.argsort(both.order, kind="stable"))
 
 
-#: Signal numbers for SBAS on L5 and for B-CNAV1 pages in `Subframes`, which UBX does not define.
+#: Signal numbers in `Subframes` that UBX does not define: SBAS on L5, and B-CNAV1 pages.
 SBAS_L5, BCNAV1_PAGE = -5, -6
 
 

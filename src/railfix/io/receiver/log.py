@@ -43,7 +43,7 @@ JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
 #: Lowest u-blox state that sets an alarm (jamming critical, spoofing affirmed). State 2 (warning, indicated) was sent
 #: for 571 of 581 s of a recording without interference.
 _CERTAIN: Final = 3
-_NOT_MITIGATED: Final = 8  #: Septentrio mode of a band with interference that is not cancelled.
+_NOT_MITIGATED: Final = 8  #: Value of Septentrio's mode field for interference that is not mitigated.
 _MON_HW_BYTES: Final = 60
 _BLOCK: Final = 24  #: Bytes of each MON-RF block of u-blox, after a header of four bytes.
 _BANDS, _FRONT_ENDS = 12, 24  #: Offsets of Septentrio's first band block and first front-end block in the payload.
@@ -138,7 +138,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the bits of jamming (not cancelled) and spoofing (misleading, unauthentic); None if malformed."""
+    """Return the bits of jamming (not mitigated) and spoofing (misleading, unauthentic); None if malformed."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -224,7 +224,7 @@ class StreamState:
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
-    """Decode a block of bytes, which may end anywhere in the stream; return a decoded piece and the state after it."""
+    """Decode a block of bytes, which may end anywhere in the stream; return the decoded piece and the new state."""
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:

@@ -301,7 +301,7 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
-    """Return the start of the GLONASS frame that contains a string 1, GPS time; `time` resolves the day."""
+    """Return the start, in GPS time, of the GLONASS frame that contains a string 1; `time` resolves the day."""
     utc = gpst_to_utc(time)
     return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 

@@ -27,7 +27,7 @@ Place = int | tuple[tuple[int, int], ...]
 
 
 def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
-    """Return the layout of a message from codings of fields, and the first bit or the pieces of each field."""
+    """Return the layout of a message, given the coding, and the first bit or the pieces, of each field."""
     return {name: (place, *codings[name]) for name, place in places.items()}
 
 

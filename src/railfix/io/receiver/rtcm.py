@@ -87,7 +87,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Return the channels known before, and then those in messages 1020; MSM4 and MSM6 do not contain channels."""
+    """Return the channels known before, then the channels in messages 1020; MSM4 and MSM6 do not contain channels."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -112,7 +112,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
         return replace(no_measurements("RTCM 3"), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
     rows = join_measurements([rows for _, rows, _ in parts])
-    # Messages of one instant form one epoch; instants stay in the order of the stream.
+    # Messages with the same time form one epoch; epochs stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
     letter = np.concatenate([letters for _, _, letters in parts])[by_stream]
     glonass = letter == "R"
@@ -167,7 +167,7 @@ def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Shift GLONASS times by whole days toward the previous message, because some encoders leave the day 0 (DF416)."""
+    """Shift GLONASS times by whole days toward the previous message, because some encoders send day 0 (DF416)."""
     others = np.flatnonzero(~glonass)
     if not len(others) or not glonass.any():
         return time
@@ -311,7 +311,7 @@ def _decode(
 
 
 def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
-    """Return the epoch times of messages, GPS time."""
+    """Return the epoch times of messages in GPS time."""
     if system == "R":
         day, of_day = read_unsigned(bits, 24, 3), read_unsigned(bits, 27, 27) * 1e-3
         utc_s = day * 86_400.0 + of_day - _MOSCOW_S
@@ -369,7 +369,7 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: Week field by ephemeris message: GPS week in which the field is 0, and number of weeks after which it repeats.
+#: Week field by ephemeris message: GPS week in which the field is 0, and number of weeks after which the field repeats.
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 

@@ -233,7 +233,7 @@ def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
 
 
 def _signal_number(kind: Integers, info: Integers) -> Integers:
-    """Return the signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where these are 31."""
+    """Return the signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where those of Type are 31."""
     low = np.asarray(kind, dtype=np.int64) & 31
     return np.where(low == 31, np.asarray(info, dtype=np.int64) // 8 + 32, low)
 
@@ -305,7 +305,7 @@ def _bcnav1_pages(frames: Frames) -> Subframes:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Return the offsets in the stream of navigation pages with a time, and their times."""
+    """Return the offset in the stream and the time of each navigation page that has a time."""
     chosen, rows = frames.structures("sbf", [*_PAGES, BDS_RAW_B1C], _TIME)
     dated = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)
     times = from_week(rows["week"][dated].astype(np.int64), rows["tow_ms"][dated] * 1e-3)
@@ -318,7 +318,7 @@ def _align_words(bits: Bytes, length: int) -> Words:
 
 
 def _inav_words(words: Words) -> Words:
-    """Return the even and the odd page in four words each, from both pages joined without the even page's tail."""
+    """Split page pairs, joined without the even page's tail, into four words of the even and four of the odd page."""
     bits = unpack_words(words, drop=0, keep=32)
     pages = np.zeros((len(words), 320), dtype=np.uint8)
     pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]

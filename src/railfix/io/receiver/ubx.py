@@ -220,7 +220,7 @@ def find_date(frames: Frames) -> np.datetime64:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Return the offsets in the stream of NAV-PVT messages with a valid date, and their times."""
+    """Return the offset in the stream and the time of each NAV-PVT message with a valid date."""
     days, rows, places = _date(frames)
     return places, nearest_week(rows["tow_ms"] * 1e-3, days)
 

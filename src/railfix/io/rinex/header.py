@@ -116,7 +116,7 @@ def read_version(path: FilePath, line: str) -> float:
 def apply_records(
     path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, log: FaultLog
 ) -> RinexHeader:
-    """Apply header records in the middle of a file (epoch flags 2 to 4); `first_line` is the number of the first."""
+    """Apply header records in the middle of a file (epoch flags 2 to 4), the first at line `first_line`."""
     reader = _HeaderRecords(path, header, log)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
@@ -124,7 +124,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header; records that are not in their columns are split at spaces."""
+    """Applies header records to a copy of a header; records that are not in their columns are split at spaces."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
@@ -319,7 +319,7 @@ def _interval(text: str) -> float:
     return value if value > 0.0 and math.isfinite(value) else math.nan
 
 
-#: Field of `ObservationHeader` and reader of each record with one value.
+#: For each record with one value: the field of `ObservationHeader`, and the function that reads the value.
 _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
     "APPROX POSITION XYZ": ("approximate_ecef_m", _place),
     "ANTENNA: DELTA H/E/N": ("antenna_delta_hen_m", _three),
@@ -332,7 +332,7 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
 }
 
 
-#: Readers of records in `_VALUES` whose fields are separated by spaces instead of columns.
+#: Functions that read records of `_VALUES` if the fields are separated by spaces instead of columns.
 _BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
     "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
     "ANTENNA: DELTA H/E/N": lambda words: _three("".join(f"{word:>14}" for word in words[:3])),

@@ -44,7 +44,7 @@ class NavigationContent:
     seen: set[tuple[object, ...]] = field(default_factory=set)
 
     def add(self, record: RawRecord) -> None:
-        """Add a record, or count a duplicate, which occurs in joined files of several receivers."""
+        """Add a record, or count a duplicate; joined files of several receivers contain duplicates."""
         key = (record.satellite, record.epoch, record.message, *record.numbers)
         if key in self.seen:
             self.skipped["duplicate"] += 1

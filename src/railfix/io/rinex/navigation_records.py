@@ -79,7 +79,7 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
 }
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 _BLANK: Final = float("nan")
-_UNKNOWN: Final = 0.99e9  #: Magnitudes from this to 1.01E9 mean unknown; RINEX writes 0.9999E9.
+_UNKNOWN: Final = 0.99e9  #: Magnitudes from this value to 1.01E9 mean an unknown number; RINEX writes 0.9999E9.
 _TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this from toe are invalid [s].
 
 

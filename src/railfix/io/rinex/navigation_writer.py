@@ -22,7 +22,7 @@ from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_targ
 
 UNKNOWN_S: Final = 0.9999e9  #: Value of an unknown transmission time, and of CNV1 fields that the records lack.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
-#: Messages of Keplerian records by version.
+#: Messages whose Keplerian records can be written, by RINEX version.
 _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
     "3.04": ("LNAV", "INAV", "FNAV", "D1", "D2"),
     "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
@@ -63,7 +63,7 @@ def write_navigation(
     Raises
     ------
     ValueError
-        `packing` is Hatanaka, which exists for observations only; or the version has no form for a record.
+        `packing` is Hatanaka, which exists for observations only; or a record cannot be written in this version.
     OutputError
         The file cannot be written.
     """
@@ -121,7 +121,7 @@ def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04"
 
 
 def check_messages(records: KeplerRecords, version: RinexVersion) -> None:
-    """Raise ValueError if the version has no form for the message of a record."""
+    """Raise ValueError if the message of a record cannot be written in this version."""
     if (other := ~np.isin(records.message, _WRITTEN[version])).any():
         raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
 

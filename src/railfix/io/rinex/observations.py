@@ -39,7 +39,8 @@ BLOCK_BYTES: Final = 4 << 20
 #: Longest accepted line [bytes]. Failing recorders fill lines with zeros, but these lines are shorter.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
-_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems equal GPS time.
+#: Conversions to GPS time; other systems equal it.
+_TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
@@ -125,7 +126,7 @@ class BlockReader:
             first, count = int(table.line[k]) + 1, int(table.count[k])
             after = self._event(lines[first : first + count], after)
             if after.reading != header.reading:
-                taken = first + count  # lines after a change have other types, so decode the lines before it again
+                taken = first + count  # lines after the change have other types; only the lines before it are decoded
                 trial = self._log.fresh()
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
                 break
@@ -223,8 +224,8 @@ def _runs(
 ) -> Iterator[Observations]:
     """Yield runs of epochs of all files in order of time.
 
-    Raise InputFileError if no file has a usable epoch, and MismatchError if no epoch is selected or the files are from
-    different runs.
+    Raise InputFileError if no file has a usable epoch, and MismatchError if no epoch is selected or consecutive files
+    are more than a week apart.
     """
     firsts = [first_time(path) for path in paths] if len(paths) > 1 else []
     if firsts:
@@ -306,7 +307,8 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Yield pieces of `epochs` epochs from runs; the first piece is a fifth as long, so that processing begins early.
+    """Divide runs into pieces of `epochs` epochs. The first piece has a fifth of this length, so that processing begins
+    early.
 
     Each problem is reported in the piece that was being collected when the problem was found.
     """

@@ -214,12 +214,12 @@ def _label(lines: Lines, line: int) -> str:
 
 
 def _is_record(lines: Lines, line: int) -> bool:
-    """Return whether a line is a header record by its label."""
+    """Return whether a line is a header record, recognised by its label."""
     return lines.length[line] > 60 and _label(lines, line) in LABELS
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
-    """Find epochs of RINEX 2 by the decimal point of their seconds, which no observation line has in that column."""
+    """Find the epoch lines of RINEX 2 by the decimal point of the seconds; other lines have no point in this column."""
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]

@@ -3,8 +3,8 @@
 In RINEX 3 and 4, a type contains the signal ("C1C" is the code of "1C"). In RINEX 2, a type contains the band (RINEX
 2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 have the signal of C1 if it is declared, otherwise of P1; L2,
 D2 and S2 have the signal of P2 if it is declared, otherwise of C2. If these codes are not declared, the signals of C1
-and P2 are used. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because RINEX 3.02 has
-B1 as band 1.
+and P2 are used. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because B1 is band 1 in
+RINEX 3.02.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
 
 
 def _right_aligned(text: Bytes) -> Bytes:
-    """Return fields of three characters without blanks at their end, which some programs write after a count."""
+    """Right-align fields of three characters, because some programs write blanks after a count."""
     for _ in range(2):
         text = np.where(text[-1] == _BLANK, np.roll(text, 1, axis=0), text)
     return text
@@ -212,7 +212,7 @@ _CODES_2: Final[dict[str, dict[str, str]]] = {
     "S": {"C1": "1C", "C5": "5X", "CA": "1C"},
     "I": {"C5": "5A", "C9": "9A"},
 }
-#: Codes that a RINEX 2 phase, Doppler or C/N0 may belong to; the first declared one is used.
+#: Codes to which a RINEX 2 phase, Doppler or C/N0 may belong, by band; the first declared code is used.
 _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "C2")}
 
 

@@ -197,7 +197,7 @@ class Electrification:
         return rows
 
 
-#: Ratio of the chip length to a C/A chip, by constellation and band; 1 for all other signals (BPSK(1), BOC(1,1)).
+#: Chip length divided by the length of a C/A chip, by constellation and band; 1 for other signals (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle.
 _NO_FIELD: Final = 0.01  #: Amplitude below which reflections are neglected.

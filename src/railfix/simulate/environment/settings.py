@@ -93,8 +93,8 @@ class RoofSettings(ScenarioSettings):
     inner_m: NotNegative = 1.8  #: Distance of the inner edge from the track axis; 0 for a roof that covers the track.
     outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)  #: Distance of the outer edge.
     height_m: Positive = 6.0  #: Height above the rails.
-    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)  #: Range of the uniform length along the line.
-    gap_m: Between = (10.0, 40.0)  #: Range of the uniform gap to the next roof.
+    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)  #: Range of the uniformly distributed lengths.
+    gap_m: Between = (10.0, 40.0)  #: Range of the uniformly distributed gaps to the next roof.
     loss_db: NotNegative = 25.0  #: Loss of signals through the roof.
 
     @field_validator("outer_m")

@@ -169,7 +169,7 @@ _LEAST_TWICE: Final = 0.05  #: Smallest lateral component of rays for which seco
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return amplitude, extra path [m] and growth [m/m] of reflections by both sides of the line, shapes (N,).
+    """Return amplitude, extra path [m] and growth [m/m] of reflections by one side after the other, shapes (N,).
 
     The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d of the walls of the first row on both sides.
     """
