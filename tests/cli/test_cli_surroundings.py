@@ -112,7 +112,7 @@ def test_a_name_that_is_not_utf_8_is_one_sentence(tmp_path: Path) -> None:
     done = subprocess.run([*PROGRAM, "map", "check", name], capture_output=True, text=True, check=False)
     assert done.returncode == 3
     assert done.stderr.startswith("railfix: error: ")
-    assert "is not UTF-8; rename the file" in done.stderr
+    assert "is not valid UTF-8; rename the file" in done.stderr
     assert done.stderr.count("\n") == 1
 
 

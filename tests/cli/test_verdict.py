@@ -129,7 +129,7 @@ def test_a_sigma_that_is_too_small_is_said(desk: Desk) -> None:
     lines = verdict_of_evaluation(evaluation)
     assert len(lines) == 5
     assert "too small for the errors" in lines[0]
-    assert re.fullmatch(r"and \d+ more with smaller errors, in the tables below", lines[3])
+    assert re.fullmatch(r"and \d+ more with smaller errors: see the tables below", lines[3])
 
 
 # -- for scripts ---------------------------------------------------------------------------------------------

@@ -595,7 +595,7 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
     done = subprocess.run(command, input=line, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0
     assert done.stderr.startswith(
-        ("railfix ground train: no authority was received", "railfix ground train: nothing was reported")
+        ("railfix ground train: no authority was received", "railfix ground train: no position was reported")
     )
 
 

@@ -170,7 +170,7 @@ def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
     times = [tag_ns(epoch) + (3000 * MS if k >= 10 else 0) for k, epoch in enumerate(epochs)]
     played(stepped, [(at, "front", epoch) for at, epoch in zip(times, epochs, strict=True)])
     assert stepped.counts["skipped, behind the receivers"] == 21
-    assert any("the receivers' time is 3.0 s later than before" in text for text in stepped.reports)
+    assert any("the receivers' time tags are 3.0 s older than before" in text for text in stepped.reports)
 
 
 def test_a_session_that_is_behind_says_so_while_data_wait(

@@ -120,7 +120,7 @@ def test_positions_for_a_caster_that_is_not_there_are_one_sentence(tmp_path: Pat
 @pytest.mark.parametrize(
     ("trusted", "scheme", "says"),
     [
-        (False, "ntrips", "its certificate is not accepted .*self.signed.*ntrip_certificates"),
+        (False, "ntrips", "the server's certificate is not accepted .*self.signed.*ntrip_certificates"),
         (True, "ntrip", r"it may expect TLS \(ntrips://\)"),
     ],
 )
@@ -146,6 +146,6 @@ def test_a_caster_without_tls_is_said_to_be_one(certificate: Path) -> None:
 
 def test_a_file_without_certificates_is_named(tmp_path: Path) -> None:
     (tmp_path / "none.pem").write_text("nothing")
-    for path, says in ((tmp_path / "none.pem", "no certificate in PEM"), (tmp_path / "absent.pem", "No such file")):
+    for path, says in ((tmp_path / "none.pem", "no PEM certificate"), (tmp_path / "absent.pem", "No such file")):
         with pytest.raises(SettingsError, match=says):
             received(Caster(wants=0), None, SETTINGS.replaced(ntrip_certificates=path))

@@ -307,14 +307,14 @@ def test_mqtt_broker_that_asks_for_a_password(tmp_path: Path) -> None:
 
 def test_mqtt_without_a_broker() -> None:
     pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed")
-    with pytest.raises(OutputError, match="cannot be connected to"):
+    with pytest.raises(OutputError, match="the connection cannot be opened"):
         asyncio.run(open_sink(f"json@mqtt://127.0.0.1:{free_port()}/x"))
 
 
 def test_a_session_that_does_not_begin_leaves_no_file(tmp_path: Path) -> None:
     words = ["live", "--front", f"tcp://127.0.0.1:{free_port()}", "--track", str(demo_files()["track"])]
     done = RUNNER.invoke(app, [*words, "--send", f"json@{tmp_path / 'messages'}"])
-    assert "cannot be connected to" in " ".join(done.output.split())
+    assert "the connection cannot be opened" in " ".join(done.output.split())
     assert not list(tmp_path.iterdir())
     (kept := tmp_path / "kept").write_text("messages of yesterday")
     for more in ((), ("--metrics", "127.0.0.1:99999")):
@@ -334,7 +334,7 @@ def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:
     words = ["live", "--front", str(demo_files()["front"]), "--track", str(demo_files()["track"])]
     done = RUNNER.invoke(app, [*words, "--send", "etcs@-", "--live", "reference_m=400000"])
     assert done.exit_code == 4
-    assert "give a location nearer to the line" in " ".join(done.output.split())
+    assert "move it nearer" in " ".join(done.output.split())
     with pytest.raises(SettingsError, match="FORM@TARGET"):
         asyncio.run(open_sink(f"packet0@{tmp_path}/x"))
 

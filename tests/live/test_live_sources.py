@@ -270,7 +270,7 @@ def test_waits_double_and_silence_is_a_break() -> None:
     assert isinstance(second, Lost)
     assert "has sent nothing for 0.1 s" in second.reason
     assert [part.wait_s for part in (second, *later) if isinstance(part, Lost)] == [0.02, 0.04, 0.04, 0.04]
-    assert "cannot be connected to" in str(later[-1])
+    assert "the connection cannot be opened" in str(later[-1])
 
 
 def test_a_message_cut_off_by_a_break_does_not_swallow_the_next(log: bytes) -> None:

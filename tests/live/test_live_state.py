@@ -110,7 +110,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     path.write_bytes(kept)
     rows, numbers, told = live(parts["late"], tmp_path, "late", "--state", str(path))
     late, _, _ = live(parts["late"], tmp_path, "late alone")
-    assert "sequence number of the file are used, because its last epoch is 120.1 s before" in told
+    assert "sequence number of the file are used, because the file's last epoch is 120.1 s before" in told
     assert numbers[0] == SPLIT + 1
     assert np.array_equal(rows["chainage_m"].to_numpy(), late["chainage_m"].to_numpy(), equal_nan=True)
     path.write_bytes(kept)
@@ -132,7 +132,7 @@ def test_a_file_that_is_no_state_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     for content in (b"hello", b'{"form": "minutes"}', b"[1]"):
         path.write_bytes(content)
-        with pytest.raises(OutputError, match="is not a state file of railfix live, which would overwrite it"):
+        with pytest.raises(OutputError, match="is not a state file of railfix live, but would be overwritten"):
             load_state(path, {})
         assert path.read_bytes() == content
 

@@ -235,7 +235,7 @@ def test_the_command_writes_a_model_and_says_what_it_lacks(done_run: Path, tmp_p
         app, ["error-model", str(done_run), "--reference", truth, "--out", str(out), "--cn0", "0,60"]
     )
     assert done.exit_code == 0, done.output
-    assert "satellite and atmospheric errors are in the model" in " ".join(done.output.split())
+    assert "satellite and atmospheric errors are part of the model" in " ".join(done.output.split())
     model = read_error_model(out)
     assert model.covers == "satellite_and_atmosphere"
     assert model.bins.shape == (5, 4, 1)

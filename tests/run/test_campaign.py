@@ -200,7 +200,7 @@ def test_a_scheduler_that_is_none_is_one_sentence(folder: Path, tmp_path: Path) 
     words = ["campaign", str(folder / "campaign.toml"), "--out", str(tmp_path / "out"), "--scheduler", "tpc://nowhere"]
     result = RUNNER.invoke(app, words)
     assert result.exit_code == 4, result.output
-    assert "no scheduler answers there" in " ".join(result.output.split())
+    assert "no scheduler answers at this address" in " ".join(result.output.split())
 
 
 CLUSTER = """

@@ -1,6 +1,6 @@
 """Command-line program ``railfix`` and its commands.
 
-The module of a command is imported only when the command is called, so that ``railfix --help`` starts quickly.
+The module of a command is imported only when the command is called, so that ``railfix --help`` appears quickly.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from railfix import __version__
 from railfix.cli.command import LazyCommands, command_group
 from railfix.core.files import source_commit
 
-# OpenBLAS threads occupy their cores while they wait for work. The variable must be set before numpy is imported.
+# Threads of OpenBLAS occupy processor cores even while they wait for work, so that one thread is used. The variable
+# must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 class _Program(LazyCommands):
-    """Top-level command group with the one-line summary and the module of each command."""
+    """Top-level group of commands, with a one-line summary and the module of each command."""
 
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
@@ -100,18 +101,18 @@ def railfix(
     Exit codes:
 
     - 0: done
-    - 1: a defect of railfix itself (a traceback is shown)
-    - 2: the command line was misused (unknown option, missing argument)
+    - 1: an internal error of railfix (a traceback is shown)
+    - 2: the command line is wrong (unknown option, missing argument)
     - 3: an input file is missing, unreadable, or malformed
-    - 4: a setting is misspelt, out of range, or contradicts another
+    - 4: a setting is misspelt, out of range, or contradicts another setting
     - 5: the inputs are readable but do not match each other, for example in day or location
     - 6: the track map was checked and has errors
     - 7: the results contain no position, or the inputs no usable position
     - 8: the output cannot be written
     - 9: two channels of a live session computed different outputs from the same input
 
-    A signal ends the program with exit code 128 plus the number of the signal: 143 for SIGTERM, and 141 for SIGPIPE,
-    when the program that reads the output ends first.
+    After a signal, the exit code is 128 plus the number of the signal: 143 for SIGTERM, or 141 for SIGPIPE if the
+    program that reads the output ends first.
 
     An error is reported in one sentence on standard error, and no results are written. Existing files are replaced only
     with `--overwrite`; an input is never replaced.

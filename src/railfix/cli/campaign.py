@@ -41,7 +41,9 @@ from railfix.run.inputs import ColumnNames, LogReading
 
 @from_models
 def campaign(
-    path: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="Patterns of the input files (see above).")],
+    path: Annotated[
+        Path, typer.Argument(metavar="CAMPAIGN.toml", help="File with the patterns of the input files (see above).")
+    ],
     reading: LogReading,
     *,
     out: OutOption,
@@ -58,8 +60,9 @@ def campaign(
 ) -> None:
     r"""Position all logs of a campaign, each run into its own folder; an interrupted campaign is continued.
 
-    CAMPAIGN.toml has path patterns with fields in braces, relative to its own folder. Logs with equal field values form
-    one run. Navigation files are assigned to runs by the fields that their pattern shares with the logs' patterns:
+    CAMPAIGN.toml has patterns of paths, relative to the folder of this file, with fields in braces. Logs with the same
+    values of all fields form one run. A navigation file is assigned to the runs that have the same values in the fields
+    of its pattern:
 
         front = "logs/{train}/{day}/front.obs*"
         rear = "logs/{train}/{day}/rear.obs*"
@@ -78,10 +81,10 @@ def campaign(
         [options.logs]
         broken_lines = "count"
 
-    The files of `railfix run` are written into a folder per run, such as `DIR/runs/train=A/day=2024-03-05/`; together
-    these folders are one hive-partitioned data set. `campaign.csv` has one row per run; a run that fails has its error
-    there. The page `campaign.html` shows the lines, the errors (with `reference`) and levels of each run, and the ten
-    worst epochs with their explanations. A run is not repeated if its results for the same inputs and settings exist.
+    Each run has a folder with the files of `railfix run`, such as `DIR/runs/train=A/day=2024-03-05/`; together, these
+    folders are one hive-partitioned data set. `campaign.csv` has one row per run, with the error message of a run that
+    fails. The page `campaign.html` shows the lines, the protection levels and (with `reference`) the errors of each
+    run, and explains the ten worst epochs. A run is not repeated if results for the same inputs and settings exist.
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
@@ -104,28 +107,28 @@ def campaign(
         show_notes(console, report.notes)
         show_files(console, files)
     if len(failed) == len(table):
-        raise NoPositionError(f"every run has failed; the first: {failed['error'][0]}")
+        raise NoPositionError(f"every run has failed; the first error: {failed['error'][0]}")
     if len(failed):
-        raise MismatchError(f"{len(failed)} of {len(table)} runs failed; the first: {failed['error'][0]}")
+        raise MismatchError(f"{len(failed)} of {len(table)} runs failed; the first error: {failed['error'][0]}")
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print the number of finished runs, `kept` of them by earlier calls, and the time left, on standard error."""
+    """Print the number of finished runs and the remaining time on standard error; `kept` runs were finished earlier."""
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} of earlier calls)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
     sys.stderr.flush()
 
 
-#: Signals that end a worker process: SIGINT (Ctrl-C), and SIGTERM, which the pool sends when another worker has ended.
+#: Signals that end a worker process: SIGINT (Ctrl-C), and SIGTERM, which the pool sends after another worker has ended.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 def _prepare_worker() -> None:
     """Install the signal handlers of a worker process, then unblock its signals.
 
-    A signal that is already pending ends the process at once. The handlers are required because polars replaces the
-    default handlers when it is imported and ignores Ctrl-C.
+    A signal that is already pending ends the process at once. The handlers are required because polars, when it is
+    imported, replaces the default handlers, so that Ctrl-C would be ignored.
     """
     for each in _ENDING:
         signal.signal(each, _end)
@@ -135,7 +138,7 @@ def _prepare_worker() -> None:
 
 
 def _end(number_of_signal: int, _frame: object) -> None:
-    """Ignore further signals that would interrupt the end of the process, and raise SystemExit."""
+    """Ignore further signals, which would interrupt the end of the process, and raise SystemExit."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number_of_signal)
@@ -143,9 +146,9 @@ def _end(number_of_signal: int, _frame: object) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Yield the executor, and the exception types that report a lost worker process.
+    """Yield an executor, and the types of the exceptions by which it reports a lost worker process.
 
-    Raise SettingsError if no scheduler answers at its address, or `distributed` is not installed.
+    Raise SettingsError if no scheduler answers at the given address, or if `distributed` is not installed.
     """
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
@@ -164,7 +167,7 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
     try:
         client = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
-        raise SettingsError(f"--scheduler {scheduler}: no scheduler answers there ({error})") from None
+        raise SettingsError(f"--scheduler {scheduler}: no scheduler answers at this address ({error})") from None
     with client:
         executor: Executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
         yield executor, (BrokenExecutor, KilledWorker)
@@ -173,15 +176,18 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
 @from_models
 def benchmark(
     *,
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of cases, each a folder with `case.toml`.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder with one subfolder per case, which has a `case.toml`.")
+    ],
     choices: Choices,
     out: OutOption,
     workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Number of parallel processes.")] = 2,
 ) -> None:
     r"""Run the cases of a folder with one configuration, and compare them with other programs.
 
-    `case.toml` names the files of a case, relative to its folder, and their SHA-256; a file with a different SHA-256 is
-    rejected. The keys of `files` are the options of `railfix run`, and `truth` for the ground truth:
+    `case.toml` names the files of a case, relative to the folder of the case, with their SHA-256. A file with a
+    different SHA-256 is rejected. The keys of `files` are the options of `railfix run`, and `truth` for the ground
+    truth:
 
         licence = "CC BY 4.0"
         fetch = "https://example.org/town.zip"
@@ -199,14 +205,14 @@ def benchmark(
         [sha256]
         "rover.rnx" = "2c26b46b..."
 
-    `positions` are logs of positions that other programs computed (RTKLIB, NMEA, CSV). The positions are moved to the
-    nearest point of the line and evaluated with the same code, as are RTKLIB's single-point positions where `rnx2rtkp`
-    is installed. `scenario` describes the recording as EN 16803-2 requires for record and replay; `options` and
-    `evaluation` are options of `railfix run` and `railfix evaluate`. A case with `held_out` is reserved for the
-    benchmark: settings derived from its files are rejected.
+    `positions` are logs of positions that other programs have computed (RTKLIB, NMEA, CSV). These positions are moved
+    to the nearest point of the line and evaluated with the same code. If `rnx2rtkp` is installed, the single-point
+    positions of RTKLIB are computed and evaluated in this way, too. `scenario` describes the recording as EN 16803-2
+    requires for record and replay. `options` has options of `railfix run`, and `evaluation` options of `railfix
+    evaluate`. A case with `held_out` is reserved for the benchmark: settings derived from its files are rejected.
 
     `benchmark.csv`, `benchmark.json`, `benchmark.md` and the folders of the runs are written into DIR. A run is not
-    repeated if its results for the same inputs and settings exist.
+    repeated if results for the same inputs and settings exist.
 
     Example: `railfix benchmark cases --out benchmark`
 
@@ -226,15 +232,15 @@ def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> 
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
     console = TableConsole()
     head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
-    caption = "Errors in metres, along the line and straight (3-D); below each, the performance feature of EN 16803-1"
+    caption = "Errors in metres, along the line and in 3-D; below each error, the performance feature of EN 16803-1"
     show_table(console, plain_table(head, shown_rows(table), caption, texts=2))
     show_notes(console, notes)
     show_files(console, [out / f"benchmark.{kind}" for kind in ("csv", "json", "md")])
     failed = table["error"].drop_nulls()
     if len(failed) == len(table):
-        raise NoPositionError(f"every case has failed; the first: {failed[0]}")
+        raise NoPositionError(f"every case has failed; the first error: {failed[0]}")
     if len(failed):
-        raise MismatchError(f"{len(failed)} cases failed; the first: {failed[0]}")
+        raise MismatchError(f"{len(failed)} cases failed; the first error: {failed[0]}")
 
 
 @from_models
@@ -248,18 +254,20 @@ def ablate(
 ) -> None:
     r"""Compare the screens on a log: all screens, none, each screen alone, and all but one.
 
-    The logs are read once. Screens that are off in the settings stay off, and screens that cannot be run (no second
-    antenna, no C/N0 curve) are left out and reported. Satellite validity and health are checked in every case; `none`
-    applies these checks only, without an elevation mask.
+    The logs are read once. Screens that are off in the settings stay off. Screens that cannot be run (no second
+    antenna, no C/N0 curve) are left out and reported. The validity and health of satellites are checked in every case;
+    `none` applies only these checks, and no elevation mask.
 
-    With `--filter track` the table also has rows of the filter along the track, with all screens on: a row with every
-    available source (codes, phases, Dopplers, and the sensors given), and a row without each source except codes.
+    With `--filter track`, the table also has rows of the filter along the track with all screens: one row with all
+    available sources (codes, phases, Dopplers, and the given sensors), and, for each source except codes, one row
+    without this source.
 
-    For each choice the table shows the fractions of epochs with coordinates and of epochs of status ok, the number of
-    satellites used, and the median standard deviation along the line. With `--truth` the table also shows the errors
-    along the line (an error over 50 m is a wrong position) of all epochs with coordinates, of ok epochs, and of epochs
-    without satellites, and the 95th percentile of the ratio of error to stated sigma. `ablation.csv` in DIR has all
-    figures, including the figures of the conventional position; `ablation.json` has the versions, inputs and settings.
+    For each selection of screens, the table shows the fractions of epochs with coordinates and of epochs with status
+    ok, the number of satellites used, and the median standard deviation along the line. With `--truth`, the table also
+    shows errors along the line for three groups: all epochs with coordinates, epochs with status ok, and epochs without
+    satellites. An error over 50 m counts as a wrong position. A further column is the 95th percentile of the ratio of
+    error to stated sigma. `ablation.csv` in DIR has all figures, and those of the conventional position;
+    `ablation.json` has the versions, inputs and settings.
 
     Example:
 
@@ -279,7 +287,7 @@ def ablate(
 
 
 def show_ablation(ablation: Ablation) -> None:
-    """Print one table per antenna, the notes, and the location of the results."""
+    """Print one table per antenna, the notes, and the path of the results."""
     console = TableConsole()
     for antenna in dict.fromkeys(effect.antenna for effect in ablation.effects):
         _show(console, [effect for effect in ablation.effects if effect.antenna == antenna])

@@ -1,4 +1,4 @@
-"""Base classes of the commands, which are loaded on demand and report an error in one sentence with an exit code."""
+"""Base classes of the commands, which are loaded on demand, and end with a one-sentence message and an exit code."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from railfix.core.extras import needs_extra
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: Offset of the exit code of a program that a signal ended; the signal's number is added, as in POSIX shells.
+#: Exit code of a program that was ended by a signal, minus the number of the signal, as in POSIX shells.
 SIGNALLED: Final = 128
 #: Message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
-#: Error numbers of a write to a standard output that accepts no more data.
+#: Error numbers with which a write fails when the standard output accepts no more data.
 _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 
 class Command(TyperCommand):
-    """Command that rejects repeated options and switches with a value, and reports all missing options together."""
+    """Command that rejects repeated options, and values after switches, and reports all missing options together."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -43,7 +43,7 @@ class Command(TyperCommand):
             _simplify_help(param)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; repeated options, switches with a value and missing options are usage errors."""
+        """Parse the arguments; a repeated option, a value after a switch, or a missing option is a usage error."""
         options = {name: param for param in self.params for name in getattr(param, "opts", ())}
         given: Counter[str] = Counter()
         words = iter(args[: args.index("--")] if "--" in args else args)
@@ -76,7 +76,7 @@ class Command(TyperCommand):
     def _check_switch(ctx: Any, name: str, args: list[str]) -> None:
         for before, after in pairwise(args):
             if before == name and after.lower() in _YES_NO:
-                ctx.fail(f"{name} is a switch and has no value; leave {after} out")
+                ctx.fail(f"{name} is a switch and takes no value; remove {after} after it")
 
 
 #: Longest line of choices in the column of types of a help page; typer cuts words in a longer one at 80 columns.
@@ -109,24 +109,28 @@ def _wrap_choices(show: Callable[..., str | None], **context: Any) -> str | None
 
 
 class Commands(TyperGroup):
-    """Group of commands that report an error in one sentence and end with the exit code of the error's class."""
+    """Group of commands that report an error in one sentence, and end with the exit code of the error class."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; a RailfixError is reported in one sentence, and other errors with their traceback."""
+        """Run the command; report a RailfixError in one sentence, and any other error with a traceback."""
         try:
             _check_surroundings()
             with needs_extra(), warnings.catch_warnings():
-                warnings.simplefilter("ignore", RailfixWarning)  # commands print them as notes
+                warnings.simplefilter("ignore", RailfixWarning)  # commands print these warnings as notes
                 return super().invoke(ctx)
         except RailfixError as error:
             _end(error)
         except MemoryError:
-            _end(SettingsError("the command needs more memory than there is; give a shorter time or smaller chunks"))
+            _end(
+                SettingsError(
+                    "the command needs more memory than is available; choose a shorter period or smaller chunks"
+                )
+            )
         except RuntimeError as error:
             loop = _LOOP.match(str(error))
             if loop is None:
                 raise
-            _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; link to the file"))
+            _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; make it a link to a file"))
 
 
 #: Options of every typer program; rich formats the help but not the tracebacks.
@@ -141,10 +145,10 @@ def command_group(name: str, *, cls: type[Commands] = Commands, **options: Any) 
 
 
 class LazyCommands(Commands):
-    """Group that imports the module of a command only when the command is called; the help shows `summaries`."""
+    """Group that imports the module of a command only when it is called; the group's help is made from `summaries`."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Name of the module of each command whose module is not named after the command.
+    #: Names of modules, by command, for commands whose module has another name than the command.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -152,13 +156,15 @@ class LazyCommands(Commands):
         return [*super().list_commands(ctx), *self.summaries]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; for a command in `summaries`, a placeholder with its name and summary, used by the help."""
+        """Return a command; for names in `summaries`, a placeholder with name and summary for use in the help."""
         if cmd_name in self.summaries:
             return Command(cmd_name, help=self.summaries[cmd_name])
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name, the imported command and its arguments; the error for an unknown name suggests a command."""
+        """Return the name, the imported command and its arguments; for an unknown name, the error suggests a similar
+        one.
+        """
         known = self.list_commands(ctx)
         word = args[0] if args else ""
         near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
@@ -169,7 +175,7 @@ class LazyCommands(Commands):
 
 
 def load_command(name: str, module_name: str | None = None) -> Any:
-    """Import and return a command from a module of `railfix.cli`, by default the module named after the command."""
+    """Import a command from a module of `railfix.cli`, by default the module with the command's name, and return it."""
     word = name.replace("-", "_")
     module = import_module(f"railfix.cli.{module_name or word}")
     app = getattr(module, "app", None)
@@ -182,7 +188,7 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program and exit with its code; a standard output closed by its reader is not reported as an error."""
+    """Run the program and exit with its code; no error is reported if the reader of standard output has closed it."""
     if number := getattr(signal, "SIGPIPE", None):
         signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -203,7 +209,10 @@ def run_program(app: typer.Typer) -> NoReturn:
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:
-    """Exit if the reader of standard output has closed it; otherwise return, and the write to the other pipe fails."""
+    """Exit if the reader of standard output has closed it.
+
+    Otherwise another pipe is broken; then the function returns, so that the write to that pipe fails.
+    """
     poll = select.poll()
     poll.register(1, 0)
     if any(event & select.POLLERR for _, event in poll.poll(0)):
@@ -228,7 +237,7 @@ def _check_surroundings() -> None:
             word.encode("utf-8")
         except UnicodeEncodeError:
             shown = word.encode("utf-8", "backslashreplace").decode()
-            raise InputFileError(shown, "the name is not UTF-8; rename the file, or make a link to it") from None
+            raise InputFileError(shown, "the name is not valid UTF-8; rename the file, or use a link to it") from None
 
 
 def _discard_output() -> None:

@@ -1,4 +1,4 @@
-"""Output of the commands: progress bars, tables, verdicts, notes, and names of written files."""
+"""Output of the commands: progress bars, tables, verdicts, notes, and paths of written files."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ _MOST: Final = 5
 #: Maximum number of lines that a run prints without ``--verbose``.
 _MOST_LINES: Final = 12
 _ANTENNAS: Final = ("front", "rear")
-#: Limit on the 95th percentile of |error| / stated sigma, which is 2.0 for normal errors; above this limit the stated
-#: standard deviation is reported as too small.
+#: Limit on the 95th percentile of |error| / stated sigma, above which the stated sigma is reported as too small. For
+#: normally distributed errors the percentile is 2.0.
 _OVERCONFIDENT: Final = 3.0
 
 
@@ -48,7 +48,7 @@ def print_json(values: Mapping[str, Any]) -> None:
 
 
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """Return the error statistics of the positions on the map per run and antenna, over all epochs of the run.
+    """Return the error statistics of the positions on the map, one row per run and antenna, over all epochs of the run.
 
     Rows without errors come first, then the rows in descending order of the 95th percentile.
     """
@@ -60,26 +60,26 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Return at most `_MOST` lines: the accuracy per run and antenna, largest errors first, and the next command.
+    """Return at most `_MOST` lines: accuracy per run and antenna, largest errors first, and the command to use next.
 
-    A line on accuracy also states whether the stated sigma fits the errors.
+    Each line on accuracy also reports whether the stated sigma fits the errors.
     """
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
-        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} more with smaller errors, in the tables below"]
+        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} more with smaller errors: see the tables below"]
     paths, references = ({str(getattr(run, what)) for run in evaluation.runs} for what in ("path", "reference"))
     if len(paths) == len(references) == 1:
         run, reference = shlex.quote(paths.pop()), shlex.quote(references.pop())
         return [*texts, f"next: railfix report {run} --reference {reference} --out report.html"]
-    return [*texts, "next: railfix report compares the runs in one page, with the same references"]
+    return [*texts, "next: compare the runs on one page with railfix report and the same references"]
 
 
 def describe_errors(evaluation: Evaluation) -> str:
     """Return one sentence on the errors of a run's positions against its ground truth.
 
-    The sentence has the errors of the filter's positions, or of the single-epoch positions if the run has no filter;
-    the number of errors above the protection level; and the errors of the conventional positions.
+    The sentence has the errors of the filter's positions, or of the single-epoch positions if the run has no filter. It
+    also has the number of errors above the protection level, and the errors of the conventional positions.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("run") != "all", pl.col("antenna") == "all"
@@ -102,7 +102,7 @@ def describe_errors(evaluation: Evaluation) -> str:
 
 
 def _judge(row: Mapping[str, Any]) -> str:
-    """Return a sentence on the errors in a row of `list_antenna_errors`, which is of one run and antenna."""
+    """Return a sentence on one row of `list_antenna_errors`, that is, on the errors of one run and antenna."""
     from railfix.evaluate.accuracy import WRONG_PLACE_M
 
     run, train, _ = str(row["run"]).partition(" (train)")
@@ -124,21 +124,21 @@ def _judge(row: Mapping[str, Any]) -> str:
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels if this machine has no compiled code of them yet."""
+    """Compile the kernels unless this machine already has their compiled code."""
     if not kernels.is_compiled():
         import_module("railfix.live.warm_up").prepare_kernels()
 
 
-#: Width of tables in characters if the output is not a terminal, wide enough that no cell is cut or folded.
+#: Width of tables in characters if the output is not a terminal; no cell is cut or folded at this width.
 _FILE_WIDTH: Final = 500
-#: Number of map findings printed; further findings are only counted.
+#: Largest number of map findings that are printed; further findings are only counted.
 MOST_FINDINGS: Final = 40
 #: Replacements for characters that some terminals cannot show.
 _PLAIN: Final = str.maketrans("−–", "--")
 
 
 class TableConsole(Console):
-    """Console for standard output that prints text unchanged, and a table wider than the console in parts.
+    """Console for standard output that prints text unchanged, and splits a table that is wider than the console.
 
     Numbers are never cut or folded.
     """
@@ -149,7 +149,7 @@ class TableConsole(Console):
             self.width = max(self.width, _FILE_WIDTH)
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print objects as `rich.console.Console.print` does, but split wide tables into parts that fit."""
+        """Print objects as `rich.console.Console.print` does, but split wide tables into parts that fit the console."""
         for item in objects or ("",):
             if isinstance(item, RichTable):
                 for part in split_table(item, self):
@@ -159,10 +159,10 @@ class TableConsole(Console):
 
 
 def split_table(table: RichTable, console: Console) -> list[RichTable]:
-    """Split a table by its columns into tables that fit the console; each part repeats the leading text columns.
+    """Split a table by columns into parts that fit the console; each part repeats the leading columns of text.
 
-    Text cells may be folded, but numbers are not, so a part with a single column of numbers may be wider than the
-    console.
+    Cells with text may be folded, but numbers are not. A part with only one column of numbers may therefore be wider
+    than the console.
     """
     options = console.options.update(width=_FILE_WIDTH)
     if console.measure(table, options=options).maximum <= console.width:
@@ -192,7 +192,7 @@ def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable
 
 
 def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
-    """Print the caption and the first `most` rows of a table, by default all, and the number of omitted rows."""
+    """Print the caption, the first `most` rows of a table (by default all), and the number of omitted rows."""
     if table.caption:
         console.print(table.caption)
     if not table.rows:
@@ -217,20 +217,22 @@ def show_verdict(console: Console, lines: Iterable[str]) -> None:
 
 
 def show_notes(console: Console, notes: Iterable[str]) -> None:
-    """Print each note in a line that begins with "note: "."""
+    """Print each note on a line that begins with "note: "."""
     for note in notes:
         console.print(f"note: {note}")
 
 
 def show_files(console: Console, paths: Iterable[Path]) -> None:
-    """Print the path of each written file in a line."""
+    """Print the path of each written file on a separate line."""
     for path in paths:
         console.print(f"wrote {path}")
 
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """Yield the function that updates a progress bar on standard error, which is shown only on a terminal.
+    """Yield the function that updates a progress bar on standard error.
+
+    The bar is shown only if standard error is a terminal.
 
     The bar shows the number of epochs, the rate in epochs/s and the remaining time.
     """
@@ -247,7 +249,8 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
     def show(*, epochs: int, fraction: float) -> None:
-        bar.start()  # not earlier: the bar starts a thread, and a run must fork before it has threads
+        # not earlier, because the bar starts a thread, and a run must fork its processes before it has threads
+        bar.start()
         elapsed = bar.tasks[task].elapsed or 0.0
         bar.update(task, completed=fraction, epochs=epochs, rate=epochs / elapsed if elapsed > 0 else 0.0)
 
@@ -258,9 +261,10 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
 
 
 def show_summary(summary: RunSummary, *, verbose: bool) -> None:
-    """Print the verdict on a run, its notes, the location of the results and the next command.
+    """Print the verdict on a run, the notes, the path of the results and the command to use next.
 
-    At most `_MOST_LINES` lines are printed; with `verbose` all notes, and the tables of statuses and reasons.
+    At most `_MOST_LINES` lines are printed. With `verbose`, all notes and the tables of statuses and reasons are
+    printed.
     """
     console = TableConsole()
     lines = summary.verdict.lines()
@@ -287,13 +291,13 @@ def show_summary(summary: RunSummary, *, verbose: bool) -> None:
 
 
 def show_budget(console: Console, summary: RunSummary) -> None:
-    """Print the tables of the number of epochs by status and of the number of pseudoranges by rejection reason."""
+    """Print two tables: the number of epochs by status, and the number of pseudoranges by reason of rejection."""
     for table in budget_tables(summary.record["antennas"], level_basis(summary.record)):
         show_table(console, table)
 
 
 def join_antennas(notes: Iterable[str]) -> list[str]:
-    """Return the notes in order; equal notes "front: TEXT" and "rear: TEXT" become "front and rear: TEXT"."""
+    """Return the notes in order, with "front: TEXT" and "rear: TEXT" joined to "front and rear: TEXT"."""
     texts: dict[str, list[str]] = {}
     for note in notes:
         antenna, colon, text = note.partition(": ")

@@ -39,22 +39,21 @@ def demo(
     overwrite: OverwriteOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Position the log that comes with railfix, and compare it with its ground truth.
+    """Position the log that comes with railfix, and compare the positions with the ground truth.
 
-    The log is a simulated run of a train with two antennas on a line with curves and cant; the README in the folder
-    of the log describes the run. The log is positioned as by `railfix run`. The report compares the positions on the
-    map and the conventional positions (3-D single point of unscreened ranges, moved to the nearest point of the
-    line) with the ground truth, as `railfix report` does.
+    The log is a simulated run of a train with two antennas on a line with curves and cant; the README in the folder of
+    the log describes the run. The log is positioned as by `railfix run`. As with `railfix report`, a page compares the
+    positions on the map with the ground truth. The conventional positions (3-D single points from unscreened ranges,
+    moved to the nearest point of the line) are also compared.
 
-    DIR receives `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet` and
-    `run.json` of the run, the folder `unscreened` with the run for the conventional positions, and the page
-    `report.html`, to open in a browser.
+    The run's `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet` and `run.json`
+    are written into DIR. Further outputs are the folder `unscreened`, with the run for the conventional positions, and
+    the page `report.html`, to open in a browser.
 
-    With `--real` the log is a car's drive of 20 minutes through a town, from the wheel `gnss-benchmark` (MIT) of the
-    package index. pip downloads the wheel, which is kept unpacked in the user's cache. The map is made from the
-    drive's ground truth, which RTKLIB computes where it is installed. `railfix benchmark` evaluates the positions of
-    railfix and of RTKLIB against the ground truth; the case is written into `DIR/drive`, the results into
-    `DIR/benchmark`.
+    With `--real`, the log is a car's drive of 20 minutes through a town, from the wheel `gnss-benchmark` (MIT) of the
+    package index. pip downloads the wheel, which is kept unpacked in the user's cache. The map is made from the drive's
+    ground truth, which is computed by RTKLIB if it is installed. `railfix benchmark` evaluates the positions of railfix
+    and of RTKLIB against the ground truth. The case is written into `DIR/drive`, and the results into `DIR/benchmark`.
 
     Example: `railfix demo --out first-look`
 
@@ -73,7 +72,7 @@ def demo(
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
         summary = run_files(inputs, Config(), out=out, options=options, progress=progress)
-    # P1 computes conventional positions from ranges that are not screened
+    # as in P1, conventional positions are computed from ranges that are not screened
     unscreened = Config(filter="off", screens=("elevation",), protection="off")
     run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
     runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])

@@ -51,13 +51,13 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Maximum numbers of printed rows by section, and of printed epochs with an error above the protection level.
+#: Maximum number of rows printed of the table by section.
 _MOST_SECTIONS: Final = 20
-_MOST_BEYOND: Final = 5
+_MOST_BEYOND: Final = 5  #: Maximum number of printed epochs with an error above the protection level.
 
 
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
-    """Print the verdict, the references of each run, the tables of errors and levels, and the files written."""
+    """Print the verdict, the references of each run, the tables of errors and levels, and the written files."""
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
     for run in evaluation.runs:
@@ -86,27 +86,30 @@ def evaluate(
     inputs: EvaluationInputs,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for the files; without it only tables are printed."),
+        typer.Option(
+            "--out", metavar="DIR", help="Folder for the output files; without this option, tables are only printed."
+        ),
     ] = None,
     files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     options: EvaluationOptions,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    r"""Compute the errors of runs along the line against references, and their statistics.
+    r"""Compute the along-track errors of runs against references, and statistics of these errors.
 
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
-    either direction of travel. The tables describe the positions on the map, the positions with status ok, and the
-    conventional positions (3-D single point, moved to the nearest point of the line), over the epochs of each kind of
-    position and over the common epochs. Errors are grouped by antenna, section, environment, speed, number of
-    satellites used, presence of satellites, and status; with several runs also by configuration and line.
+    either direction of travel. The tables have three kinds of positions: the positions on the map, the positions with
+    status ok, and the conventional positions (3-D single point, moved to the nearest point of the line). The statistics
+    are given over the epochs of each kind, and over the epochs that all kinds have. Errors are grouped by antenna,
+    section, environment, speed, number of satellites used, presence of satellites, and status. With several runs, they
+    are also grouped by configuration and line.
 
     `evaluation.json` in DIR has all figures, the options and the hashes of the inputs; `errors.parquet` has one row per
-    epoch and antenna. Further files are `tables.csv` and `intervals.csv`. A run with protection levels also has
-    `levels.csv`, `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and `beyond_KIND.csv` (every
-    epoch whose error exceeds its level), with KIND `sbas`, `separation` or `train`. The filter along the track has
-    `outages.csv` (stretches without satellites) and `branches.csv` (stated probability of a branch, and how often it
-    was correct).
+    epoch and antenna. Further files are `tables.csv` and `intervals.csv`. For a run with protection levels,
+    `levels.csv`, `stanford_KIND.csv` (protection levels against errors, counted at each alarm limit) and
+    `beyond_KIND.csv` (every epoch with an error above the protection level) are also written; KIND is `sbas`,
+    `separation` or `train`. For the filter along the track, `outages.csv` has the stretches without satellites, and
+    `branches.csv` compares the stated probabilities of branches with how often the branches were correct.
 
     Example:
 
@@ -117,7 +120,7 @@ def evaluate(
     Exit codes are listed in `railfix --help`.
     """
     if unknown := [name for name in inputs.table if name not in TABLES]:
-        raise SettingsError(f"--table {unknown[0]}: no such table; known are {', '.join(TABLES)}")
+        raise SettingsError(f"--table {unknown[0]}: no such table; the tables are {', '.join(TABLES)}")
     pairs = [
         replace(pair, table=name, conventional=inputs.conventional)
         for pair in _pair(runs, inputs.reference, inputs.label)
@@ -140,17 +143,17 @@ def evaluate(
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
-    """Return each run with its reference, or None for `auto`, and its label.
+    """Return for each run the reference, None if it is `auto`, and the label.
 
     Raise SettingsError if the number of references or labels does not match the number of runs.
     """
     references = reference * len(runs) if len(reference) == 1 else reference
     if len(references) != len(runs):
         raise SettingsError(
-            f"{len(references)} references for {len(runs)} runs; give one for all runs, or one for each in order"
+            f"{len(references)} references for {len(runs)} runs; give one for all runs, or one for each run in order"
         )
     if label and len(label) != len(runs):
-        raise SettingsError(f"{len(label)} labels for {len(runs)} runs; give one for each in order")
+        raise SettingsError(f"{len(label)} labels for {len(runs)} runs; give one for each run in order")
     return [
         RunAndReference(run=run, reference=None if file == "auto" else Path(file), configuration=name)
         for run, file, name in zip(runs, references, label or [None] * len(runs), strict=True)
@@ -169,15 +172,15 @@ def reference(
 
     A position is rejected if it is not an RTK fix, has a low ambiguity ratio, lies off the antenna's trajectory,
     disagrees with the distance travelled, or disagrees with the distance between the two antennas. The remaining
-    positions are matched to the trajectory. The gaps between them are bridged by Doppler speeds, tachometer pulses and
-    accelerations, as far as they are given, weighted by their variances; the closing error of a gap is distributed over
-    it. The following files are written into DIR:
+    positions are matched to the trajectory. The gaps between these positions are bridged with Doppler speeds,
+    tachometer pulses and accelerations, as far as they are given, each weighted by its variance. The closing error of a
+    gap is distributed over the gap. The following files are written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
     - `fixes.csv`: every position with its test result and measurements
     - `reference.json`: versions, hashes of the inputs, settings given and used, counts by reason, gaps
 
-    Gaps that are too long, and instants whose standard deviation is too large, are left out, counted and reported. All
+    Gaps that are too long, and instants with too large a standard deviation, are left out, counted and reported. All
     times are GPS time.
 
     Example:
@@ -192,7 +195,9 @@ def reference(
 
 
 def show_reference(summary: ReferenceSummary) -> None:
-    """Print the numbers of fixes, instants and rejections per antenna, the notes, and the files written."""
+    """Print the numbers of fixes, instants and rejections of each antenna, the notes, and the paths of the written
+    files.
+    """
     for name, part in summary.built.items():
         source = part.reference.source
         counts = part.fixes.counts()
@@ -216,20 +221,20 @@ def error_model(
     *,
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `railfix run` wrote.")],
     beside: StationBeside,
-    out: Annotated[Path, typer.Option("--out", metavar="MODEL.toml", help="Error model to write.")],
+    out: Annotated[Path, typer.Option("--out", metavar="MODEL.toml", help="File for the error model.")],
     fit: ErrorModelFit,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Model the errors of corrected pseudoranges, which are multipath on the line and receiver noise.
+    """Model the errors that corrected pseudoranges have on a line because of multipath and receiver noise.
 
-    Each RUN is positioned again with its own settings. The error of a pseudorange is the pseudorange less the distance
-    from the reference position and the receiver clock; with `--base`, also less the error of the same satellite at a
-    nearby reference station. Without `--base` the model includes the orbit, clock and atmospheric errors of the
-    recorded days, so that it is wider, and valid only for days with similar errors.
+    Each RUN is positioned again with the settings of the run. The error of a pseudorange is the pseudorange minus the
+    receiver clock and the distance between satellite and reference position. With `--base`, the error of the same
+    satellite at a nearby reference station is also subtracted. Without `--base`, the model includes the orbit, clock
+    and atmospheric errors of the recorded days; it is then wider, and valid only for days with similar errors.
 
-    The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, azimuth relative
-    to the front of the car and C/N0, before and after the screens. `railfix run --error-model MODEL.toml` derives the
-    protection level from the model.
+    The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, C/N0, and azimuth
+    relative to the front of the car. Each is given before and after the screens. `railfix run --error-model MODEL.toml`
+    derives the protection level from the model.
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
@@ -271,7 +276,7 @@ def priors_text(rate: FaultRate) -> str:
 
 def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     console = TableConsole()
-    base = model.source.base or "none: satellite and atmospheric errors are in the model"
+    base = model.source.base or "none, so that satellite and atmospheric errors are part of the model"
     console.print(
         f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres"
     )
@@ -290,7 +295,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
         if stretches := ", ".join(f"[{start:g}, {end:g}]" for start, end in rate.no_level_m):
             console.print(
                 f"local faults are more frequent than on the line at chainages [m] {stretches}: runs that use the "
-                "priors of this model have no level there"
+                "priors of this model have no protection level there"
             )
 
 
@@ -305,7 +310,7 @@ def cn0_curve(
         list[Path],
         typer.Option("--nav", metavar="FILE", help="RINEX navigation file of that day; may be repeated."),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="CURVE.toml", help="Curve to write.")],
+    out: Annotated[Path, typer.Option("--out", metavar="CURVE.toml", help="File for the curve.")],
     plot: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Picture of the samples, the mean C/N0 and the threshold.")
     ] = None,
@@ -316,16 +321,16 @@ def cn0_curve(
             help="Antenna position to within a few kilometres, in degrees and metres; by default from the file header.",
         ),
     ] = None,
-    bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
+    bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the elevation bins.")] = 5.0,
     reading: LogReading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fit the mean C/N0 over elevation of one antenna and receiver.
 
-    Record about a day under open sky with the antenna and the receiver of the train: the curve is valid only for this
-    antenna and receiver. One curve is fitted per constellation and signal; the file names its inputs. With the curve,
-    positioning rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor
-    on the C/N0 can be applied.
+    Record about a day under open sky with the antenna and the receiver of the train, because the curve is valid only
+    for this antenna and receiver. One curve is fitted per constellation and signal. The file also names the inputs.
+    With the curve, positioning rejects signals that are 10 dB-Hz below the mean at the same elevation; without a curve,
+    only a fixed minimum of the C/N0 can be applied.
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 

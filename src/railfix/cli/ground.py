@@ -49,11 +49,11 @@ class MonitorChoices(Settings):
     )
     out: Path = option("Folder for monitor.csv and triangle.png.", metavar="DIR")
     point: tuple[str, ...] = option(
-        "Known coordinates of a receiver, in the order of the logs; by default from the headers of the logs.",
+        "Known coordinates of a receiver, in the order of the logs; by default read from the headers of the logs.",
         (),
         metavar="LAT,LON,HEIGHT",
     )
-    fixes: bool = option("The logs contain receiver positions computed elsewhere (RTK, PPP-RTK, CLAS).", False)
+    fixes: bool = option("The logs contain positions that another program has computed (RTK, PPP-RTK, CLAS).", False)
     live: bool = option("Evaluate streams as they arrive, once per second.", False)
     for_s: float | None = option("With --live: end after this time.", None, name="--for", metavar="S", ge=0)
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
@@ -75,11 +75,11 @@ def monitor(
         ),
     ],
 ) -> None:
-    """Monitor satellite positioning with three receivers at known points.
+    """Monitor satellite positioning with three receivers at points with known coordinates.
 
-    The single-point fixes of the receivers are computed from the same satellites. Each fix must lie within a circle
-    around its known point, and the vectors between the fixes must agree with the vectors between the points. The first
-    cause that stops the trains is latched and printed.
+    The single-point fixes of the three receivers are computed from the same satellites. Each fix must lie within a
+    circle around the receiver's known point, and the vectors between the fixes must agree with the vectors between the
+    points. The first cause that stops the trains is latched and printed.
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
 
@@ -114,7 +114,7 @@ def monitor(
 
 
 def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits, times: MonitorLimits) -> None:
-    """Monitor logs, or streams for at most `for_s`; write a row per epoch to monitor.csv, and print each order."""
+    """Monitor logs, or streams for at most `for_s`; write one row per epoch to monitor.csv, and print each order."""
     import asyncio
     import time
 
@@ -133,7 +133,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
     async def work() -> None:
         async for fixes in _fixes(logs, choices):
-            # without a clock reading, as for recorded streams, the time tags are the clock
+            # for recorded streams, no clock is passed, and the time tags are used instead
             judged = monitor.judge(fixes, None if recorded else time.monotonic())
             choices.out.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if counts else "wb") as file:
@@ -169,7 +169,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
 
 async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[StationFixes]:
-    """Yield the fixes of the receivers; logs yield all epochs in one object, streams one object per epoch."""
+    """Yield the fixes of the three receivers: for logs one object with all epochs, for streams one object per epoch."""
     from railfix.ground.fixes_at_stations import read_fixes, stream_fixes
     from railfix.io import read_navigation
     from railfix.live.sources import check_source
@@ -208,13 +208,13 @@ def keys(
         Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; it is created if it does not exist.")
     ],
 ) -> None:
-    """Make keys and certificates of a centre and its trains, add trains, and renew certificates.
+    """Make keys and certificates for a control centre and trains, add trains, and renew certificates.
 
     A certificate authority signs the certificates; the key of the authority (authority.key) must stay in DIR. Copy
     authority.pem and the centre's two files to the centre, and authority.pem and a train's two files to each train. If
     DIR already has a certificate authority, trains are added. The serial number of each certificate is printed; to
-    revoke a certificate, write its serial number into revoked.txt in the centre's folder. Key files can be read only by
-    their owner.
+    revoke a certificate, write its serial number into revoked.txt in the centre's folder. Key files are readable only
+    by the user who made them.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
@@ -225,7 +225,7 @@ def keys(
     from railfix.ground.keys import renew_keys, write_keys
 
     if not all(0 < number < 1 << 32 for number in choices.train):
-        raise SettingsError("--train: a number from 1 to 4294967295 was expected")
+        raise SettingsError("--train: expected a number from 1 to 4294967295")
     make = renew_keys if choices.renew == "renew" else write_keys
     files = make(out, sorted(set(choices.train)), valid_days=choices.days)
     console = TableConsole()
@@ -245,7 +245,7 @@ class DemoChoices(Settings):
     port: int = option("Port of the page; 0 for any free port.", 0, metavar="PORT", ge=0, le=65535)
     hold: float = option("Time for which the page stays available after the end.", 0.0, metavar="S", ge=0, le=3600)
     coverage: Path | None = option(
-        "Picture of the links: response rates along the line, and round-trip times over time and chainage.",
+        "Picture with the response rates of the links along the line, and the round-trip times over time and chainage.",
         None,
         metavar="PNG",
     )
@@ -255,11 +255,12 @@ class DemoChoices(Settings):
 @app.command("demo", cls=Command)
 @from_models
 def demo(choices: DemoChoices) -> None:
-    """Demonstrate two trains with two lossy links each, a centre with its page, and a satellite fault.
+    """Demonstrate a control centre, two trains with two lossy links each, and a satellite fault.
 
-    The trains meet in a passing loop; one bearer fails, then both bearers of one train. At the end a satellite clock
-    drifts. The reference triangle detects the drift, satellite positioning is suspended and the trains stop. All
-    traffic stays on loopback addresses. The program ends after about half a minute with a table of events.
+    The trains meet in a passing loop. One bearer of the links fails, and later both bearers of one train. At the end, a
+    satellite clock drifts; the reference triangle detects the drift, satellite positioning is suspended, and the trains
+    stop. The centre's page shows the trains. All traffic stays on loopback addresses. The program ends after about half
+    a minute with a table of events.
 
     Example: `railfix ground demo --hold 60`
 
@@ -302,8 +303,8 @@ class CentreChoices(Settings):
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
-        "File with the password for orders in its first line, and the NAME and PASSWORD of a person in each "
-        "further line; without the file a password is generated and printed.",
+        "File with the password for orders in the first line, and the NAME and PASSWORD of one person in each "
+        "further line. Without this file, a password is generated and printed.",
         None,
         metavar="FILE",
     )
@@ -322,10 +323,10 @@ def centre(
 ) -> None:
     r"""Supervise the trains of a line: receive reports, send movement authorities, set points and routes, show a page.
 
-    Trains connect over two QUIC links with the certificates of `railfix ground keys`. Reports are written into a
-    database before they are acknowledged, and authorities before they are sent, so the centre may be killed and
-    restarted at any time. The page can be read without a log-in; releasing a stop and setting a route by hand require a
-    log-in. Points are simulated.
+    Trains connect over two QUIC links with the certificates of `railfix ground keys`. Position reports are written into
+    a database before they are acknowledged, and movement authorities before they are sent. Therefore, the centre may be
+    killed and restarted at any time. The page can be read without a log-in; releasing a stop and setting a route by
+    hand require a log-in. The movement of points (switches) is simulated.
 
         keys = "keys"
         listen = { A = "127.0.1.1:4433", B = "127.0.2.1:4433" }
@@ -374,13 +375,13 @@ class TrainChoices(Settings):
 
     keys: Path = option("Folder with authority.pem and the train's key and certificate.", metavar="DIR")
     centre: tuple[str, ...] = option(
-        "Address of the centre on bearer A, then its address on bearer B.", metavar="HOST:PORT"
+        "Address of the centre on bearer A, then the centre's address on bearer B.", metavar="HOST:PORT"
     )
     local: tuple[str, ...] = option(
-        "Local address on bearer A, then on bearer B; by default the system chooses.", (), metavar="HOST"
+        "Local address on bearer A, then on bearer B; by default, the system chooses the addresses.", (), metavar="HOST"
     )
     integrity: Path | None = option(
-        'File into which the train integrity device writes "complete" at least every 2 s.', None, metavar="FILE"
+        'File to which the train integrity device writes "complete" at least every 2 s.', None, metavar="FILE"
     )
     for_s: float | None = option("End after this time.", None, name="--for", metavar="S", ge=0)
 
@@ -393,12 +394,12 @@ def train(
     *,
     number: Annotated[int, typer.Argument(metavar="N", min=1, help="Number of the train.")],
 ) -> None:
-    """Send the positions of a train to the centre over two links, and receive its movement authorities.
+    """Send the positions of a train to the centre over two links, and receive the train's movement authorities.
 
     The command reads position messages as JSON lines from standard input (`railfix live ... --send json@-`) and reports
     the newest message every second. It writes a JSON line for each authority, for each beginning and end of braking,
-    and for each input line that is not a position message. At the end of its input it waits for the answer to the last
-    report, at most 5 s, and ends.
+    and for each input line that is not a position message. At the end of the input, the command waits at most 5 s for
+    the answer to the last report, then ends.
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
@@ -413,7 +414,7 @@ def train(
 
     hosts = choices.local or ("0.0.0.0", "0.0.0.0")
     if len(choices.centre) != 2 or len(hosts) != 2:
-        raise SettingsError("--centre and --local are given twice: for bearer A, then for bearer B")
+        raise SettingsError("give --centre, and --local if it is used, twice: for bearer A, then for bearer B")
     try:
         addresses = dict(zip(BEARERS, map(parse_address, choices.centre), strict=True))
     except ValueError as error:
@@ -429,7 +430,9 @@ def train(
     )
     reports, authorities = asyncio.run(work)
     if not reports:
-        typer.echo("railfix ground train: nothing was reported: the input ended before the first report", err=True)
+        typer.echo(
+            "railfix ground train: no position was reported, because the input ended before the first report", err=True
+        )
     elif not authorities:
         typer.echo(
             f"railfix ground train: no authority was received in answer to {plural(reports, 'report')}; the "

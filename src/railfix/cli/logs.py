@@ -38,15 +38,15 @@ def locate(
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
     reading: LogReading,
     *,
-    out: Annotated[Path, typer.Option(metavar="FILE.pos", help="Positions to write, in RTKLIB's solution format.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.pos", help="File for the positions, in RTKLIB's solution format.")],
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compute conventional 3-D positions with standard deviations from a log, without a track map.
 
-    Pseudoranges that are inconsistent with the others are excluded. The positions have quality 5 (single);
-    `railfix map match` matches them to the tracks of a network. To make a map, use `railfix map survey` on the logs:
-    its map is better than a map made from these positions.
+    Pseudoranges that are inconsistent with the others are excluded. The positions have quality 5 (single); `railfix map
+    match` matches them to the tracks of a network. To make a map, use `railfix map survey` with the logs, because a map
+    made from these positions would be worse.
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 
@@ -80,17 +80,19 @@ def which_track(
     save_last: Annotated[
         Path | None,
         typer.Option(
-            "--save-last", metavar="FILE.json", help="Track probabilities to write, for --last at the next start."
+            "--save-last",
+            metavar="FILE.json",
+            help="File for the track probabilities, to be used with --last at the next start.",
         ),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Decide on which track a train at rest is, or report `undecided`.
 
-    Each track of the map within 60 m is a hypothesis; a further hypothesis is a track missing from the map (`none`).
-    The code errors of a satellite are nearly constant at rest, so longer observation helps less than independent
-    samples would. With a base station, carrier phases are also used. A track is decided when the total probability of
-    all other hypotheses is below `--risk`; the probabilities are printed in any case.
+    Each track of the map within 60 m is a hypothesis; a further hypothesis is that the track is missing from the map
+    (`none`). At rest, the code errors of a satellite are nearly constant, so longer observation helps less than
+    independent samples would. With a base station, carrier phases are also used. The train is reported to be on a track
+    when the total probability of all other hypotheses is below `--risk`; the probabilities are always printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
@@ -104,7 +106,7 @@ def which_track(
     decided = "" if np.isnan(decision.decided_s) else f", decided after {decision.decided_s:.0f} s"
     console.print(f"track: {decision.track}{decided} (risk {options.risk:g})")
     if not last.fits:
-        console.print("the codes do not fit the error model (--code-bias-m, --code-noise-m): no decision is taken")
+        console.print("the codes do not fit the error model (--code-bias-m, --code-noise-m), so no decision is made")
     rows = []
     facing = np.append(last.with_rising, np.nan)
     for k in np.argsort(-last.probability):
@@ -188,14 +190,14 @@ def export(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write the positions of a run for maps and ROS 2: KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP.
+    """Write the positions of a run as KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP (ROS 2).
 
-    The extension of FILE selects the format. Each position has its time, antenna, status, chainage, standard deviation,
-    protection level, speed and track, as far as the run has them; an infinite level is left empty. Epochs without a
-    position are left out. Coordinates are WGS 84 with ellipsoidal heights.
+    The extension of FILE selects the format. Each position has the time, antenna, status, chainage, standard deviation,
+    protection level, speed and track, as far as the run has them; an infinite protection level is left empty. Epochs
+    without a position are left out. Coordinates are WGS 84 with ellipsoidal heights.
 
-    For GeoJSON, GeoPackage and GeoParquet files a style file of the same name (`.qml`) is written, which colours the
-    positions by status in QGIS. MCAP files have every column of the run.
+    With GeoJSON, GeoPackage and GeoParquet files, a style file of the same name (`.qml`) is written, with which QGIS
+    colours the positions by status. MCAP files have every column of the run.
 
     Example: `railfix export results --out positions.gpkg`
 
@@ -204,9 +206,7 @@ def export(
     """
     tables = list_position_tables(run)
     if filtered and tables and "train" not in tables:
-        raise InputFileError(
-            run, "has no positions of the filter; leave --filter out, or repeat the run with the filter"
-        )
+        raise InputFileError(run, "has no positions of the filter; omit --filter, or repeat the run with the filter")
     table = "train" if filtered or (filtered is None and "train" in tables) else "positions"
     folder = read_run(run, table=table)
     results = [run / f"{name}.parquet" for name in (*TABLES, "observations", "tracks")]
@@ -228,7 +228,10 @@ def export(
 @from_models
 def doctor(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Logs, navigation, track, vehicle, references.")
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="Files to identify: logs, navigation, track maps, vehicles, references, settings."
+        ),
     ],
     *,
     reading: Annotated[LogReading, Without("broken_lines", "reader")],
@@ -236,10 +239,9 @@ def doctor(
 ) -> None:
     """Identify files before a run, check whether they fit together, and print the command to run.
 
-    The content of a file determines its kind: observation log, navigation file, track map, log of positions, vehicle
-    file or settings. Mismatches and missing files are printed first, then the command, ready to copy, then the
-    properties of each file (span in GPS time, rate, gaps, satellites, signals, position, frame, heights). No file is
-    written.
+    Each file is identified from its content: observation log, navigation file, track map, log of positions, vehicle
+    file or settings. Mismatches and missing files are printed first, then the command, ready to copy. The properties of
+    each file follow (span in GPS time, rate, gaps, satellites, signals, position, frame, heights). No file is written.
 
     Example: `railfix doctor front.obs brdc.nav line.csv car.toml`
 

@@ -40,7 +40,7 @@ TracksArgument = Annotated[
     typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track maps, joined in this order to one route."),
 ]
 
-#: Options for reading a map, for commands whose output does not depend on the frame and accuracy of the map.
+#: Options for reading a map in commands that need neither the frame nor the accuracy of the map.
 PointsReading = Annotated[
     TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma", "plan_sigma")
 ]
@@ -57,18 +57,18 @@ def check(
     ] = None,
     reading: MapReading,
     max_gap: Annotated[
-        float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
+        float, typer.Option(metavar="M", help="Largest gap between the ends of two segments that is bridged.")
     ] = 1.0,
     mid_chord: Annotated[
-        float, typer.Option(metavar="M", help="Largest mid-chord deviation from the arc that is accepted.")
+        float, typer.Option(metavar="M", help="Largest accepted mid-chord deviation from the arc.")
     ] = 0.30,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Check a track map and print its faults.
 
-    The command checks the spacing of points and duplicate points; mid-chord deviation from the arc (from `radius_m`
-    where given, otherwise from the circle through neighbouring points); kinks; jumps and reversals of the kilometrage;
-    gradients and height spikes; cant; and curve attributes, which it compares with the points.
+    The command checks the spacing of points, duplicate points, kinks, jumps and reversals of the kilometrage,
+    gradients, height spikes and cant. The mid-chord deviation from the arc is computed with `radius_m` where it is
+    given, otherwise with the circle through neighbouring points. Curve attributes are compared with the points.
 
     Example: `railfix map check line.csv --out report`
 
@@ -113,8 +113,8 @@ def features(
         list[Path] | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of `railfix run` with --tachometer and --inertial; the features that the train measured are "
-            "listed next to the features of the map; may be repeated.",
+            help="Folder that `railfix run` wrote with --tachometer and --inertial; the features that the train "
+            "measured are listed next to the features of the map. May be repeated.",
         ),
     ] = None,
     out: Annotated[
@@ -123,12 +123,12 @@ def features(
     reading: PointsReading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """List the features of a line, which are the positions where its gradient or curvature changes.
+    """List the features of a line, which are the positions at which the gradient or the curvature changes.
 
-    A train that measures the same change can determine its position (`railfix.motion.features`). Changes are computed
-    over 15 m, about the distance between two bogies. With `--run` the features are the changes that several runs
-    measured consistently. Each feature then has the number of runs that measured it, the standard deviation of the
-    measured positions (as in P2's table 1), and the distance from the feature of the map.
+    A train that measures such a change can determine its position from it (`railfix.motion.features`). Changes are
+    computed over 15 m, which is about the distance between two bogies. With `--run`, the features are the changes that
+    several runs measured consistently. Each feature then has the number of runs that measured it, the standard
+    deviation of the measured positions (as in P2's table 1), and the distance from the same feature in the map.
 
     Example:
 
@@ -216,9 +216,9 @@ def from_positions_command(
 ) -> None:
     """Make a track map from the positions of one run.
 
-    Positions of another quality or at standstill are left out, and the rest is thinned to the spacing such that
-    the path deviates by at most 0.30 m from the line between two points. The map is the path of the antenna: use it
-    without a vehicle file. A run over several laps gives a map with several laps.
+    Positions of another quality or at standstill are left out. The other positions are thinned to the spacing, and the
+    path deviates by at most 0.30 m from the line between two points. The map is the path of the antenna: use it without
+    a vehicle file. A run over several laps gives a map with several laps.
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 
@@ -249,7 +249,9 @@ def _qualities(text: str | None) -> list[int] | None:
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
-        raise SettingsError(f"--quality {text!r}: expected whole numbers with commas, for example 1,2") from None
+        raise SettingsError(
+            f"--quality {text!r}: expected whole numbers separated by commas, for example 1,2"
+        ) from None
 
 
 def _print_quality(quality: TrackQuality, picture: Path | None) -> None:

@@ -37,13 +37,15 @@ MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "
 
 
 class RouteChoice(Settings):
-    """Selection of a route through a network by its tracks, by points or by positions."""
+    """Selection of a route through a network by the names of tracks, by points or by positions."""
 
     tracks: str | None = option(
-        "Tracks of the route, in order; tracks between them are added.", None, metavar="NAME,NAME..."
+        "Names of tracks of the route, in order; tracks between two of them are added.", None, metavar="NAME,NAME..."
     )
-    via: tuple[str, ...] = option("Point on the route; repeat it in the order of travel.", (), metavar="LAT,LON")
-    positions: Path | None = option("Positions of a run on the route.", None, metavar="LOG", panel=INPUTS)
+    via: tuple[str, ...] = option(
+        "Point on the route; repeat the option in the order of travel.", (), metavar="LAT,LON"
+    )
+    positions: Path | None = option("Log of positions of a run on the route.", None, metavar="LOG", panel=INPUTS)
     heights: Path | None = option(
         "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), a CSV table over chainage_m "
         "or kilometrage_m, or positions of a run.",
@@ -60,7 +62,7 @@ class RouteChoice(Settings):
 
 
 class Connecting(Settings):
-    """Tolerance of track connections, and frame of the positions."""
+    """Tolerance of the connections between tracks, and frame of the positions."""
 
     tolerance: float = option(
         "Distance within which ends of tracks are connected, if the file has no connections.",
@@ -76,7 +78,7 @@ class Connecting(Settings):
 
 
 class MatchOptions(Settings):
-    """Cross-track error of the positions, rows to fill, and files to write."""
+    """Cross-track error of the positions, choice of rows to fill, and files to write."""
 
     sigma: float | None = option(
         "Standard deviation of the distance from the track, including the map's error; by default as "
@@ -86,7 +88,7 @@ class MatchOptions(Settings):
         gt=0.0,
     )
     within: float | None = option(
-        "Largest distance of a track that is considered; by default 30 m, up to 100 m where LOG states larger sigmas.",
+        "Largest distance of a position from a track; by default 30 m, up to 100 m where LOG states larger sigmas.",
         None,
         metavar="M",
         gt=0.0,
@@ -122,8 +124,8 @@ def network(
 ) -> None:
     """Check a network of tracks and print its faults.
 
-    The command reports gaps between ends, connections whose ends do not meet, dead ends, kinks at switches, and tracks
-    whose distance is less than vehicles require.
+    The command reports gaps between ends of tracks, connections whose ends do not meet, dead ends, kinks at switches,
+    and tracks that are closer together than vehicles require.
 
     Example: `railfix map network tracks.gpkg --out network.png`
 
@@ -172,7 +174,7 @@ def route(
 ) -> None:
     """Make the track map of one route from a network or another map file.
 
-    The route is given by its tracks or by points on it, or is found from the positions of a run.
+    The route is given by tracks or by points on the route, or is found from the positions of a run.
 
     Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
 
@@ -223,7 +225,7 @@ def _route_tracks(
 def _in_frame_of(
     net: Network, log: PlanLog, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
-    """Return the positions of a log in the reference frame of the network, and notes on the log and on the shift."""
+    """Return the positions of a log in the reference frame of the network, and notes on log and transformation."""
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)
@@ -253,11 +255,14 @@ def match_command(
     reading: Annotated[TrackReading, Without(*RUN_ALONE, "height_sigma")],
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Match positions to the tracks of a network: track, chainage on the track, probability, and the next best track.
+    """Match positions to the tracks of a network.
 
-    Rows without a position between known positions are filled along the shortest route; `filled_bound_m` bounds the
-    error of a filled row. The positions are transformed to the reference frame of the map at their epoch. The track of
-    a position far from all tracks is empty.
+    For each position, the track, the chainage on the track, the probability and the second most probable track are
+    written.
+
+    Rows without a position that lie between known positions are filled along the shortest route; `filled_bound_m`
+    bounds the error of a filled row. The positions are transformed to the reference frame of the map at the epoch of
+    the positions. For a position far from all tracks, the track is empty.
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
 
@@ -270,7 +275,7 @@ def match_command(
     positions, notes = _in_frame_of(net, as_read, connecting, reading)
     matched = match(net, positions, sigma_m=options.sigma, within_m=options.within)
     if not (matched.track >= 0).any():
-        raise MismatchError(f"{log}: no position lies near a track of the network; give the map of this region")
+        raise MismatchError(f"{log}: no position lies near a track of the network; provide the map of this region")
     write_whole(
         out, _write_matches(net, positions, matched, fill_gaps(net, matched, positions, rows_to_fill=options.fill))
     )

@@ -20,7 +20,7 @@ from railfix.core.tables import Column, count, listing, number, percent, plain_t
 from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
-#: Minimum fraction of the epochs of a served stretch at which the protection level is within the alarm limit.
+#: Fraction of epochs with a protection level within the alarm limit, from which on a stretch counts as served.
 _SERVED: Final = 0.95
 _COLUMNS: Final[Sequence[Column]] = (
     ("chainage m", "from_m", count),
@@ -38,19 +38,23 @@ _COLUMNS: Final[Sequence[Column]] = (
 
 
 def service(
-    runs: Annotated[list[Path], typer.Argument(metavar="RESULTS...", help="Folders of `railfix run` on one map.")],
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RESULTS...", help="Folders that `railfix run` wrote with the same map.")
+    ],
     *,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Table to write, one row per stretch.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Table to write, with one row per stretch.")
+    ] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
     page: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Page to write, with zoomable charts.")] = None,
     stretch: Annotated[float, typer.Option(metavar="M", help="Length of the stretches of the line.")] = 100.0,
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit for the protection level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Report, by chainage, numbers of satellites, signs of reflections, fractions of ok epochs, and protection levels.
+    """Report by chainage: numbers of satellites, signs of reflections, fractions of ok epochs, protection levels.
 
-    The distance of the 3-D position from the line indicates reflections, because this position is computed without the
-    map. Several runs at different times of the day are more representative than one run.
+    The distance of the 3-D position from the line indicates reflected signals, because the 3-D position is computed
+    without the map. Several runs at different times of the day are more representative than one run.
 
     Example: `railfix map service monday-results tuesday-results --out service.csv --page service.html`
 
@@ -75,12 +79,12 @@ def service(
     verdict = [f"{len(found)} stretches of {stretch:g} m with epochs of {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
-            f"{len(served)} of them have a level within {limit:g} m in {100 * _SERVED:.0f} % of the epochs or more; "
-            f"worst stretch {worst['from_m']:.0f} to {worst['to_m']:.0f} m "
+            f"{len(served)} of them have a protection level within {limit:g} m in {100 * _SERVED:.0f} % of the epochs "
+            f"or more; worst stretch {worst['from_m']:.0f} to {worst['to_m']:.0f} m "
             f"({100 * worst['within_limit_share']:.0f} % of its epochs)"
         )
     else:
-        verdict.append("the runs have no filter and no levels; fractions are of single epochs")
+        verdict.append("the runs have no filter and no protection levels; the fractions are those of single epochs")
     show_verdict(console, verdict)
     caption = (
         f"Stretches of {stretch:g} m from the stated chainage. Satellites and levels: median and percentile of the "
@@ -103,7 +107,7 @@ class SurveyFiles(Settings):
     """Navigation files, picture and name of a survey."""
 
     nav: tuple[Path, ...] = option(
-        "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS
+        "Navigation file of the logs; repeat the option for several days.", (), metavar="NAV", panel=INPUTS
     )
     picture: Path | None = option(
         "Picture of the map, the runs and the standard deviations (.png or .svg).", None, metavar="FILE"
@@ -133,8 +137,8 @@ def survey(
 
     Laps, runs in both directions, standstill and runs over a part of the line are allowed; outliers are down-weighted.
     Logs of observations give a better map than logs of positions, because carrier-phase changes and Dopplers determine
-    the shape of the line. The map is the path of the antenna. Runs on several days average the errors that are common
-    to all positions of a day.
+    the shape of the line. The map is the path of the antenna. With runs on several days, the errors that all positions
+    of one day have in common are averaged.
 
     Example: `railfix map survey monday.obs tuesday.obs --nav monday.nav --nav tuesday.nav --out line.csv`
 

@@ -1,4 +1,4 @@
-"""Conversion of `Settings` models into command-line options, and of the options into settings."""
+"""Conversion of `Settings` models to command-line options, and of the given options to settings."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ VerboseOption = Annotated[
     typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
 ]
 JsonOption = Annotated[
-    bool, typer.Option("--json", rich_help_panel="Choices", help="Print the result as one line of JSON.")
+    bool, typer.Option("--json", rich_help_panel="Choices", help="Print the results as one line of JSON.")
 ]
 
 
@@ -50,7 +50,7 @@ def overwriting(asked: bool) -> Overwrite:
 
 
 def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, inputs: Iterable[Path | None]) -> list[Path]:
-    """Return the paths that are not None; raise the errors of `check_output_file` if a file must not be written."""
+    """Return the paths that are not None; raise the errors of `check_output_file` if one must not be written."""
     asked = [(path, kind) for path, kind in outputs if path is not None]
     read = [path for path in inputs if path is not None]
     for path, kind in asked:
@@ -60,7 +60,7 @@ def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, input
 
 
 class Without:
-    """Annotation with the names of the fields of a model for which a command has no option."""
+    """Annotation that names the fields of a model for which a command has no option."""
 
     def __init__(self, *names: str) -> None:
         self.names = names
@@ -68,7 +68,7 @@ class Without:
 
 @dataclass(frozen=True, kw_only=True)
 class _Option:
-    """Option of a command, with the path of field names to its value in the model and the parameter of the command."""
+    """Option of a command, with the parameter of the command and the field names that lead to the value in a model."""
 
     path: tuple[str, ...]
     parameter: inspect.Parameter
@@ -78,7 +78,7 @@ class _Option:
 
     @property
     def name(self) -> str:
-        """Option as it is written on the command line, such as ``--out``."""
+        """Name of the option on the command line, such as ``--out``."""
         info = get_args(self.parameter.annotation)[1]
         return str(info.default)
 
@@ -86,8 +86,9 @@ class _Option:
 def from_models(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command in which each parameter that is a `Settings` model is replaced by one option per field.
 
-    Fields that are not declared by `railfix.core.options.option`, and fields named by `Without`, have no option.
-    Fields that are models are replaced in turn. An option that two models share sets the field in both models.
+    Fields that are not declared by `railfix.core.options.option`, and fields named by `Without`, have no option. A
+    field that is itself a model is replaced by the options of its fields. An option that two models share sets the
+    field in both models.
     """
     hints = get_type_hints(command, include_extras=True)
     parameters: dict[str, inspect.Parameter] = {}
@@ -108,7 +109,7 @@ def from_models(command: Callable[..., None]) -> Callable[..., None]:
         used = {option.parameter.name for _, options in models.values() for option in options}
         command(**{name: value for name, value in values.items() if name not in used}, **built)
 
-    # typer reads both the signature and the annotations
+    # typer reads both the signature and the annotations of the function
     run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
     run.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
     del run.__wrapped__
@@ -158,7 +159,7 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
 
 
 def _gps_time(text: str) -> datetime:
-    """Return the GPS time of a text; a time with a time zone is converted.
+    """Return the GPS time that a text states; a time with a time zone is converted.
 
     Raise BadParameter if the text is not a time.
     """
@@ -178,7 +179,7 @@ def _gps_time(text: str) -> datetime:
 
 
 def _plain_type(annotation: Any) -> tuple[Any, bool]:
-    """Return the type of a single value of an annotation, and whether several values are allowed."""
+    """Return the type of one value of an annotated option, and whether several values are allowed."""
     if get_origin(annotation) is Annotated:
         return _plain_type(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -189,9 +190,9 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 
 
 def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any]) -> Model:
-    """Return the model with the values of the command line.
+    """Return the model with the values given on the command line.
 
-    Raise SettingsError if a value is invalid; the message names the option, if a single option is wrong.
+    Raise SettingsError if a value is invalid; if only one option is wrong, the message names it.
     """
     values: dict[str, Any] = {}
     for chosen in options:
@@ -221,16 +222,16 @@ def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any])
 
 
 class Choices(Settings):
-    """Settings of a run from the command line; later options override earlier options, in the order of the fields."""
+    """Settings of a run from the command line; in the order of the fields, later options override earlier ones."""
 
     preset: str | None = option(
         "Base preset, which other settings override: default, strict (fewer positions of higher integrity), or p1 "
-        "(limits of the paper that describes the screens, for geodetic receivers at 10 Hz).",
+        "(limits of paper P1, which describes the screens, for geodetic receivers at 10 Hz).",
         None,
         metavar="NAME",
     )
     config: Path | None = option(
-        "Settings file; settings that are not in the file have their defaults.", None, metavar="TOML"
+        "Settings file; settings that are missing in the file have default values.", None, metavar="TOML"
     )
     setting: tuple[str, ...] = option(
         "Setting that overrides the settings file, such as --set elevation.mask_deg=15; may be repeated.",
@@ -248,10 +249,12 @@ class Choices(Settings):
         "Filter along the track over all epochs, written to train.csv and train.parquet: track (default) or off.", None
     )
     cn0_curve: Path | None = option(
-        "Mean C/N0 over elevation of the antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"
+        "File written by `railfix cn0-curve`: mean C/N0 over elevation of the antenna and receiver.",
+        None,
+        metavar="TOML",
     )
     error_model: Path | None = option(
-        "Pseudorange errors of this line for weights and protection level, from railfix error-model.",
+        "File written by `railfix error-model`: pseudorange errors on this line, for weights and protection levels.",
         None,
         metavar="TOML",
     )
@@ -266,7 +269,7 @@ class Choices(Settings):
 
 
 def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the settings in force, and the settings that were given explicitly.
+    """Return the resulting settings, and the settings that were given explicitly.
 
     Options of the command line override the settings file. Raise SettingsError if a setting is unknown, out of range
     or given twice.
@@ -278,7 +281,7 @@ def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
         parse_config(values, source=str(choices.config))
     if choices.preset is not None:
         if choices.preset not in PRESETS:
-            raise SettingsError(f"--preset {choices.preset}: unknown preset; known are {', '.join(PRESETS)}")
+            raise SettingsError(f"--preset {choices.preset}: unknown preset; the presets are {', '.join(PRESETS)}")
         values["preset"] = choices.preset
     check_set_once(choices.setting)
     for text in choices.setting:

@@ -22,14 +22,14 @@ from railfix.report.plots.screens import draw_run_screens
 from railfix.run.inputs import ColumnNames
 from railfix.run.output import OutputFolder
 
-#: Columns of the table of satellites of an explained epoch.
+#: Columns of the table of satellites in the explanation of an epoch.
 _SATELLITES: Final[Sequence[Column]] = (
     ("satellite", "satellite", str), ("signal", "signal", str), ("elevation", "elevation_deg", partial(digits, 1)),
     ("C/N0", "cn0_dbhz", partial(digits, 1)), ("sigma m", "sigma_m", partial(digits, 2)),
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and size above which an array is allocated in separate pages [bytes].
+#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: arrays above this size [bytes] have separate pages.
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
@@ -50,9 +50,8 @@ def report(
         list[Path] | None,
         typer.Option(
             metavar="RUN",
-            help="Another run on the same log, whose conventional positions are shown. A run with `--screens "
-            "elevation` gives unscreened positions, as in P1. Repeat the option with one for each run in "
-            "order.",
+            help="Another run on the same log; the conventional positions of this run are shown. A run with `--screens "
+            "elevation` has unscreened positions, as in P1. Repeat the option with one for each run in order.",
         ),
     ] = None,
     background: Annotated[
@@ -66,10 +65,10 @@ def report(
     """Write one HTML page on one or several runs, to open in a browser.
 
     The page begins with one sentence, five key figures, the plan of the line coloured by error, and the error over
-    chainage compared with the conventional error. Folded sections follow with figures of merit, counts, protection
-    levels, settings and inputs; each table has a CSV download. The charts of each antenna show errors, protection
+    chainage compared with the conventional error. Folded sections follow, with figures of merit, counts, protection
+    levels, settings and inputs; each table can be downloaded as CSV. The charts of each antenna show errors, protection
     levels, intervals and, with `railfix run --observations`, sky, C/N0 and screens. Omitted parts are listed with the
-    reasons. Errors require `--reference`.
+    reasons. Errors are shown only with `--reference`.
 
     The page needs no other files and no network, and can be sent and printed.
 
@@ -87,7 +86,7 @@ def report(
     ]
     _free_arrays_at_once()
     check_outputs((out, "page"), overwrite=overwrite, inputs=[*(reference or ()), *in_runs, background])
-    # the observations are read piece by piece while the page is drawn
+    # the observations are read in pieces while the page is drawn, so that reading errors occur in this block
     with reading_table(runs[0] / "observations.parquet" if len(runs) == 1 else Path("observations.parquet of a RUN")):
         page = write_report(
             runs,
@@ -102,7 +101,7 @@ def report(
 
 
 def _free_arrays_at_once() -> None:
-    """Set the GNU C library, where it is used, to return the memory of freed arrays to the system at once.
+    """Make the GNU C library, where it is used, return the memory of freed arrays to the system at once.
 
     By default malloc keeps freed arrays of up to 32 MB for reuse, which costs 50 MB of memory in a long run.
     """
@@ -117,13 +116,14 @@ def explain(
     antenna: Annotated[
         str | None, typer.Option(metavar="NAME", help="Antenna, front or rear; by default the run's first antenna.")
     ] = None,
-    html: Annotated[Path | None, typer.Option(metavar="HTML", help="Page to write, with a sky plot as well.")] = None,
+    html: Annotated[Path | None, typer.Option(metavar="HTML", help="Page to write, which also has a sky plot.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain an epoch: its position, the outcome of every satellite, the causes of sigma, protection level and status.
+    """Explain an epoch: position, use or rejection of every satellite, and causes of sigma, protection level and
+    status.
 
-    For each used satellite the table has the distance by which the single-epoch position would move along the line
-    without this satellite. The epoch nearest to TIME is explained; it may be at most one minute away.
+    For each used satellite, the table has the distance by which the single-epoch position would move along the line if
+    this satellite were omitted. The epoch nearest to TIME is explained; it may be at most one minute away.
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
@@ -153,8 +153,8 @@ def plot_screens(
     """Plot each screen's metric against its limit, over time and over chainage.
 
     One PNG file is written per screen and antenna, such as `front_doppler.png`, `rear_antenna_pair.png` and
-    `front_raim.png`; none is written for screens that were off or inactive. Rejected observations have another colour;
-    the title states their fraction.
+    `front_raim.png`. Screens that were off or inactive have no file. Rejected observations have a different colour; the
+    title states the fraction of rejected observations.
 
     Example: `railfix plot-screens results --out results/screens`
 

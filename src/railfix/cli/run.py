@@ -1,4 +1,6 @@
-"""``railfix run`` and ``railfix live``: position logs into a folder, and streams as they arrive."""
+"""``railfix run`` positions logs and writes the results into a folder; ``railfix live`` positions streams as they
+arrive.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
 
-#: Interval after which a thread releases the interpreter to a waiting thread [s], longer than the default of Python
+#: Interval after which a thread releases the interpreter to a waiting thread [s]. It is longer than Python's default,
 #: because frequent switches cost more time than waiting.
 _TURN_S: Final = 0.05
 
@@ -44,20 +46,21 @@ def run(
 
     Logs are RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), UBX, SBF or RTCM 3. The following files are written into DIR:
 
-    - `positions.csv` and `positions.parquet`: one row per epoch and antenna, with or without a position: chainage and
-      its standard deviation, coordinates, and the conventional position for comparison
-    - `train.csv` and `train.parquet`: positions of the filter along the track, each from all measurements up to its
-      epoch, with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also
-      positions from earlier and later measurements
+    - `positions.csv` and `positions.parquet`: chainage with standard deviation, coordinates, and the conventional
+      position for comparison; one row per epoch and antenna, also without a position
+    - `train.csv` and `train.parquet` (unless `--filter off`): positions of the filter along the track, each computed
+      from all measurements up to the epoch, with speed, direction and the probability of the branch; with `--smooth`,
+      also positions computed from earlier and later measurements
     - `tracks.csv` and `tracks.parquet` (if TRACK is a network of tracks in one file): every track near each position,
       with its probability; the route is found from the log, and alternative routes are reported
-    - `track.csv`: the track that was used, if it differs from the file (route of a network, other heights or frame)
+    - `track.csv`: the track that was used, if it differs from the given map (route of a network, other heights or
+      frame)
     - `observations.parquet` (with `--observations`): one row per epoch, satellite and signal
     - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and reason, and
       positioning rate
 
-    Times are the receiver's time tags in GPS time. The results appear in DIR when the run is complete; after an error
-    nothing is written.
+    Times are the receiver's time tags in GPS time. The results appear in DIR when the run is complete; if the run ends
+    with an error, nothing is written.
 
     Example:
 
@@ -89,18 +92,18 @@ def live(
             "--live",
             metavar="KEY=VALUE",
             rich_help_panel="Choices",
-            help="One setting of live operation, such as period_s=0.1, pair_wait_s, reconnect, train, line, facing, "
-            "front_offset_m or length_m; may be repeated.",
+            help="Setting of live operation, such as period_s=0.1, or one of pair_wait_s, reconnect, train, line, "
+            "facing, front_offset_m and length_m; may be repeated.",
         ),
     ] = None,
 ) -> None:
     r"""Position a train from the streams of its receivers, and send one message per period.
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages. Ephemerides are used as soon as
-    they are complete, SBAS messages only with `--sbas stream`. The positions are equal to the positions of
-    `railfix run` on the same epochs, also with on-board sensors. A message is sent even for a period without input.
-    Broken connections are reopened. The program ends when its input files end, or on SIGINT or SIGTERM; on SIGHUP it
-    only prints a message.
+    they are complete. SBAS messages are used only with `--sbas stream`. The positions equal those that `railfix run`
+    computes from the same epochs and sensor data. A message is sent even for a period without input. Broken connections
+    are reopened. The program ends when the input files end, or on SIGINT or SIGTERM. On SIGHUP, it only prints a
+    message.
 
     Example:
 

@@ -1,4 +1,4 @@
-"""``railfix simulate``: simulated runs as files, with ground truth."""
+"""``railfix simulate``: write the files of simulated runs, with ground truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SimulateOptions(Settings):
     """Folder of the runs, and settings that override the scenario."""
 
     out: Path | None = option(
-        "Folder for the files; each run of a recipe has a subfolder.", None, metavar="DIR", panel="Options"
+        "Folder for the files; each run of a recipe is written into a subfolder.", None, metavar="DIR", panel="Options"
     )
     seconds: float | None = option("Duration, in place of the duration in the scenario.", None, metavar="S", gt=0.0)
     seed: int | None = option("Seed of the random numbers, in place of the seed in the scenario.", None)
@@ -40,7 +40,7 @@ class SimulateOptions(Settings):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Settings that override the scenario; raise SettingsError if a key is given twice."""
+        """Settings that override those of the scenario; raise SettingsError if a key is given twice."""
         check_set_once(self.setting)
         changes: dict[str, Any] = {}
         for text in self.setting:
@@ -63,16 +63,18 @@ def simulate(
     *,
     scenario: Annotated[
         str | None,
-        typer.Argument(metavar="SCENARIO", help="Scenario file (TOML), or the name of a shipped scenario, see --list."),
+        typer.Argument(
+            metavar="SCENARIO", help="Scenario file (TOML), or the name of a shipped scenario (see --list)."
+        ),
     ] = None,
     list_shipped: Annotated[bool, typer.Option("--list", help="List the shipped scenarios and exit.")] = False,
 ) -> None:
     """Simulate runs of a train: logs of two antennas, navigation, track map, vehicle, sensors, and ground truth.
 
-    SCENARIO defines the line (elements, a generated line, or a track file), the motion of the train, the
-    satellites (a simulated constellation, or a navigation file), receivers, errors, obstacles along the line and
-    on-board sensors. A recipe is a scenario file with several runs, each of which is written to its own folder. The
-    same scenario gives the same files.
+    SCENARIO defines the line (elements, a generated line, or a track file), the motion of the train, the satellites (a
+    simulated constellation, or a navigation file), receivers, errors, obstacles along the line and on-board sensors. A
+    recipe is a scenario file with several runs; each run is written to a separate folder. The same scenario always
+    produces the same files.
 
     Example: `railfix simulate demo --out simulated`
 
@@ -103,7 +105,7 @@ def _simulate(
     folders: dict[int, Path],
     options: SimulateOptions,
 ) -> None:
-    from railfix.simulate.run import write_run  # imported here because scipy.signal takes 0.4 s to load
+    from railfix.simulate.run import write_run  # imported here, because the import of scipy.signal takes 0.4 s
 
     done = 0
     files: dict[str, Path] = {}
@@ -142,7 +144,7 @@ def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
     if not only:
         return list(range(len(recipe.names)))
     if not recipe.names[0]:
-        raise SettingsError(f"--only {only[0]}: {recipe.path} is a single run; leave the option out")
+        raise SettingsError(f"--only {only[0]}: {recipe.path} is a single run; omit the option")
     numbers = []
     for word in only:
         if word in recipe.names:

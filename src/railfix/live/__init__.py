@@ -1,7 +1,7 @@
-"""Positions from receiver streams as they arrive: sources, pairing of antennas, one message per period, sinks.
+"""Positioning from live receiver streams: sources, pairing of antennas, one message per period, sinks.
 
-`LiveEngine` computes messages from epochs without files, clocks or sockets. `run_session` adds sources
-and sinks, `run_live` everything else of ``railfix live``::
+`LiveEngine` computes messages from epochs; it uses no files, clocks or sockets. `run_session` adds the sources and
+sinks. `run_live` adds all other functions of ``railfix live``::
 
     engine = LiveEngine(processor, LiveSettings(train=7))
     engine.add_navigation(navigation)

@@ -1,7 +1,8 @@
 """Two-channel operation: two processes compute each message, and the messages are compared byte by byte (P1 2.1).
 
 Both channels receive the same epochs, records and clock readings. The second channel returns its messages, and digests
-of its processing stages. At the first difference the output stops, and the first stage that differs is named.
+of the results of each processing stage. At the first difference, the output stops, and the error names the first stage
+whose results differ.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from railfix.pipeline.processor import EpochProcessor
 
 P = ParamSpec("P")
 
-#: First message of the second channel, sent when it can process calls.
+#: First object that the second channel sends, once it is ready for calls.
 _READY: Final = "ready"
-#: Stages in the order of processing, with the arrays of `AntennaResult` that are compared.
+#: Compared arrays of `AntennaResult`, by processing stage in the order of processing.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -35,7 +36,9 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Return, for each output, the SHA-256 digests of its stages and its encoded message, as hexadecimal digits."""
+    """Return, for each output, the SHA-256 digest of each processing stage and the encoded message, as hexadecimal
+    digits.
+    """
     return [
         {
             **{
@@ -65,7 +68,7 @@ def _digest(arrays: list[Any]) -> str:
 def _second_channel(
     connection: Connection, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str]
 ) -> None:
-    """Execute the calls that the first channel sends, in lists, until the connection closes."""
+    """Execute the lists of calls that the first channel sends, until the connection closes."""
     engine = LiveEngine(processor, settings, sensors)
     kernels.load()
     connection.send(_READY)
@@ -82,7 +85,7 @@ def _second_channel(
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
-    """Return a method of the engine that also records its call, for execution in the second channel."""
+    """Return a method that calls the given engine method, and records the call for execution in the second channel."""
 
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
@@ -93,20 +96,21 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 
 
 class TwoChannels(LiveEngine):
-    """`LiveEngine` whose calls are repeated by a second engine in another process.
+    """`LiveEngine` that has its calls repeated by a second engine in another process.
 
     Raise ChannelsDisagreeError if the second process does not start.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
-        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []  # calls that are sent with the next poll
+        # calls that the next poll sends to the second channel
+        self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # Wait before any data arrive: a later wait would delay the data, and the end of the session by a signal.
+        # Wait here, before any data arrive; waiting later would delay the data, and the reaction to signals.
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
@@ -121,7 +125,7 @@ class TwoChannels(LiveEngine):
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """Return the outputs of `LiveEngine.poll`, if both channels agree.
 
-        Raise ChannelsDisagreeError if a message or a stage differs, or the second channel has ended.
+        Raise ChannelsDisagreeError if a message or the results of a stage differ, or if the second channel has ended.
         """
         self._calls.append(("poll", (), {"now_ns": now_ns, "sent_ns": sent_ns}))
         try:
@@ -140,7 +144,7 @@ class TwoChannels(LiveEngine):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:
-        """Kill the second process, which has no data to store."""
+        """Kill the second process; it has no data to be stored."""
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)
@@ -149,7 +153,9 @@ class TwoChannels(LiveEngine):
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:
     """Raise ChannelsDisagreeError at the first difference between the digests of two channels."""
     if len(ours) != len(theirs):
-        raise ChannelsDisagreeError(f"the channels disagree: {len(ours)} messages in one, {len(theirs)} in the other")
+        raise ChannelsDisagreeError(
+            f"the channels disagree: {len(ours)} messages in the first, {len(theirs)} in the second"
+        )
     for one, other in zip(ours, theirs, strict=True):
         for stage, digest in one.items():
             if other.get(stage) != digest:

@@ -39,7 +39,7 @@ from railfix.run.sensors import check_filter, load_balises, read_sensors, units_
 from railfix.run.sources import OpenedLine, open_line
 from railfix.run.tally import TABLES, make_tables
 
-#: Number of results kept in memory before they are written.
+#: Number of results that are collected in memory before they are written to the tables.
 _BLOCK = 600
 
 
@@ -55,7 +55,7 @@ class ResultTables:
         return self
 
     def add(self, output: LiveOutput) -> None:
-        """Add the rows of one output; rows are written in blocks."""
+        """Add the rows of one output to the tables; the rows are written in blocks."""
         if output.result is None or output.part == "message":
             return
         for name, table in make_tables(output.result, passings=self._passings).items():
@@ -78,8 +78,8 @@ class ResultTables:
         self._folder.__exit__(kind, error, trace)
 
 
-#: Longest distance from the reference location that an ETCS position report can express, less a margin for the position
-#: uncertainty [m].
+#: Longest distance from the reference location that an ETCS position report can express, minus a margin for the
+#: position uncertainty [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
@@ -92,7 +92,7 @@ def _files_read(inputs: LiveInputs) -> list[Path]:
 
 
 def _check_outputs(inputs: LiveInputs) -> None:
-    """Raise OutputError if a file to be written is also read or is written twice, or cannot be the log or state."""
+    """Raise OutputError if an output file is also an input or another output, or is unusable as log or state file."""
     named = [parse_file_target(text) for text in inputs.send]
     written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
     for k, path in enumerate(written):
@@ -108,13 +108,13 @@ def _check_outputs(inputs: LiveInputs) -> None:
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """Run a session until its sources end, or until SIGINT or SIGTERM.
 
-    Return the lines of the summary, and whether SIGTERM ended the session. SIGHUP is logged and counted, and has no
-    other effect. Raise RailfixError if a source, sink, file or setting is invalid, or two channels disagree.
+    Return the lines of the summary, and whether SIGTERM ended the session. A SIGHUP is only logged and counted. Raise
+    RailfixError if a source, sink, file or setting is invalid, or two channels disagree.
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
     if inputs.live.gga_s > 0.0 and not (inputs.base or "").startswith("ntrip"):
-        raise SettingsError("--live gga_s is given without an NTRIP caster as --base; give one, or leave gga_s out")
+        raise SettingsError("--live gga_s is given without an NTRIP caster as --base; specify a caster, or omit gga_s")
     _check_outputs(inputs)
     check_filter(inputs.config, inputs.sensors)
     live = inputs.live
@@ -164,7 +164,7 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
 
 
 async def _run_until_signal(session: Coroutine[Any, Any, object], metrics: Metrics, log: SessionLog) -> bool:
-    """Run a session until its end, SIGINT or SIGTERM; return whether SIGTERM ended it."""
+    """Run a session until it ends or a SIGINT or SIGTERM arrives; return whether SIGTERM ended the session."""
     task, loop, terminated = asyncio.ensure_future(session), asyncio.get_running_loop(), False
 
     def hung_up() -> None:
@@ -193,9 +193,11 @@ def _hooks(
     *,
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
-    """Return the hooks for result tables, state file, status line and sensor checks, and the streams' stored states.
+    """Return the session's hooks, and the states of the receiver streams from the state file.
 
-    The stored states are empty if there is no state file or the file is not used.
+    The hooks write the result tables and the state file, show the status line, and check the sensors.
+
+    The mapping of states is empty if there is no state file or the file is not used.
     """
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
 
@@ -219,7 +221,7 @@ def _hooks(
     if inputs.sensors:
         watch = SensorWatch(engine.processor, log.say)
         held.callback(watch.judge)
-        watched: Outlet[LiveOutput | Sensed] = Outlet("watch of the sensors", watch.take, waiting=1000, full=full)
+        watched: Outlet[LiveOutput | Sensed] = Outlet("sensor checks", watch.take, waiting=1000, full=full)
         held.callback(_close, watched, log)
         observers.append(watched.send)
         sensed = watched.send
@@ -241,7 +243,7 @@ def _hooks(
         for observer in tuple(observers):
             try:
                 observer(output)
-            except OutputError as error:  # the error is raised again when the outlet is closed
+            except OutputError as error:  # closing the outlet raises the error again
                 observers.remove(observer)
                 log.say(f"{error}; this output has ended, the others continue")
 
@@ -250,7 +252,7 @@ def _hooks(
 
 
 def _close(outlet: Outlet[Any], log: SessionLog) -> None:
-    """Close an outlet, and log the numbers of items that were dropped or not delivered."""
+    """Close an outlet, and log how many items were dropped and how many the target refused."""
     outlet.close()
     if outlet.dropped or outlet.failed:
         reason = f"; it {outlet.failure}" if outlet.failure else ""
@@ -258,12 +260,12 @@ def _close(outlet: Outlet[Any], log: SessionLog) -> None:
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
-    """Return the line, and an epoch processor with the data of all files that are read at the start."""
+    """Return the line, and an epoch processor that has the data of all files read at the start."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
         raise SettingsError(
-            "--sbas gives recorded messages, which a live session does not read; use --sbas stream for messages from "
-            "the receivers' streams, and --set sbas_prn=PRN for the satellite"
+            "--sbas: a live session does not read recorded SBAS messages; use --sbas stream for the messages in the "
+            "receivers' streams, and --set sbas_prn=PRN to select the satellite"
         )
     units = units_of_ranges(tables, inputs.ranging_units, ranging=inputs.sensors.get("ranging"))
     navigation = no_navigation()
@@ -289,6 +291,6 @@ def _check_reference(line: OpenedLine, live: LiveSettings) -> None:
     ends = (0.0, float(line.track.chainage_m[-1]))
     if max(abs(end - live.reference_m) for end in ends) > _REACH_OF_REFERENCE_M:
         raise SettingsError(
-            f"--live reference_m={live.reference_m:g}: the line extends from 0 to {ends[1]:.0f} m, position reports "
-            f"only to {_REACH_OF_REFERENCE_M:.0f} m from the reference location; give a location nearer to the line"
+            f"--live reference_m={live.reference_m:g}: the line extends from 0 to {ends[1]:.0f} m, but position "
+            f"reports reach only {_REACH_OF_REFERENCE_M:.0f} m from the reference location; move it nearer"
         )

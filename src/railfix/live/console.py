@@ -1,7 +1,7 @@
 """Log, status line, metrics and checks of a session.
 
-The metrics are served as Prometheus text over HTTP. The checks compare on-board sensors with satellite speeds, and the
-line with 3-D positions; their results are logged.
+The metrics are served as Prometheus text over HTTP. The checks compare the on-board sensors with satellite positions
+and speeds, and the line with 3-D positions. Contradictions are logged.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _WAITING: Final = 1000
 
 
 class _Terminal:
-    """Standard error output with the lines of the log and, below them, the status line (a `Text`)."""
+    """Display on the standard error output: the lines of the log (str), with the status line (`Text`) below."""
 
     def __init__(self, *, status: bool) -> None:
         self._console = Console(stderr=True, highlight=False)
@@ -69,29 +69,29 @@ class _Terminal:
 
 
 class _Behind(logging.Handler):
-    """Logging handler that passes formatted lines, or records, to an outlet, so that logging never waits."""
+    """Logging handler that passes lines or records to an outlet, so that logging never waits for a terminal or disk."""
 
     def __init__(self, outlet: Outlet[Any], *, line: logging.Formatter | None = None) -> None:
         super().__init__()
         self._outlet, self._line = outlet, line
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Pass one line or record to the outlet."""
-        if self._line is None:  # arguments may change before they are written
+        """Pass a record to the outlet, as a formatted line if there is a formatter."""
+        if self._line is None:  # the arguments may change before the record is written
             record = copy.copy(record)
             record.msg, record.args = record.getMessage(), None
         self._outlet.send(record if self._line is None else self._line.format(record))
 
 
 class _Rotating(logging.handlers.RotatingFileHandler):
-    """Rotating log file whose write errors are raised, not printed."""
+    """Rotating log file that raises write errors instead of printing them."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802, ARG002 (the name and form of logging)
-        """Raise the error that is being handled."""
+        """Raise the current write error."""
         raise
 
 
-#: Time at the beginning of each line of a session's log.
+#: Pattern of the time that begins each line of a session's log.
 _LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
 
 
@@ -105,14 +105,15 @@ def check_log_file(path: Path) -> None:
     except OSError as error:
         raise OutputError(f"{path}: cannot be opened as a log file ({error.strerror or error})") from None
     if begin and not _LINE.match(begin):
-        raise OutputError(f"{path}: is not a log of railfix live, and nothing is appended to it; give another file")
+        raise OutputError(f"{path}: is not a log of railfix live, so nothing is appended to it; give another file")
 
 
 class SessionLog:
-    """Log of a session, on the standard error output and in a rotating file, and the status line.
+    """Log and status line of a session; the log is also written to a rotating file if `path` is given.
 
-    A file that has `LiveSettings.log_bytes` is renamed to ``path.1``, the older file to ``path.2``, and so on. The line
-    is shown only if the standard error output is a terminal. Raise OutputError if the file cannot be opened.
+    When the file has reached `LiveSettings.log_bytes`, it is renamed to ``path.1``, an earlier ``path.1`` to
+    ``path.2``, and so on. The status line is shown only if the standard error output is a terminal. Raise OutputError
+    if the file cannot be opened.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:
@@ -144,12 +145,12 @@ class SessionLog:
         self._logger.info(sentence)
 
     def show(self, status: str) -> None:
-        """Replace the status line, if it is shown."""
+        """Replace the text of the status line, if a status line is shown."""
         if self.shows_status:
             self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
     def close(self) -> None:
-        """Write the remaining lines; the number of lines missing in the file is printed."""
+        """Write the remaining lines, and print how many lines are missing in the log file, if any."""
         for handler in self._handlers:
             self._logger.removeHandler(handler)
         self._logger.propagate = True
@@ -162,7 +163,7 @@ class SessionLog:
         self._terminal.close()
 
 
-#: Number of the latest values over which time statistics are computed.
+#: Number of latest values from which the statistics of times are computed.
 _LAST: Final = 1000
 
 
@@ -171,20 +172,22 @@ class Metrics:
     """Counts and processing times of a session."""
 
     messages: Counter[MessageStatus] = field(default_factory=Counter)
-    epochs: Mapping[str, int] = field(default_factory=dict)  #: Number of epochs by outcome, `LiveEngine.counts`.
+    #: Number of epochs by outcome; this is `LiveEngine.counts`.
+    epochs: Mapping[str, int] = field(default_factory=dict)
     skipped: Counter[str] = field(default_factory=Counter)  #: Number of unused bytes, messages and lines, by reason.
     lost: Counter[str] = field(default_factory=Counter)  #: Number of broken connections, by source.
     sinks: Sequence[Sink] = ()
-    hangups: int = 0  #: Number of SIGHUP signals received, which have no other effect.
-    #: Processing time per output, and times between messages [s].
-    processing_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
-    between_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
+    hangups: int = 0  #: Number of SIGHUP signals received.
+    processing_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))  #: Processing time per output [s].
+    between_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))  #: Intervals between messages [s].
 
     started: float = field(default_factory=time.monotonic)
     _sent: float | None = None
 
     def took(self, seconds: float, outputs: Sequence[LiveOutput]) -> None:
-        """Count the messages of outputs that were processed in a total of `seconds`, and record their times."""
+        """Count the messages of outputs, and record processing times and intervals; all outputs together took
+        `seconds`.
+        """
         now = time.monotonic()
         for output in outputs:
             self.processing_s.append(seconds / len(outputs))
@@ -223,13 +226,15 @@ class Metrics:
         lines += [f"{source}: connection lost {number:,} times" for source, number in sorted(self.lost.items())]
         for sink in self.sinks:
             if sink.dropped:
-                lines.append(f"{sink.name}: {sink.dropped:,} messages dropped for a slow reader")
+                lines.append(f"{sink.name}: {sink.dropped:,} messages dropped because the reader was too slow")
             if sink.failed:
                 lines.append(f"{sink.name}: {sink.failed:,} messages refused by the target")
         if self.processing_s:
             p50, p99 = (1e3 * float(np.quantile(self.processing_s, q)) for q in (0.5, 0.99))
             last = len(self.processing_s)
-            lines.append(f"processing of the last {last} messages: median {p50:.1f}, p99 {p99:.1f} ms")
+            lines.append(
+                f"processing time of the last {last} messages: median {p50:.1f} ms, 99th percentile {p99:.1f} ms"
+            )
         return lines
 
 
@@ -255,7 +260,7 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
             head = f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: text/plain; version=0.0.4\r\n"
             writer.write(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
             await writer.drain()
-        except (OSError, ValueError):  # the client has disconnected, or its request is not HTTP
+        except (OSError, ValueError):  # the client has disconnected, or has sent a request that is not HTTP
             pass
         finally:
             writer.close()
@@ -266,20 +271,21 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
         raise SettingsError(f"--metrics {address}: no server can be opened at this address ({error})") from None
 
 
-#: Time after which the sensors are checked, interval of the radar checks, and minimum interval of positions used [ns].
+#: Time from the first position to the check of all sensors [ns].
 WATCHED_NS: Final = 600_000_000_000
-_RADAR_NS: Final = 60_000_000_000
-_EVERY_NS: Final = 500_000_000
-#: Number of chunks of samples that are merged into one block.
+_RADAR_NS: Final = 60_000_000_000  #: Interval of the radar checks [ns].
+_EVERY_NS: Final = 500_000_000  #: Minimum interval of the positions that are used in the check [ns].
+#: Number of chunks of samples that are merged into one block, to save memory.
 _PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
 
 
 class SensorWatch:
-    """Check of on-board sensors against the satellite positions and speeds of the first antenna.
+    """Check of the on-board sensors against satellite-derived positions and speeds of the first antenna.
 
-    All sensors are checked once, after `WATCHED_NS` or at the end (`railfix.run.sensor_checks.SensorChecks`), and the
-    radar repeatedly. `say` is called with a sentence on each sensor that contradicts the satellites.
+    All sensors are checked once (`railfix.run.sensor_checks.SensorChecks`), after `WATCHED_NS` or at the end of the
+    session. The radar is also checked repeatedly. For each sensor that contradicts the satellites, `say` is called with
+    a sentence for the log.
     """
 
     def __init__(self, processor: EpochProcessor, say: Callable[[str], None]) -> None:
@@ -319,11 +325,15 @@ class SensorWatch:
                 self.judge()
 
     def _hear(self, sensed: Sensed) -> None:
-        """Store samples; after twice `WATCHED_NS` without a check, check the sensors if possible, and drop samples."""
+        """Store samples for the check of the sensors.
+
+        When samples have been collected for twice `WATCHED_NS`, the sensors are checked if there is a position, and the
+        samples are dropped.
+        """
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
-            if len(self._samples) == _PIECES:  # a single row of a stream needs the memory of a hundred rows
+            if len(self._samples) == _PIECES:  # a chunk of one row takes the memory of a hundred rows
                 self._blocks.append(_join(self._samples))
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
@@ -338,7 +348,7 @@ class SensorWatch:
                 self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_RADAR_NS, "ns"), FOREVER)
 
     def _look_at_radar(self) -> None:
-        """Compare the radar with the satellite speeds since the last comparison."""
+        """Compare the radar speeds with the satellite-derived speeds since the last comparison."""
         time, speeds = _times(self._speed_ns[self._shown :]), np.array(self._speeds[self._shown :])
         now, self._radar = self._radar.between(_NEVER, time[-1]), self._radar.between(time[-1], FOREVER)
         for alarm in self._watch.take_samples(now.radar, time, speeds) if self._has_radar else ():
@@ -348,12 +358,12 @@ class SensorWatch:
             self._forget_speeds()
 
     def _forget_speeds(self) -> None:
-        """Drop the speeds that the radar has been compared with, except the last."""
+        """Drop the satellite-derived speeds that have been compared with the radar, except the last of them."""
         kept = slice(max(self._shown - 1, 0), None)
         self._speed_ns, self._speeds, self._shown = self._speed_ns[kept], self._speeds[kept], min(self._shown, 1)
 
     def judge(self) -> None:
-        """Compare the sensors with the satellite positions and speeds so far; a second call has no effect."""
+        """Compare the sensors with the satellite-derived positions and speeds so far; further calls have no effect."""
         if self._judged:
             return
         self._judged = True
@@ -377,7 +387,7 @@ def _times(time_ns: list[int]) -> Datetimes:
 
 
 def _join(parts: list[SensorSamples]) -> SensorSamples:
-    """Merge the parts in pairs, so that each sample is copied a few times and not once per part."""
+    """Merge the parts pairwise, so that each sample is copied only a few times, and not once for every part."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [early.merge(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
@@ -387,7 +397,7 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
 class PlaceWatch:
     """Check that 3-D positions lie on the line, once an antenna has `ENOUGH_TO_STOP` positions.
 
-    If the positions lie off the line, `say` is called with the message of the error that ends `railfix run`.
+    If the positions do not lie on the line, `say` is called with the error message with which `railfix run` would end.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:

@@ -1,7 +1,7 @@
-"""Live positioning: a result for each epoch of one or two antennas, and a message for each period.
+"""Live positioning of a train: a result for each epoch of one or two antennas, and a message for each period.
 
-`LiveEngine` processes single epochs with the same `EpochProcessor` as logs, keeps the state, and reads no files. The
-memory is bounded: a limited number of epochs waits, and expired records and SBAS messages are dropped.
+`LiveEngine` processes single epochs with the same `EpochProcessor` as for logs. It keeps the state and reads no files.
+Memory is bounded: the number of waiting epochs is limited, and expired records and SBAS messages are dropped.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from railfix.pipeline.received import merge_navigation
 from railfix.pipeline.results import Result
 from railfix.ranges.sbas import SbasMessages
 
-#: Time after all epochs [ns].
+#: Time later than any epoch [ns].
 END_NS: Final = 1 << 62
-#: Largest number of an antenna's waiting epochs; more epochs wait only if the receivers' clocks differ.
+#: Largest number of epochs of one antenna that wait; more would wait only if the receivers' clocks differ.
 _LONGEST_QUEUE = 100
-#: Distance after which the order of the antennas is checked again [m].
+#: Distance travelled between two checks of the order of the antennas [m].
 _ORDER_STEP_M = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """Message, and the result of its epoch, which is None in a period without input."""
+    """Message, and the result of the epoch it reports; the result is None in a period without input."""
 
     message: TrainMessage
     result: Result | None
-    place: TrainPlace | None = None  #: Position of the message; None in a period without input.
-    #: Parts to be sent: message and rows of the result; rows alone, if the message is delayed or omitted; or a delayed
-    #: message alone.
+    place: TrainPlace | None = None  #: Position reported by the message; None in a period without input.
+    #: Parts to be sent: the message and the rows of the result ("both"), the rows alone if the message is delayed or
+    #: omitted, or a delayed message alone.
     part: Literal["both", "rows", "message"] = "both"
 
 
@@ -57,11 +57,11 @@ class EngineState:
     """State from which a restarted session continues."""
 
     state: State
-    done_ns: int  #: Time tag of the last epoch, GPS time since 1980 [ns]; 0 before the first.
+    done_ns: int  #: Time tag of the last epoch, GPS time since 1980 [ns]; 0 before the first epoch.
     last_tag: Mapping[str, int]  #: Last time tag of each antenna [ns].
-    #: Number of the last message, or a higher number that no message reaches before the next state is saved.
+    #: Sequence number of the last message, or a higher number that no message reaches before the next state is saved.
     sequence: int
-    #: Direction of the train's front end along the chainage.
+    #: Direction of the train's leading end along the chainage.
     running: RunningEnd = field(default_factory=lambda: RunningEnd(direction=0))
 
 
@@ -75,7 +75,7 @@ class _FromSatellites:
     base: Observations | None = None
 
     def with_later(self, later: _FromSatellites) -> _FromSatellites:
-        """Return this data merged with later data."""
+        """Return the data merged with data that arrived later."""
         navigation, messages = self.navigation, self.messages
         if later.navigation is not None:
             navigation = later.navigation if navigation is None else merge_navigation(navigation, later.navigation)
@@ -89,7 +89,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """Epoch that waits for its pair or for sensors; `heard` is the number of arrivals of satellite data before."""
+    """Epoch that waits for the other antenna or for sensors; `heard` is the number of satellite data before it."""
 
     epoch: Observations
     arrived_ns: int
@@ -102,19 +102,19 @@ class _Waiting:
 
 
 class LiveEngine:
-    """Positioning of a train by epochs as they arrive; compiled kernels are loaded at construction.
+    """Positioning of a train from epochs as they arrive; the constructor loads the compiled kernels.
 
     Attributes
     ----------
     counts : Counter of str
-        Epochs by outcome: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
-        "tag step", "restart", "no input", "superseded" (processed, but the message of the period was of a newer epoch),
-        "skipped, behind the receivers", "dropped, too many waiting", "base station out of order", "tachometer silent"
-        (no report up to the epoch in time) and likewise for other sensors.
+        Epochs by outcome: "paired", "front alone", "rear alone", "duplicate", "late", "out of order", "tag step",
+        "restart", "no input", "superseded" (processed, but the period's message reports a newer epoch),
+        "skipped, behind the receivers", "dropped, too many waiting", "base station out of order". An epoch for which
+        the tachometer's samples came too late counts as "tachometer silent"; this applies to all sensors.
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log: replacements of requested data and their end, restarts, skipped epochs, the train's
+        Sentences for the log: replacements of missing data and their end, restarts, skipped epochs, the train's
         direction, use of a saved state. The caller removes the sentences.
     """
 
@@ -152,15 +152,15 @@ class LiveEngine:
         self._tolerance_ns = round(tolerance_s * 1e9)
 
     def add_navigation(self, navigation: Navigation) -> None:
-        """Add navigation records; they are used from the next epoch on."""
+        """Add navigation records, which are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, navigation=navigation))
 
     def add_sbas(self, messages: SbasMessages) -> None:
-        """Add SBAS messages; they are used from the next epoch on."""
+        """Add SBAS messages, which are used from the next epoch on."""
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
 
     def add_base(self, epoch: Observations) -> None:
-        """Add an epoch of the base station for the next epochs; an epoch out of order is counted and dropped."""
+        """Add an epoch of the base station for later epochs; an epoch out of order is counted and dropped."""
         if self._based_to is not None and epoch.time[0] <= self._based_to:
             self.counts["base station out of order"] += 1
             return
@@ -176,7 +176,7 @@ class LiveEngine:
                 self._tables = self._tables.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
-        """Return the sensors that have not reported up to an epoch's time tag."""
+        """Return the sensors whose samples do not yet reach an epoch's time tag."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
@@ -189,11 +189,11 @@ class LiveEngine:
             self._from_satellites.append(item)
 
     def start(self, *, now_ns: int) -> None:
-        """Start the periods: each period after `now_ns` has a message, also before the first epoch."""
+        """Start the periods at `now_ns`; from then on, each period has a message, even before the first epoch."""
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session, with the last sequence number plus `reserved` (for a crash)."""
+        """Return the state for a restarted session; `reserved` is added to the sequence number in case of a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
@@ -203,9 +203,9 @@ class LiveEngine:
         )  # fmt: skip
 
     def resume(self, saved: EngineState) -> None:
-        """Continue from a saved state, if the first epoch is at most `LiveSettings.state_age_s` after its last epoch.
+        """Continue from a saved state, if it is at most `LiveSettings.state_age_s` older than the first new epoch.
 
-        Otherwise only its navigation records, SBAS messages and sequence number are used. `reports` states the outcome.
+        Otherwise, only the saved navigation records, SBAS messages and sequence number are used. `reports` has a note.
         """
         self._sequence = max(self._sequence, saved.sequence)
         self._saved = saved if saved.done_ns else None
@@ -235,7 +235,7 @@ class LiveEngine:
         queue.append(waiting)
 
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
-        """Use a saved state, as far as the time tag of the first new epoch permits."""
+        """Use a saved state, or only its satellite data if the first new epoch is too late or before the state."""
         self._saved = None
         age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
@@ -246,17 +246,17 @@ class LiveEngine:
         else:
             self._state = State(received=saved.state.received)
             side = "before" if age_s > 0.0 else "after"
-            allowed = f"at most {self.settings.state_age_s:g} s before the first new epoch are allowed (state_age_s)"
+            allowed = f"it may be at most {self.settings.state_age_s:g} s before the first new epoch (state_age_s)"
             self.reports.append(
-                f"state file: only the ephemerides and the sequence number of the file are used, because its last "
-                f"epoch is {abs(age_s):.1f} s {side} the first new epoch; {allowed}"
+                f"state file: only the ephemerides and the sequence number of the file are used, because the file's "
+                f"last epoch is {abs(age_s):.1f} s {side} the first new epoch; {allowed}"
             )
         # Navigation files of this session are merged with the data of the state file.
         known = self.processor.received.navigation
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether an epoch is to be processed; restart after several rising tags earlier than the last tag."""
+        """Return whether to process an epoch; restart after `restart_epochs` rising tags before the last tag."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -280,22 +280,22 @@ class LiveEngine:
         return True
 
     def _restart(self) -> None:
-        """Restart positioning after a receiver's restart, with navigation records, SBAS messages and whole tables."""
+        """Restart positioning after a receiver has restarted; keep only navigation, SBAS messages and sensor tables."""
         self.counts["restart"] += 1
         self.lag.reset()
-        self.reports.append("a receiver came back with older time tags: positioning restarts")
+        self.reports.append("a receiver has restarted with older time tags; positioning restarts")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
-        self._samples = self._tables  # a sensor's stream has only samples from before, a table also those to come
+        self._samples = self._tables  # streams had only earlier samples; tables also have later ones
         for name in self._antennas:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return the outputs due: of complete pairs, of epochs that waited long enough, and of a period without input.
+        """Return the outputs due: for complete pairs, for epochs that waited long enough, for a period without input.
 
-        `now_ns` is a time of the clock used for `push`. With `sent_ns`, the GPS time of sending [ns], one message is
-        sent per period, for the newest epoch. Without `sent_ns`, as for recorded epochs, every epoch has a message. At
-        `END_NS` all waiting epochs are due, and no message without input is added.
+        `now_ns` is the time of the clock that is used for `push`. With `sent_ns`, the GPS time of sending [ns], one
+        message is sent per period, for the newest epoch. Without `sent_ns`, as for recorded epochs, every epoch has a
+        message. At `END_NS` all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -320,9 +320,9 @@ class LiveEngine:
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
-        """Return the outputs; only the newest has a message, if the last message is at least half a period old.
+        """Return the outputs; only the newest has a message, if the previous message is at least half a period old.
 
-        An earlier message waits until one period after the last message, unless a newer message replaces it.
+        A newest message that comes earlier waits until one period after the previous one, unless a newer replaces it.
         """
         if self._due_ns is None:
             self._due_ns = now_ns - self._period_ns
@@ -348,7 +348,7 @@ class LiveEngine:
 
     @staticmethod
     def _get_tag(output: LiveOutput) -> int:
-        """Return the time tag of the newest epoch of an output [ns]."""
+        """Return the latest time tag among the epochs of an output [ns]."""
         assert output.result is not None
         return max(int((a.time[-1] - GPS_EPOCH).astype(np.int64)) for a in output.result.antennas.values())
 
@@ -366,7 +366,7 @@ class LiveEngine:
         return max(0.0, min(times))
 
     def _pairs(self, now_ns: int) -> Iterator[dict[str, _Waiting]]:
-        """Yield the epochs to be processed together, by antenna, in order of their tags."""
+        """Yield the epochs that are to be processed together, by antenna, in the order of time tags."""
         while True:
             heads = {name: queue[0] for name, queue in self._waiting.items() if queue}
             if not heads:
@@ -401,7 +401,7 @@ class LiveEngine:
         return self._locate(result)
 
     def _locate(self, result: Result) -> LiveOutput:
-        """Return the output of a result, after an update of the direction of the train's front end."""
+        """Update the direction of the train's leading end, and return the output of a result."""
         place = locate_train(result, self.frame)
         before = self._running
         self._running = before.after(place.chainage_m, place.bound_m, place.moving)
@@ -419,7 +419,7 @@ class LiveEngine:
         return replace(samples, silent=silent)
 
     def _tell_changes(self, state: State, of_epoch: tuple[str, ...]) -> None:
-        """Report new replacements of received data and their end; of other notes on an epoch only the first of both."""
+        """Report each beginning and end of a replacement of missing data; report other notes on epochs only once."""
         received = state.received or self.processor.received
         notes = (received if state.base is None else state.base.beside(received)).notes
         self.reports.extend(note for note in notes if note not in self._notes)
@@ -432,7 +432,7 @@ class LiveEngine:
         self._notes, self._own = notes, own
 
     def _check_order(self, result: Result) -> None:
-        """Report once if the positions of the antennas are in the wrong order."""
+        """Report once if the positions of the two antennas are in the wrong order along the line."""
         if self._order is None or len(result.antennas) < 2:
             return
         front, rear = (result.antennas[name] for name in ("front", "rear"))

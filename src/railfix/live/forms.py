@@ -1,4 +1,4 @@
-"""Message forms: functions that encode one output as bytes.
+"""Message forms: functions that encode an output as bytes.
 
 ``json`` (one line per message), ``cbor`` (`railfix.io.train_message`; in files and streams each message is preceded by
 its length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (gpsd TPV report), ``etcs``
@@ -24,7 +24,7 @@ from railfix.pipeline.results import Result
 from railfix.run.tally import TABLES
 
 Form = Callable[[LiveOutput], bytes]
-#: Largest uncertainty that an ETCS position report can express, less a margin for the rounding of the distance [cm].
+#: Largest uncertainty that an ETCS position report can express, minus a margin for the rounding of the distance [cm].
 _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
@@ -42,7 +42,8 @@ def cbor_bytes(output: LiveOutput) -> bytes:
 def nmea_bytes(output: LiveOutput) -> bytes:
     """Return the NMEA 0183 sentences GGA, RMC and GST of the first antenna.
 
-    The result is empty without input. Without a position, GGA and RMC have no coordinates, and there is no GST.
+    The result is empty if the output has no input. Without a position, GGA and RMC have no coordinates, and GST is
+    omitted.
     """
     place = _geodetic(output)
     if output.result is None:
@@ -71,7 +72,7 @@ def nmea_bytes(output: LiveOutput) -> bytes:
 
 
 def gga_sentence(output: LiveOutput) -> bytes:
-    """Return the GGA sentence of a valid position; empty if the output has none."""
+    """Return the GGA sentence of a valid position; the result is empty if the output has no valid position."""
     valid = output.message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
     return nmea_bytes(output).split(b"\r\n")[0] + b"\r\n" if valid and _geodetic(output) is not None else b""
 
@@ -90,9 +91,12 @@ def tpv_bytes(output: LiveOutput) -> bytes:
 
 
 def etcs_form(settings: LiveSettings) -> Form:
-    """Return the form of SUBSET-026 position reports, packet 0, as JSON lines; `settings` has the reference location.
+    """Return the form that encodes SUBSET-026 position reports (packet 0) as JSON lines.
 
-    There is no report without a bounded position of the front end, or if its bound exceeds the packet's range (327 km).
+    `settings` has the reference location.
+
+    There is no report if the position of the front end has no bound, or a bound that exceeds the packet's range (327
+    km).
     """
 
     def etcs_bytes(output: LiveOutput) -> bytes:
@@ -108,7 +112,7 @@ def etcs_form(settings: LiveSettings) -> Form:
 
 
 def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
-    """Return the form of a table's rows, one JSON line per row; empty without input or rows."""
+    """Return the form that encodes a table's rows, one JSON line per row; it yields no bytes without input or rows."""
 
     def rows_bytes(output: LiveOutput) -> bytes:
         table = None if output.result is None else table_of(output.result)
@@ -122,7 +126,7 @@ ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.item
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
-    """Return the rows as JSON lines with all digits; NaN is encoded as null, infinities as "inf" and "-inf"."""
+    """Return the rows as JSON lines, numbers with all digits; NaN becomes null, infinities "inf" and "-inf"."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
     lines = []
     for row in texts.iter_rows(named=True):
@@ -135,7 +139,7 @@ def _json_rows(table: pl.DataFrame) -> bytes:
 
 
 def forms(settings: LiveSettings) -> dict[str, Form]:
-    """Return the forms by name."""
+    """Return all message forms by name."""
     return {
         "json": json_bytes,
         "cbor": cbor_bytes,
@@ -161,7 +165,7 @@ def _utc(message: TrainMessage) -> str:
 
 
 def _angle(value: float, digits: int) -> str:
-    """Return the magnitude of an angle [deg] in NMEA format, ddmm.mmmmmmm; degrees have `digits` digits."""
+    """Return the magnitude of an angle [deg] in NMEA format, ddmm.mmmmmmm, with `digits` digits for the degrees."""
     minutes = round(abs(value) * 60.0, 7)
     return f"{int(minutes // 60):0{digits}d}{minutes % 60:010.7f}"
 
@@ -174,11 +178,11 @@ def _sentence(body: str) -> bytes:
 
 
 def wants(form: Form, output: LiveOutput) -> bool:
-    """Return whether a form applies to an output: table forms encode its rows, all other forms its message."""
+    """Return whether a form applies to an output: table forms require rows, all other forms a message."""
     return output.part != ("message" if form in ROW_FORMS.values() else "rows")
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:
-    """Return a message without the length that precedes it in streams, for a target that separates messages."""
+    """Return an encoded message without the length prefix of streams, for a target that separates messages."""
     data = form(output)
     return data[2:] if form is cbor_bytes else data

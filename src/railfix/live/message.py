@@ -1,4 +1,4 @@
-"""Position messages from results of single epochs."""
+"""Position messages computed from the results of single epochs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: K factor of the speed bound, for a two-sided probability of 1e-7, the initial value for protection levels (P1 2.4).
+#: K factor of the speed bound for a two-sided probability of 1e-7, the initial K of the protection levels of P1 2.4.
 _SPEED_K = 5.33
-#: Increase of bounds for chainages rounded to centimetres [m].
+#: Amount by which bounds are increased because chainages are rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
@@ -33,7 +33,7 @@ _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIV
 
 
 def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, time_ns: int) -> TrainMessage:
-    """Return the message of a period without input, with the last epoch's tag; its sequence number is set later."""
+    """Return the message of a period without input, with the last epoch's tag; the sequence number is set later."""
     return TrainMessage(
         train=settings.train,
         sequence=0,
@@ -49,33 +49,31 @@ def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, ti
 class TrainPlace:
     """Position of the train's reference point at the last epoch of a result."""
 
-    antenna: str  #: Antenna that determines the position.
-    #: Chainage of the reference point and its standard deviation [m]; NaN without a position.
-    chainage_m: float
-    sigma_m: float
-    #: Bound of the position error, and the protection level that it contains [m]; infinite if there is no bound.
-    bound_m: float
-    level_m: float
+    antenna: str  #: Antenna from which the position is computed.
+    chainage_m: float  #: Chainage of the reference point [m]; NaN without a position.
+    sigma_m: float  #: Standard deviation of the position along the track [m]; NaN if unknown.
+    bound_m: float  #: Bound of the position error [m]; infinite if there is none.
+    level_m: float  #: Protection level on which the bound is based [m]; infinite if there is none.
     status: MessageStatus
     moving: int  #: Direction of motion, 1 toward rising chainage, -1 toward falling, 0 if too slow or unknown.
-    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna at this position; None without a
-    #: position.
+    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna; None without a position.
     geodetic: tuple[float, float, float] | None
 
 
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the position of the train by the antenna with the lowest protection level, at the reference point.
+    """Return the position of the train's reference point, from the antenna with the lowest protection level.
 
-    The position is computed by the filter along the track if it runs, otherwise from the single epoch. The bound is
-    the filter's over- and under-reading amount if the filter has a protection level (`tracking.level`). Otherwise it
-    is the single-epoch protection level plus the distance between the two positions, so that it is valid for both.
+    The position is that of the filter along the track if the filter has one, otherwise that of the single epoch. The
+    bound is the filter's over- and under-reading amount if the filter has a protection level (`tracking.level`).
+    Otherwise, the bound is the single-epoch protection level plus the distance between the positions of filter and
+    single epoch.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
     return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
 
 
 def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the position of the train from one antenna."""
+    """Return the position of the train's reference point, computed from one antenna."""
     antenna, track = result.antennas[name], result.fusion.get(name)
     place, status = _place_and_status(antenna, track)
     arc, sigma = float(antenna.arc_m[-1]), float(antenna.along_sigma_m[-1])
@@ -84,7 +82,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
         arc, sigma = float(track.tracked.arc_m[-1]), float(track.tracked.sigma_m[-1])
         amount = float(track.tracked.amount_m[-1])
     bound = level + abs(place - single) + _ROUNDING_M if math.isfinite(single) else math.inf
-    if math.isfinite(amount) and track is not None:  # the filter has a separate level
+    if math.isfinite(amount) and track is not None:  # the filter has its own protection level
         bound, level = amount + _ROUNDING_M, float(track.tracked.level_m[-1])
     chainage, geodetic = math.nan, None
     if math.isfinite(place):
@@ -95,10 +93,10 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     bounded = math.isfinite(bound)
     if status is MessageStatus.POSITION and not bounded:
         status = MessageStatus.DOUBTFUL
-    # The bound of a position that failed a check does not apply to the dead-reckoned position.
+    # The bound of a single epoch that failed a check does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
-    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # a position with another status has no bound
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # positions with other statuses have no bound
         bound = math.inf
     moving = int(track.direction[-1]) if track is not None and len(track) else 0
     return TrainPlace(
@@ -119,11 +117,11 @@ def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tup
 def create_message(
     result: Result, place: TrainPlace, settings: LiveSettings, frame: TrainFrame, running: int
 ) -> TrainMessage:
-    """Return the message of one processed epoch; its sequence number and time of sending are set later.
+    """Return the message of one processed epoch; the sequence number and the time of sending are set later.
 
-    `running` is the direction of the train's front end. The message has the front end's chainage and bounds, which are
-    wider where either end of the train may be ahead. Where the front end is unknown, the message has the chainage and
-    bounds of the reference point. A doubtful position has no bounds.
+    `running` is the direction of the train's leading end. The message has the chainage and bounds of the front end. The
+    bounds are wider if either end of the train may be ahead. If the position of the front end is unknown, the message
+    has the chainage and bounds of the reference point. A doubtful position has no bounds.
     """
     antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
@@ -155,7 +153,9 @@ def create_message(
 
 
 def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return the fields of the train's direction and length, and the flags of its unknown properties."""
+    """Return the message's fields for the train's direction and length, and the flags for unknown properties of the
+    train.
+    """
     length, front = frame.length_m, frame.ends(running).front_m
     unknown = Unknown(0)
     for what, known in (
@@ -166,7 +166,7 @@ def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
 
 
 def _describe_place(place: TrainPlace, frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return chainage, bounds and safe ends of a position, rounded so that the bounds remain valid."""
+    """Return the message's fields for chainage, bounds and safe ends, rounded so that the bounds remain valid."""
     values: dict[str, Any] = {}
     if not math.isfinite(place.chainage_m):
         return values
@@ -192,13 +192,13 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the worst suspected interference of all antennas at the last epoch; None if the check is off."""
+    """Return the most severe suspicion of interference of all antennas at the last epoch; None if the check is off."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
-    """Return the sources, other than codes, that the filter used at the last epoch."""
+    """Return the sources of measurements, other than codes, that the filter used at the last epoch."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
@@ -213,7 +213,7 @@ def _has_place(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
 
 
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
-    """Return the chainage of an antenna [m], NaN without a position, and its status."""
+    """Return the chainage of an antenna [m], NaN without a position, and the status of the message."""
     place = float(antenna.chainage_m[-1])
     if not _has_place(track):
         if not math.isfinite(place):
@@ -230,7 +230,7 @@ def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple
 
 
 def _has_passed(antenna: AntennaResult) -> bool:
-    """Return whether the last single epoch passed every check and raises no alarm."""
+    """Return whether the last epoch passed every check of the single-epoch solution without an alarm."""
     alarm = antenna.protection is not None and antenna.protection.status[-1] == LevelStatus.ALARM
     return int(antenna.status[-1]) in (Status.OK, Status.JAMMING_SUSPECTED) and not alarm
 

@@ -1,4 +1,4 @@
-"""Live session from sources through the engine to sinks, until the sources end or the program is stopped."""
+"""Live session that passes data from sources to the engine and messages to sinks, until the sources end."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from railfix.live.stream import (
 )
 from railfix.ranges.sbas import from_receiver
 
-#: Number of items that may wait for the processor before a source is paused.
+#: Number of received items that may wait to be processed; if more arrive, the sources are paused.
 _LONGEST_QUEUE: Final = 64
 #: Period of the status line [s].
 _STATUS_S: Final = 0.5
@@ -47,13 +47,13 @@ _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """Optional callbacks of a session, and its metrics."""
+    """Optional callbacks and the metrics of a session."""
 
     observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
-    sensed: Callable[[Sensed], None] | None = None  #: Called with the completed samples of each sensor source.
-    #: Called every `LiveSettings.state_every_s`, in idle time, with the state for a restart.
+    sensed: Callable[[Sensed], None] | None = None  #: Called with the samples decoded from each sensor's source.
+    #: Called in idle time, every `LiveSettings.state_every_s`, with the state from which a restarted session continues.
     save: Callable[[SavedSession], None] | None = None
-    show: Callable[[str], None] | None = None  #: Called with a text for the status line, twice a second.
+    show: Callable[[str], None] | None = None  #: Called twice a second with the text of the status line.
     metrics: Metrics = field(default_factory=Metrics)  #: Metrics of the session, returned at its end.
 
 
@@ -68,32 +68,35 @@ async def run_session(
     date: np.datetime64 | None = None,
     streams: Mapping[str, ReceiverState] | None = None,
 ) -> Metrics:
-    """Process sources until all have ended, and return the metrics of the session.
+    """Process sources until they have ended, and return the metrics of the session.
 
     Parameters
     ----------
     sources : mapping of str to str
-        Source of each antenna, and of a base station (`BASE`); see `railfix.live.sources.read_source`.
-        RINEX observation files are replayed as well.
+        Source of each antenna, and of a base station (key `BASE`); see `railfix.live.sources.read_source`. RINEX
+        observation files are replayed as well.
     speed : float or None
-        Replay speed of recorded files relative to real time. If None, files are replayed as fast as possible, and
-        the time tags are the clock (set `LiveSettings.no_input` to "skip" for exactly one message per epoch).
+        Replay speed of recorded files relative to real time. If None, files are replayed as fast as possible, and the
+        clock follows the time tags. For exactly one message per epoch, set `LiveSettings.no_input` to "skip".
     sensors : mapping of str to str, optional
-        Streams of on-board sensors (`railfix.live.stream`) by name; tables from files are added to the engine before.
+        Streams of on-board sensors (`railfix.live.stream`) by name. Tables from files must have been added to the
+        engine.
     date : datetime64, optional
-        Time within half a week of RTCM 3 streams, whose observations have no week number; now for live streams.
+        A time within half a week of the observations in RTCM 3 streams, because these have no week number. The default
+        is the computer's time, which suits live streams.
     streams : mapping of str to ReceiverState, optional
-        States from which the receivers' streams continue, by source name.
+        States from which the decoding of the receivers' streams continues, by source name.
 
     Raises
     ------
     InputFileError
-        A source cannot be opened, or breaks and is not opened again; or the first line of a sensor's stream is not the
-        header of that sensor's table.
+        A source cannot be opened, or a source breaks and is not opened again. Also raised if the first line of a
+        sensor's stream is not the header of the sensor's table.
     OutputError
-        A sink of a replay cannot be written; raised when the other sinks are complete, or at once if no sink is left.
+        A sink of a replay cannot be written. The error is raised when the other sinks are complete, or at once if no
+        sink is left.
     ChannelsDisagreeError
-        Messages or stages of two channels differ.
+        The messages, or the results of a processing stage, of two channels differ.
     """
     hooks = hooks or Hooks()
     session = _Session(engine=engine, sinks=sinks, metrics=hooks.metrics, hooks=hooks)
@@ -131,10 +134,10 @@ async def run_session(
 
 @dataclass(kw_only=True)
 class _Session:
-    """Running session: its parts, the states of its streams, and monotonic times of the last actions [s].
+    """Running session: engine, sinks, stream states, and the monotonic times of the last actions [s].
 
-    `read_to_ns` has the latest time tag received from each source that has not ended, -1 before the first tag. `place`
-    is the last position as a GGA sentence, for a virtual base station.
+    `read_to_ns` has the latest time tag [ns] received from each source that has not ended, -1 before the first tag.
+    `place` is the last position as a GGA sentence, which is sent to the caster of a virtual base station.
     """
 
     engine: LiveEngine
@@ -144,15 +147,17 @@ class _Session:
     streams: dict[str, ReceiverState] = field(default_factory=dict)
     read_to_ns: dict[str, int] = field(default_factory=dict)
     place: bytes = b""
-    #: Function that returns the time of sending, GPS time since 1980 [ns]: of the computer, or of a paced replay.
+    #: Function that returns the time of sending, GPS time since 1980 [ns]. This is the time of the computer or, in a
+    #: paced replay, the time of the recording.
     clock: Callable[[], int] = field(default_factory=lambda: gps_now_ns)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     reserved_from: int = 0
-    ended: dict[str, OutputError] = field(default_factory=dict)  #: Sinks that could not be written.
+    #: Errors of sinks that could not be written, by name of the sink.
+    ended: dict[str, OutputError] = field(default_factory=dict)
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
-        """Process the items of the pumps until all antennas' sources have ended, and save the state at the end."""
+        """Process the items that the pumps receive until all antennas' sources have ended, then save the state."""
         read_to_ns, due = self.read_to_ns, 0
         self.reserved_from = self.engine.export_state().sequence
         self.save(reserved=self.reserved)
@@ -160,7 +165,8 @@ class _Session:
             while read_to_ns.keys() - {BASE}:  # a base station's stream may have no end
                 for pump in pumps:
                     if pump.done() and queue.empty():
-                        pump.result()  # an error of a source ends the session, after the items before it
+                        # an error of a source ends the session once the items received before the error are processed
+                        pump.result()
                 wait = None if replay else max(self.engine.wait_s(now_ns=time.monotonic_ns()), 0.001)
                 item = await next_arrival(queue, pumps, wait_s=wait)
                 now = time.monotonic_ns()
@@ -179,16 +185,18 @@ class _Session:
                         tag_ns = self.take(name, received, None if replay else now)
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
                 if self.engine.lag.skipped and not queue.empty() and now < due:
-                    continue  # skipped epochs need no answer from a second channel
+                    continue  # while epochs are skipped, do not wait for a second channel after each epoch
                 due = now + round(5e8 * self.engine.settings.period_s)
-                # In a replay the clock is the tag up to which all files have been read, so that no pair is separated.
+                # In a replay, the clock is the time tag up to which all files have been read, so that pairs stay
+                # together.
                 clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, self.clock())
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
                     self.in_idle_time(outputs)
-            if not replay:  # process epochs that still wait for their pair or period
+            # process epochs that still wait for the other antenna, and send the message that waits for the next period
+            if not replay:
                 self.emit(END_NS, self.clock())
-            for pump in pumps:  # an error of a source that ended while items were waiting
+            for pump in pumps:  # raise the error of a source that failed while items were waiting
                 if pump.done():
                     pump.result()
         except asyncio.CancelledError:
@@ -197,7 +205,7 @@ class _Session:
         self.save()
 
     async def pump(self, name: str, source: str, turn: _Pace | _InTurn | None, queue: _Queue) -> None:
-        """Move the completed items of a source into the queue, then None; epochs from files wait for their turn."""
+        """Move the items decoded from a source into the queue, then None; epochs from files wait for their turn."""
         async for received in self.received(name, source):
             if turn is not None and received.epochs:
                 await turn.wait(name, received.epochs[-1].time[-1])
@@ -207,7 +215,7 @@ class _Session:
         await queue.put((name, None))
 
     async def listen(self, sensor: str, source: str, queue: _Queue) -> None:
-        """Move a sensor's completed samples into the queue; after the stream's end no epoch waits for the sensor."""
+        """Move a sensor's decoded samples into the queue; after the stream's end, no epoch waits for the sensor."""
         lines = SensorLines(sensor=sensor, source=hidden(source))
         async for part in read_source(source, self.engine.settings):
             if isinstance(part, bytes):
@@ -218,7 +226,7 @@ class _Session:
         await queue.put(Sensed(sensor=sensor, until=FOREVER))
 
     async def received(self, name: str, source: str) -> AsyncIterator[ReceivedData]:
-        """Yield the completed items of a source one by one; connection losses are logged and counted."""
+        """Yield the items decoded from a source one by one; lost connections are logged and counted."""
         place = (lambda: self.place) if name == BASE else None
         async for item in arrivals(source, self.streams[name], self.engine.settings, place):
             if isinstance(item, ReceivedData):
@@ -227,7 +235,7 @@ class _Session:
                 self.tell(name, source, item)
 
     def tell(self, name: str, source: str, item: Connected | Lost) -> None:
-        """Log that a connection was opened or lost, and count the losses."""
+        """Log that a connection was opened or lost, and count lost connections."""
         if isinstance(item, Lost):
             self.metrics.lost[hidden(source)] += 1
             _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), item.reason, item.wait_s)
@@ -236,9 +244,10 @@ class _Session:
             _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
     def take(self, name: str, received: ReceivedData, now_ns: int | None) -> int:
-        """Pass the completed items of one source to the engine, and return the tag [ns] of its last epoch, or -1.
+        """Pass the items decoded from one source to the engine; return the time tag [ns] of the last epoch, -1 without
+        epochs.
 
-        Without `now_ns` the tags of the epochs are their times of arrival.
+        Without `now_ns`, the time tag of an epoch is its time of arrival.
         """
         self.streams[name] = received.after
         skipped = self.metrics.skipped
@@ -263,7 +272,7 @@ class _Session:
         return tag_ns
 
     def emit(self, now_ns: int, sent_ns: int | None) -> list[LiveOutput]:
-        """Pass the outputs that `LiveEngine.poll` returns to the sinks and observers, and return the outputs."""
+        """Pass the outputs of `LiveEngine.poll` to the sinks and observers, and return these outputs."""
         began = time.perf_counter()
         outputs = self.engine.poll(now_ns=now_ns, sent_ns=sent_ns)
         if outputs:
@@ -281,7 +290,7 @@ class _Session:
         return outputs
 
     def send(self, sink: Sink, output: LiveOutput) -> None:
-        """Pass an output to a sink; a sink that cannot be written ends.
+        """Pass an output to a sink; a sink that cannot be written receives no further outputs.
 
         Raise OutputError if no sink is left.
         """
@@ -306,19 +315,21 @@ class _Session:
 
     @property
     def reserved(self) -> int:
-        """Number of messages in ten state periods, reserved so that no sequence number is sent twice after a crash."""
+        """Number of messages in ten state periods; so many sequence numbers are reserved that none is sent twice after
+        a crash.
+        """
         settings = self.engine.settings
         return math.ceil(10.0 * settings.state_every_s / settings.period_s)
 
     def save(self, *, reserved: int = 0) -> None:
-        """Pass the state for a restart to `Hooks.save`, if given."""
+        """Pass the state for a restart to `Hooks.save`, if this hook is given."""
         if self.hooks.save is not None:
             streams = {name: state.after_break() for name, state in self.streams.items()}
             self.hooks.save(SavedSession(engine=self.engine.export_state(reserved=reserved), streams=streams))
 
 
 class _Pace:
-    """Common pace of all files, which delays epochs until they are due relative to the earliest first tag."""
+    """Common pace of all files: an epoch waits until it is due, counted from the earliest time tag of all files."""
 
     def __init__(self, speed: float, files: Sequence[str]) -> None:
         self._speed = speed
@@ -328,7 +339,7 @@ class _Pace:
         self._began = 0.0
 
     async def wait(self, name: str, tag: np.datetime64) -> None:
-        """Wait until an epoch of a file is due."""
+        """Wait until an epoch of the file `name` is due."""
         if name in self._to_come:
             self._first.append(tag)
             self.ended(name)
@@ -337,7 +348,7 @@ class _Pace:
         await asyncio.sleep(max(0.0, due - asyncio.get_running_loop().time()))
 
     def now_ns(self) -> int:
-        """Return the time of the recording, GPS time since 1980 [ns]; before the first tag the computer's time."""
+        """Return the time of the recording, GPS time since 1980 [ns]; before the first tag, the computer's time."""
         if not self._first or not self._all_known.is_set():
             return gps_now_ns()
         elapsed_s = (asyncio.get_running_loop().time() - self._began) * self._speed
@@ -352,17 +363,18 @@ class _Pace:
 
 
 class _InTurn:
-    """Order of reading files: epochs pass in the order of their time tags, at equal tags a base station's epoch first.
+    """Order of reading files: by time tag, with a base station's epoch before the train's epochs of the same tag.
 
-    No epoch passes before the next epoch of every other file is known, so that the files may begin at any time.
+    An epoch is not passed on before the next epoch of every other file is known, so that files may begin at any time.
     """
 
     def __init__(self, files: Sequence[str]) -> None:
-        #: Time tag of each file's waiting epoch, and whether the file is of the train; None while it is being read.
+        #: Time tag of each file's waiting epoch, and whether it is an epoch of the train; None while the file is being
+        #: read.
         self._waiting: dict[str, tuple[np.datetime64, bool] | None] = dict.fromkeys(files)
 
     async def wait(self, name: str, tag: np.datetime64) -> None:
-        """Wait until no other file has an epoch that precedes this epoch of a file."""
+        """Wait until no other file has an epoch that precedes the epoch `tag` of the file `name`."""
         self._waiting[name] = own = (tag, name != BASE)
         while any(other is None or other < own for other in self._waiting.values()):
             await asyncio.sleep(0)
@@ -374,7 +386,7 @@ class _InTurn:
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:
-    """Return the status line: time, status, position, speed, satellites, processing time, losses."""
+    """Return the status line: time, status, position, speed, satellites, processing time, messages, losses."""
     message = output.message
     at = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
     words = [f"{np.datetime_as_string(at, unit='ms')[11:]} GPST", message.status.name.lower()]

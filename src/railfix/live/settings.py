@@ -17,47 +17,48 @@ from railfix.run.output import Overwrite
 class LiveSettings(Settings):
     """Settings of live operation."""
 
-    #: Period of messages, also without input (P1 2.1: 0.1 s).
+    #: Interval between messages (P1 2.1: 0.1 s).
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
-    #: Longest wait for the other antenna's epoch after a pair's first epoch has arrived.
+    #: Longest wait for the other antenna's epoch of the same time, after one antenna's epoch has arrived.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    #: Longest wait for on-board sensor samples up to an epoch; the epoch is then processed without the sensor.
+    #: Longest wait of an epoch for samples of the on-board sensors; then the epoch is processed without the missing
+    #: samples.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    no_input: Literal["send", "skip"] = "send"  #: Whether a period without input has a message.
-    #: Number of consecutive epochs with tags before the last epoch's, after which a receiver is considered restarted.
+    no_input: Literal["send", "skip"] = "send"  #: Whether a message is sent in a period without input.
+    #: Number of consecutive epochs with time tags before an earlier epoch, after which a receiver counts as restarted.
     restart_epochs: int = Field(default=3, ge=1)
-    #: Whether a connection that broke is opened again, with waits that double from `reconnect_first_s` to
-    #: `reconnect_longest_s`; otherwise the session ends when its sources end. The first connection must always succeed.
+    #: Whether a broken connection is opened again; otherwise the session ends when all sources have ended. The first
+    #: connection must always succeed.
     reconnect: Literal["on", "off"] = "on"
 
+    #: Wait before the first attempt to open a broken connection again; the wait doubles with every attempt.
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
-    reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: A connection without a byte for this time is considered broken.
+    reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)  #: Longest wait before an attempt.
+    #: A connection on which no byte arrives for this time is considered broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: Period at which the train's position (GGA) is sent to the base station's caster, for a virtual station; it is not
-    #: sent with 0.
+    #: Interval at which the train's position (GGA) is sent to the base station's caster, as a virtual station requires;
+    #: with 0, the position is not sent.
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    #: File with certificates (PEM) that are trusted for casters over TLS, in addition to the system's certificates.
+    #: File with certificates (PEM) that are trusted for casters over TLS, in addition to the certificates of the
+    #: system.
     ntrip_certificates: Path | None = None
-    #: Number of messages that may wait for a slow target; further messages to it are dropped and counted.
+    #: Number of messages that may wait for a slow target; further messages are dropped and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Delay of epochs, relative to the shortest observed delay, above which epochs are skipped with a line in the log;
-    #: recorded epochs are never skipped.
+    #: Delay of an epoch, compared with the shortest delay so far, above which epochs are skipped. This is logged.
+    #: Recorded epochs are never skipped.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
-    state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Period at which the state file is written.
-    #: Longest time from the last epoch of a state file to the first new epoch; after a longer time only ephemerides and
-    #: the sequence number are used.
+    state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Interval at which the state file is written.
+    #: Longest time from the last epoch of a state file to the first new epoch. After a longer time, only the
+    #: ephemerides, SBAS messages and sequence number of the file are used.
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
-    #: Size at which a log file is rotated [bytes], and number of rotated files.
-    log_bytes: int = Field(default=1_000_000, ge=1000)
-    log_files: int = Field(default=5, ge=1, le=1000)
-    #: Identities of train and line in messages.
-    train: int = Field(default=0, ge=0)
-    line: int = Field(default=0, ge=0)
-    #: Direction along the chainage of the train's leading end at the start, 0 if unknown; by default from the
-    #: vehicle file. A train that has run 50 m in the other direction has changed ends.
+    log_bytes: int = Field(default=1_000_000, ge=1000)  #: Size at which a log file is rotated [bytes].
+    log_files: int = Field(default=5, ge=1, le=1000)  #: Number of rotated log files that are kept.
+    train: int = Field(default=0, ge=0)  #: Identity of the train in messages.
+    line: int = Field(default=0, ge=0)  #: Identity of the line in messages.
+    #: Direction of the train's leading end at the start: 1 toward rising chainage, -1 toward falling, 0 if unknown. The
+    #: default is taken from the vehicle file. A train that has run 50 m in the other direction has changed ends.
     facing: Literal[-1, 0, 1] | None = None
-    #: Distance of the train's front end ahead of the front antenna; by default computed from the vehicle file.
+    #: Distance by which the train's front end is ahead of the front antenna; by default computed from the vehicle file.
     front_offset_m: float | None = Field(default=None, ge=0.0)
     length_m: float | None = Field(default=None, gt=0.0)  #: Train length; by default from the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
@@ -74,55 +75,68 @@ class LiveInputs(Settings):
     """Inputs of a live session, the options of ``railfix live``."""
 
     front: str = input_option(
-        "Stream of the front antenna's receiver: a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, "
+        "Source of the front antenna's receiver data: a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, "
         "ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), or - (standard input).",
         metavar="SOURCE",
     )
-    track: tuple[Path, ...] = input_option("Track map; repeat it for a route.", metavar="TRACK")
-    rear: str | None = input_option("Source of the rear antenna.", None, metavar="SOURCE")
+    track: tuple[Path, ...] = input_option("Track map; repeat the option for a route of several maps.", metavar="TRACK")
+    rear: str | None = input_option(
+        "Source of the rear antenna's receiver data, as for --front.", None, metavar="SOURCE"
+    )
     vehicle: Path | None = input_option("Vehicle file with the positions of the antennas.", None, metavar="TOML")
-    nav: tuple[Path, ...] = input_option("Navigation files known from the start.", (), metavar="FILE")
+    nav: tuple[Path, ...] = input_option("Navigation files that are read at the start.", (), metavar="FILE")
     base: str | None = input_option(
-        "Stream of a base station: RTCM 3 (MSM, and 1005 or 1006 with its position), or the formats of --front.",
+        "Source of a base station's data: RTCM 3 (MSM, and 1005 or 1006 with the position), or a format of --front.",
         None,
         metavar="SOURCE",
     )
     base_place: str | None = option(
-        "Position of the base station; by default it is read from the stream or header.", None, metavar="LAT,LON,HEIGHT"
+        "Position of the base station; by default it is read from the stream or the file's header.",
+        None,
+        metavar="LAT,LON,HEIGHT",
     )
     tachometer: str | None = input_option(
-        "Pulses of a tachometer: rows of the table of `railfix run` as lines of CSV, header first, from a "
-        "source as for --front, or the whole table as a file. A row that has only the time reports that there "
-        "was no pulse.",
+        "Source of a tachometer's pulses, as for --front: the rows of the tachometer table of `railfix run` as lines "
+        "of CSV, header first, or the whole table as a file. A row with only a time reports that there was no pulse.",
         None,
         metavar="SOURCE",
     )
-    inertial: str | None = input_option("Source of an inertial unit.", None, metavar="SOURCE")
-    radar: str | None = input_option("Source of the speeds of a Doppler radar.", None, metavar="SOURCE")
-    ranging: str | None = input_option("Source of two-way ranges to ground units.", None, metavar="SOURCE")
-    ranging_units: Path | None = input_option("Surveyed ground units: unit, x_m, y_m, z_m (ECEF).", None, metavar="CSV")
-    balises: str | None = input_option("Source of balise readings.", None, metavar="SOURCE")
+    inertial: str | None = input_option(
+        "Source of an inertial unit's samples, as for --tachometer.", None, metavar="SOURCE"
+    )
+    radar: str | None = input_option("Source of a Doppler radar's speeds, as for --tachometer.", None, metavar="SOURCE")
+    ranging: str | None = input_option(
+        "Source of two-way ranges to ground units, as for --tachometer.", None, metavar="SOURCE"
+    )
+    ranging_units: Path | None = input_option(
+        "Table of surveyed ground units: unit, x_m, y_m, z_m (ECEF).", None, metavar="CSV"
+    )
+    balises: str | None = input_option("Source of balise readings, as for --tachometer.", None, metavar="SOURCE")
     balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
     virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
     send: tuple[str, ...] = option(
-        "Form and target of messages: json, cbor, nmea, tpv, etcs, positions, train or passings at -, a "
-        "file, udp://HOST:PORT, "
-        "tcp-server://HOST:PORT or mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",
+        "Form and target of messages. FORM is json, cbor, nmea, tpv, etcs, positions, train or passings; TARGET is - "
+        "(standard output), a file, udp://HOST:PORT, tcp-server://HOST:PORT or "
+        "mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",
         ("json@-",),
         metavar="FORM@TARGET",
     )
     speed: float | None = option(
-        "Speed of the replay relative to real time; by default without pauses.", None, metavar="TIMES", ge=0.01
+        "Replay speed of recorded files relative to real time; by default as fast as possible.",
+        None,
+        metavar="TIMES",
+        ge=0.01,
     )
     channels: Literal["1", "2"] = option(
-        "Number of channels; with 2, a second process checks every message, and a difference ends the output.", "1"
+        "Number of channels; with 2, a second process computes every message, too, and any difference ends the output.",
+        "1",
     )
     metrics: str | None = option("Serve metrics as Prometheus text at /metrics.", None, metavar="HOST:PORT")
     state: Path | None = option(
-        "Write the state regularly into this file, and continue from it after a restart.", None, metavar="FILE"
+        "State file: written regularly, and read at the start to continue an earlier session.", None, metavar="FILE"
     )
-    log: Path | None = option("Also write the log into this file, which is rotated.", None, metavar="FILE")
-    out: Path | None = option("Also write the tables of results into this folder.", None, metavar="DIR")
+    log: Path | None = option("Also write the log to this file, which is rotated.", None, metavar="FILE")
+    out: Path | None = option("Also write the result tables into this folder.", None, metavar="DIR")
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
     config: Config = Field(default_factory=Config)
     live: LiveSettings = Field(default_factory=LiveSettings)
@@ -142,12 +156,12 @@ class LiveInputs(Settings):
 
     @property
     def sensors(self) -> dict[Sensor, str]:
-        """Sources or tables of the on-board sensors that are given, by name."""
+        """Sources or tables of the given on-board sensors, by name."""
         return {name: source for name in SENSORS if (source := getattr(self, name)) is not None}
 
     @property
     def files(self) -> dict[str, Path]:
-        """Files that the positions depend on, by their role."""
+        """Files on which the positions depend, by their role."""
         named = {f"track {k}": path for k, path in enumerate(self.track)}
         given = {
             "vehicle": self.vehicle, "ranging units": self.ranging_units, "balise list": self.balise_list,

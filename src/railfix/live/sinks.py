@@ -1,4 +1,4 @@
-"""Message sinks, given as ``FORM@TARGET``, with a queue for each target that may be slow.
+"""Sinks for messages, given as ``FORM@TARGET``; targets that may be slow have a queue.
 
 The forms are functions of `railfix.live.forms`. The targets are ``-`` (standard output), a file, ``udp://HOST:PORT``
 (one datagram per message), ``tcp-server://HOST:PORT`` (all connected clients) and
@@ -36,11 +36,11 @@ _CLOSE_S = 5.0
 
 
 class Outlet(Generic[Item]):
-    """Target with its own queue and thread, in which `send` processes one item.
+    """Target with its own queue and thread; the thread calls `send` with one item at a time.
 
-    `full` selects the action when the queue is full: drop and count the item ("drop", live), or wait ("wait", replay of
-    recorded files). `dropped` is the number of dropped items, `failed` the number of items that the target refused, and
-    `failure` the reason for refusing the last item, blank if the item was accepted.
+    `full` selects the action when the queue is full: "drop" drops and counts the item (live), "wait" waits (replay of
+    recorded files). `dropped` is the number of dropped items, and `failed` the number of items that the target refused.
+    `failure` is the reason why the last item was refused, blank if it was accepted.
     """
 
     def __init__(self, name: str, send: Callable[[Item], None], *, waiting: int, full: str = "drop") -> None:
@@ -76,11 +76,11 @@ class Outlet(Generic[Item]):
                 self.failure = f"cannot be written ({getattr(error, 'strerror', None) or error})"
             except Exception as error:  # noqa: BLE001 (a defect: raised when the next item is passed on)
                 self._defect = error
-                self.failure = f"has ended by a defect ({error!r})"
+                self.failure = f"has stopped because of an internal error ({error!r})"
                 self.failed += 1
 
     def close(self) -> None:
-        """Wait some seconds for the remaining items; items that still wait are counted as dropped.
+        """Wait some seconds for the remaining items; items that are left after this time are counted as dropped.
 
         Raise OutputError as `send` does.
         """
@@ -95,23 +95,23 @@ class Outlet(Generic[Item]):
 
 #: Number of bytes that may wait for a client of a TCP sink; a client with more bytes is disconnected.
 _LARGEST_BACKLOG: Final = 1 << 20
-#: Longest wait for the answer of an MQTT broker [s].
+#: Longest wait for an MQTT broker to accept a connection [s].
 _ANSWER_S: Final = 10.0
-#: Longest wait for unsent messages when an MQTT target is closed [s].
+#: Longest wait until the last messages are sent, when an MQTT target is closed [s].
 _LEFT_S: Final = 2.0
 _HELP: Final = (
-    "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, passings, TARGET -, a file, "
-    "udp://, tcp-server:// or mqtt://"
+    "expected FORM@TARGET, where FORM is json, cbor, nmea, tpv, etcs, positions, train or passings, and TARGET is -, a "
+    "file, udp://, tcp-server:// or mqtt://"
 )
 
 
 class Sink(Protocol):
-    """Target of outputs, which counts the outputs that its reader has missed."""
+    """Target of outputs, which counts the messages that do not reach the reader."""
 
-    name: str  #: Name in counts and messages.
+    name: str  #: Name of the sink in counts and error messages.
     dropped: int  #: Number of messages dropped for a slow reader.
     failed: int  #: Number of messages that the target refused.
-    failure: str  #: Reason for refusing the last message; blank if the message was accepted.
+    failure: str  #: Reason why the target refused the last message; blank if it was accepted.
 
     def send(self, item: LiveOutput, /) -> None:
         """Process one output."""
@@ -165,7 +165,7 @@ class UdpTarget:
     socket: socket.socket = field(default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
 
     def send(self, output: LiveOutput) -> None:
-        """Send one datagram; nothing is sent if the form yields no bytes."""
+        """Send one datagram, unless the form yields no bytes."""
         if data := whole_message(self.form, output):
             self.socket.sendto(data, self.address)
 
@@ -175,7 +175,7 @@ class UdpTarget:
 
 
 class MqttTarget:
-    """MQTT target, which publishes with QoS 0 (at most once); a broken connection is opened again.
+    """MQTT target; messages are published with QoS 0 (at most once), and a broken connection is opened again.
 
     Raise OutputError if the broker cannot be reached, or refuses the connection.
     """
@@ -194,7 +194,9 @@ class MqttTarget:
         try:
             self._client.connect(str(parts.hostname), int(parts.port or 0))
         except OSError as error:
-            raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: cannot be connected to ({error})") from None
+            raise OutputError(
+                f"mqtt://{parts.hostname}:{parts.port}: the connection cannot be opened ({error})"
+            ) from None
         self._client.loop_start()
         try:
             answer = answers.get(timeout=_ANSWER_S)
@@ -203,10 +205,10 @@ class MqttTarget:
         self._client.on_connect = None
         if not self._client.is_connected():
             self._client.loop_stop()
-            raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker refuses the connection ({answer})")
+            raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker has refused the connection ({answer})")
 
     def send(self, output: LiveOutput) -> None:
-        """Publish one message; nothing is published if the form yields no bytes.
+        """Publish one message, unless the form yields no bytes.
 
         Raise OutputError if there is no connection, or the broker is too slow.
         """
@@ -221,7 +223,7 @@ class MqttTarget:
         if len(self._sent) >= self._waiting:
             raise OutputError("the broker does not keep up")
         sent = self._client.publish(self.topic, data, qos=0)
-        if sent.rc:  # the connection has broken meanwhile
+        if sent.rc:  # the connection has broken since the check above
             raise OutputError("the broker is not connected")
         self._sent.append(sent)
 
@@ -232,14 +234,14 @@ class MqttTarget:
             if self._client.is_connected():
                 info.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
-        # a broker that stops reading would delay the end for the lifetime of its connection
+        # in a thread, because a broker that has stopped reading would block this call while the connection lasts
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)
         ending.start()
         ending.join(max(until - time.monotonic(), 0.5))
 
 
 class OutletSink(Outlet[LiveOutput]):
-    """Sink with a queue before its target, which is closed with the sink."""
+    """Sink with a queue before the target; closing the sink closes the target."""
 
     def __init__(self, name: str, target: Any, *, waiting: int, full: str) -> None:
         super().__init__(name, target.send, waiting=waiting, full=full)
@@ -259,7 +261,7 @@ class OutletSink(Outlet[LiveOutput]):
 
 
 class TcpServerSink:
-    """TCP server that sends each client the messages since it connected; slow clients are disconnected."""
+    """TCP server that sends messages to all connected clients; slow clients are disconnected."""
 
     def __init__(self, form: Form, name: str) -> None:
         self.form, self.name = form, name
@@ -303,7 +305,7 @@ class TcpServerSink:
 
 
 def parse_file_target(text: str) -> Path | None:
-    """Return the file that a text ``FORM@TARGET`` names; None for another target."""
+    """Return the file named by a text ``FORM@TARGET``; None if the target is not a file."""
     target = text.partition("@")[2]
     other = target in ("", "-") or urlsplit(target).scheme in ("udp", "tcp-server", "mqtt")
     return None if other else Path(target)
@@ -317,7 +319,7 @@ def _open_without_change(path: Path) -> IO[bytes]:
 async def open_sink(
     text: str, settings: LiveSettings | None = None, *, overwrite: str = "refuse", full: str = "drop"
 ) -> Sink:
-    """Open the sink of a text ``FORM@TARGET``; `full` is as for `Outlet`.
+    """Open the sink given by a text ``FORM@TARGET``; for `full` see `Outlet`.
 
     The content of an existing file remains until the first epoch's message. Raise SettingsError if the text has no
     valid form or target. Raise OutputError if the target cannot be opened, or is an existing file and `overwrite` is

@@ -21,7 +21,7 @@ from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 
 Item = TypeVar("Item")
-#: Function that returns the present position as a GGA sentence, empty without a position.
+#: Function that returns the present position as a GGA sentence, or no bytes without a position.
 Place = Callable[[], bytes]
 #: Function that writes to the other end of a connection until it is cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
@@ -33,37 +33,38 @@ _FORMS = (
 )
 #: Schemes of NTRIP without and with TLS.
 _NTRIP = ("ntrip", "ntrips")
-#: Longest wait for a connection, and for the first line of an answer [s].
+#: Longest wait for a connection to open [s].
 _CONNECT_S = 10.0
 #: Longest wait for a byte in one read of a serial line [s].
 _SERIAL_S = 0.05
-#: Wait for bytes that have already arrived [s].
+#: Additional wait for bytes that arrived while the program was busy [s].
 _ONCE_MORE_S = 0.02
-#: Longest interval between attempts to send a first position to a caster [s].
+#: Longest wait before the next attempt to send a position to a caster, while there is none [s].
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
-_TELLING_BYTES: Final = 16  #: Number of leading content bytes that identify wrong content types.
+#: Number of leading bytes of the content by which content other than a receiver's stream is recognised.
+_TELLING_BYTES: Final = 16
 _OK: Final = 200  #: HTTP status of a successful answer.
 
 
 @dataclass(frozen=True)
 class Connected:
-    """Event of an opened connection; `broken` is the number of earlier breaks."""
+    """Event: a connection has been opened; `broken` is the number of times it has broken before."""
 
     broken: int
 
 
 @dataclass(frozen=True)
 class Lost:
-    """Event of a broken connection; the next attempt follows after `wait_s`."""
+    """Event: a connection has broken; the next attempt to open it follows after `wait_s`."""
 
     reason: str
     wait_s: float
 
 
 def check_source(source: str) -> None:
-    """Raise SettingsError if a source has none of the supported forms."""
+    """Raise SettingsError if a source is not given in one of the supported forms."""
     parts = urlsplit(source)
     if parts.scheme in ("tcp", *_NTRIP):
         try:
@@ -92,11 +93,11 @@ def hidden(source: str) -> str:
 async def read_source(
     source: str, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a source as they arrive, and events of its connection.
+    """Yield the bytes of a source as they arrive, and the events of the connection.
 
-    A connection that breaks is opened again, if `LiveSettings.reconnect` is "on". `place` returns the present GGA
-    sentence, which is sent to a caster every `LiveSettings.gga_s` unless it is empty. Raise InputFileError if the
-    source cannot be opened, or its connection breaks and is not opened again.
+    A connection that breaks is opened again, if `LiveSettings.reconnect` is "on". `place` returns the present position
+    as a GGA sentence, which is sent to a caster every `LiveSettings.gga_s` unless it is empty. Raise InputFileError if
+    the source cannot be opened, or if the connection breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
@@ -119,7 +120,10 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a connection, which is reopened after growing waits; `opened` yields empty bytes once open."""
+    """Yield the bytes and events of a connection, which is reopened after growing waits.
+
+    `opened` returns an iterator that yields empty bytes once the connection is open, and then the received bytes.
+    """
     broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
     while True:
         reason = "the other end has closed the connection"
@@ -151,10 +155,10 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 
 
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
-    """Return the result of a call, or raise TimeoutError.
+    """Return the result of a call; raise TimeoutError if the call takes too long.
 
-    The call is repeated once after the time has passed, for data that arrived while this program was busy.
-    (`asyncio.wait_for` may lose a cancellation that arrives at the same time.)
+    After the time has passed, the call is repeated once for `_ONCE_MORE_S`, because data may have arrived while this
+    program was busy. (`asyncio.wait_for` may lose a cancellation that arrives at the same time.)
     """
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
@@ -175,7 +179,7 @@ async def _tcp(
         async with asyncio.timeout(_CONNECT_S):
             reader, writer = await asyncio.open_connection(parts.hostname, parts.port, ssl=tls)
     except ssl.SSLCertVerificationError as error:
-        why = f"its certificate is not accepted ({error.verify_message})"
+        why = f"the server's certificate is not accepted ({error.verify_message})"
         hint = "; if it is a private certificate, give it by --live ntrip_certificates=FILE"
         raise InputFileError(hidden(source), why + hint) from None
     except ssl.SSLError as error:
@@ -184,7 +188,9 @@ async def _tcp(
         raise InputFileError(hidden(source), f"{without} ({reason}); for a server without TLS give ntrip://") from None
     except (OSError, TimeoutError) as error:
         over = "" if tls is None else " over TLS"
-        raise InputFileError(hidden(source), f"cannot be connected to{over} ({str(error) or 'no answer'})") from None
+        raise InputFileError(
+            hidden(source), f"the connection cannot be opened{over} ({str(error) or 'no answer'})"
+        ) from None
     sending = None if send is None else asyncio.create_task(send(writer))
     try:
         if request:
@@ -204,10 +210,10 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """Yield the bytes of an NTRIP caster's mount point, by NTRIP 2, or by NTRIP 1 if the caster answers in version 1.
+    """Yield the bytes of an NTRIP caster's mount point; the request is NTRIP 2, the answer may be NTRIP 1.
 
-    With `LiveSettings.gga_s` the train's position is sent for a virtual station: in the request if the position is
-    known (NTRIP 2), and later as lines.
+    If `LiveSettings.gga_s` is not 0, the train's position is sent for a virtual station. It is part of the request if
+    it is already known (NTRIP 2), and is later sent as lines.
     """
     if settings.gga_s == 0.0:
         place = None
@@ -242,7 +248,7 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
 class _Answer:
     """Decoder of a caster's answer: HTTP 1.1 by h11 (NTRIP 2), or ``ICY 200 OK`` and bytes (NTRIP 1).
 
-    `begun` states that the mount point sends a stream, `ended` that the caster has ended the stream.
+    `begun` is true once the mount point sends a stream, and `ended` once the caster has ended the stream.
     """
 
     def __init__(self, source: str) -> None:
@@ -250,15 +256,15 @@ class _Answer:
             import h11
         self._h11, self._source = h11, source
         self._client: Any = h11.Connection(our_role=h11.CLIENT, max_incomplete_event_size=_HEADER_BYTES)
-        self._first: bytes | None = b""  # bytes up to the end of the first line; None once the line is complete
+        self._first: bytes | None = b""  # bytes of the answer's first line; None once the line is complete
         self._content = b""  # first bytes of the content
         self._broken: InputFileError | None = None
         self._plain = self.begun = self.ended = False
 
     def request(self, sentence: bytes) -> bytes:
-        """Return the request for the mount point, with a GGA sentence if it is not empty.
+        """Return the request for the mount point, with the GGA sentence unless it is empty.
 
-        Raise SettingsError if the source does not give a valid request.
+        Raise SettingsError if no valid request can be made from the source.
         """
         parts = urlsplit(self._source)
         head = [
@@ -277,7 +283,7 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content in further bytes of the answer; raise InputFileError if the mount point has no stream."""
+        """Return the content in further bytes of the answer; raise InputFileError if it is not a receiver's stream."""
         if self._first is not None:
             self._first += data
             if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:
@@ -309,17 +315,19 @@ class _Answer:
                 elif isinstance(event, self._h11.EndOfMessage):
                     self.ended = True
                     break
-        except self._h11.RemoteProtocolError as error:  # bytes received before the error are used
+        except self._h11.RemoteProtocolError as error:  # bytes received before the error are still returned
             self._broken = InputFileError(hidden(self._source), f"the caster's answer is not HTTP ({error})")
         return bytes(content)
 
     def check(self) -> None:
-        """Raise InputFileError if the last bytes were not HTTP."""
+        """Raise InputFileError if the bytes passed to `take` were not HTTP."""
         if self._broken is not None:
             raise self._broken
 
     def _check_head(self, response: Any) -> None:
-        """Raise InputFileError if the answer is an error, a source table, a page of HTML, or compressed."""
+        """Raise InputFileError if the answer's header announces an error, a source table, an HTML page or compressed
+        content.
+        """
         if response.status_code != _OK:
             raise _refuse(self._source, f"{response.status_code} {response.reason.decode('latin-1')}".encode())
         head = {bytes(name).lower(): bytes(value).lower().strip() for name, value in response.headers}
@@ -327,16 +335,18 @@ class _Answer:
         if kind.startswith(b"gnss/sourcetable"):
             raise self._no_stream("its source table")
         if kind.startswith(b"text/html"):
-            raise self._no_stream("a page of HTML")
+            raise self._no_stream("an HTML page")
         if coding != b"identity":
-            raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not requested")
+            raise self._no_stream(
+                f"content with the encoding {coding.decode('latin-1')[:20]!r}, which was not requested"
+            )
 
     def _check_content(self, content: bytes) -> None:
-        """Raise InputFileError if the first bytes are compressed, a page of HTML, or a source table."""
+        """Raise InputFileError if the first bytes belong to compressed content, an HTML page or a source table."""
         if content.startswith(b"\x1f\x8b"):
             raise self._no_stream("compressed content (gzip), which was not requested")
         if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
-            raise self._no_stream("a page of HTML")
+            raise self._no_stream("an HTML page")
         if content.startswith((b"STR;", b"CAS;", b"NET;", b"SOURCETABLE")):
             raise self._no_stream("its source table")
 
@@ -348,7 +358,7 @@ class _Answer:
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """Return a TLS context with the certificates of the system and of a PEM file.
+    """Return a TLS context that trusts the certificates of the system and of a PEM file.
 
     Raise SettingsError if the file cannot be read or has no certificate.
     """
@@ -357,7 +367,7 @@ def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
         try:
             context.load_verify_locations(certificates)
         except OSError as error:
-            why = "holds no certificate in PEM" if isinstance(error, ssl.SSLError) else str(error.strerror)
+            why = "contains no PEM certificate" if isinstance(error, ssl.SSLError) else str(error.strerror)
             raise SettingsError(f"ntrip_certificates: {certificates}: {why}; needed for {hidden(source)}") from None
     return context
 
@@ -379,8 +389,8 @@ def _baud(source: str) -> int:
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
     """Yield empty bytes once the serial line is open, then received bytes.
 
-    A thread reads, so that no bytes are lost while the program is busy. Raise InputFileError if the line cannot be
-    opened, breaks, or is silent for `silence_s`.
+    A thread reads the line, so that no bytes are lost while the program is busy. Raise InputFileError if the line
+    cannot be opened, breaks, or is silent for `silence_s`.
     """
     with needs_extra(f"source {source!r}: a serial line"):
         import serial
@@ -394,7 +404,7 @@ async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
         item: bytes | OSError = b""
         while not ended.is_set() and isinstance(item, bytes):
             try:
-                # Wait for the first byte, and read all bytes that have arrived with it.
+                # Wait for one byte, then read all other bytes that have arrived.
                 item = bytes(port.read(1))
                 item += bytes(port.read(port.in_waiting)) if item else b""
             except OSError as error:

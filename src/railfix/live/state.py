@@ -1,8 +1,9 @@
-"""State file, from which a restarted session continues; it is written regularly, and checked before use.
+"""State file, from which a restarted session continues; the file is written regularly, and checked before use.
 
-Its first line, in JSON, has versions, hashes of map, vehicle and settings, and the length and SHA-256 of the state that
-follows. A state is used only if all of these agree with the session. The state contains only plain values, arrays and
-data classes of this package (`railfix.live.state_values`), and reading the file executes no content.
+The first line of the file is JSON with the versions, the hashes of map, vehicle and settings, and the length and
+SHA-256 of the state that follows. A state is used only if the state is complete and the other entries agree with the
+session. The state contains only plain values, arrays and data classes of this package (`railfix.live.state_values`);
+reading the file does not execute code from it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _FORM: Final = "railfix live state 5"
 
 @dataclass(frozen=True, kw_only=True)
 class SavedSession:
-    """State of a session: the states of the engine and of each receiver's stream."""
+    """State of a session: the state of the engine and the states of the receivers' streams."""
 
     engine: EngineState
     streams: Mapping[str, ReceiverState]
@@ -42,14 +43,15 @@ class SavedSession:
 class Loaded:
     """Outcome of reading a state file."""
 
-    session: SavedSession | None  #: None if the file is not used.
+    session: SavedSession | None  #: State read from the file; None if the file is not used.
     outcome: str  #: One sentence for the log.
 
 
 def belongs_to(
     files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...], *, base: str | None = None
 ) -> dict[str, Any]:
-    """Return entries that must agree for a state to be used: versions, antennas, hashes of files and settings.
+    """Return the entries of a state file that must agree with the session: versions, antennas, hashes of files and
+    settings.
 
     `base` is the given position of the base station.
     """
@@ -67,7 +69,10 @@ def belongs_to(
 
 
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
-    """Write a complete state file with the entries of `belongs_to`, or keep the previous file and raise OutputError."""
+    """Write a state file with the entries `under` (see `belongs_to`).
+
+    If it cannot be written completely, keep the previous file, and raise OutputError.
+    """
     content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     part = _part(path)
@@ -84,7 +89,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 
 
 def check_state_path(path: Path) -> None:
-    """Raise OutputError if no state can be written to a path, before a session that could not be continued."""
+    """Raise OutputError if no state can be written to a path; called before the session starts."""
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: is not a regular file, and no state can be written there; give another file")
     try:
@@ -95,9 +100,9 @@ def check_state_path(path: Path) -> None:
 
 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
-    """Read a state file; the state is used only if the entries of the file agree with `under` (`belongs_to`).
+    """Read a state file; the state is used only if the file's entries agree with `under` (see `belongs_to`).
 
-    Raise OutputError if the file is not a state file, and would be overwritten by the session.
+    Raise OutputError if the file exists but is not a state file, because the session would overwrite it.
     """
     try:
         data = path.read_bytes()
@@ -112,14 +117,14 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
         head = None
     form = str(head.get("form")) if isinstance(head, dict) else ""
     if data and not form.startswith("railfix live state "):
-        raise OutputError(f"{path}: is not a state file of railfix live, which would overwrite it; give another file")
+        raise OutputError(f"{path}: is not a state file of railfix live, but would be overwritten; give another file")
     if form != _FORM:
         return _refuse(path, "is not a state file of this version")
     for name, value in under.items():
         if head.get(name) != value:
             return _refuse(path, f"was made with another {name}")
     if {name for name in head if name not in ("form", "bytes", "sha256")} != set(under):
-        return _refuse(path, "was made with other files")
+        return _refuse(path, "was made with other input files")
     if len(content) != head.get("bytes") or hashlib.sha256(content).hexdigest() != head.get("sha256"):
         return _refuse(path, "is damaged or cut off")
     try:
@@ -132,7 +137,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
 
 
 def _part(path: Path) -> Path:
-    """Return the name under which a state is written before it replaces the state file."""
+    """Return the path of the temporary file to which a state is written before it replaces the state file."""
     return path.with_name(f".{path.name}.part")
 
 

@@ -1,8 +1,8 @@
-"""Encoding of a live state as JSON and arrays, and its decoding, which executes no content.
+"""Encoding of a live state as JSON and arrays, and decoding without executing any content.
 
-Plain values, arrays, containers, enumerations, named tuples, settings and data classes of this package are written.
-Settings and data classes are created by their own constructors, so that the constructors' checks apply to the values
-from the file.
+Plain values, arrays, containers, enumerations, named tuples, settings and data classes of this package can be encoded.
+Settings and data classes are decoded by calls of their constructors, so that the constructors' checks apply to the
+values from the file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from railfix.core.settings import Settings
 
-#: Container classes by their names in the file.
+#: Container classes, by the names used for them in the file.
 _MAPPINGS: Final[dict[str, Any]] = {
     "dict": dict, "proxy": MappingProxyType, "counter": Counter, "ordered": OrderedDict,
 }  # fmt: skip
@@ -31,7 +31,7 @@ _SEQUENCES: Final[dict[str, Any]] = {"list": list, "tuple": tuple, "set": set, "
 
 
 class StateFormatError(ValueError):
-    """Error of a value that cannot be part of a state, or of bytes that are not a state."""
+    """Error: a value cannot be part of a state, or bytes are not an encoded state."""
 
 
 def encode(value: Any) -> bytes:
@@ -47,7 +47,7 @@ def encode(value: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """Return the state that `encode` has encoded; raise StateFormatError if the bytes are not a state."""
+    """Return the state from bytes encoded by `encode`; raise StateFormatError if they are not a state."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return _decode(json.loads(stored["tree"].tobytes()), stored)
@@ -141,9 +141,9 @@ def _name(kind: Any) -> str:
 
 
 def _find(name: str, fits: Any) -> Any:
-    """Return a class of this package by its name.
+    """Return the class of this package that has the given name.
 
-    Raise StateFormatError if there is none for which `fits` returns True.
+    Raise StateFormatError if there is no class of this name for which `fits` returns True.
     """
     module, _, own = str(name).partition(":")
     if module.split(".")[0] == "railfix" and own.isidentifier():

@@ -1,9 +1,10 @@
-"""Epochs, navigation records, SBAS messages and sensor samples decoded from a source's data as they arrive.
+"""Decoding of a source's data as they arrive: epochs, navigation records, SBAS messages and sensor samples.
 
-Samples arrive as lines, the rows of a CSV table. The first line has the names of the columns, as in the tables of
-``railfix run``; it may be repeated after a break. A row that has only the time reports that nothing was measured up to
-this time, for example by a tachometer at standstill. `Lag` measures the delay of a session relative to its receivers,
-and selects the epochs to be skipped if the delay is too long.
+Samples of a sensor arrive as lines, which are the rows of a CSV table. The first line has the names of the columns, as
+in the tables of ``railfix run``; this line may be repeated after a break of the connection. A row that has only the
+time reports that nothing was measured up to this time, for example by a tachometer at standstill.
+
+`Lag` measures how far a session is behind the receivers, and selects the epochs to be skipped if the delay is too long.
 """
 
 from __future__ import annotations
@@ -36,35 +37,36 @@ from railfix.run.sensors import make_samples
 
 @dataclass(frozen=True, kw_only=True)
 class ReceiverState:
-    """State of a receiver's stream after the bytes received so far."""
+    """State of the decoder of a receiver's stream after the bytes received so far."""
 
     stream: StreamState = field(default_factory=StreamState)
     tracking: Tracking = field(default_factory=Tracking)
 
     def after_break(self) -> ReceiverState:
-        """Return the state after a break of the connection: the start of an incomplete frame is dropped."""
+        """Return the state after a break of the connection, without the beginning of an incomplete frame."""
         return replace(self, stream=replace(self.stream, rest=b""))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReceivedData:
-    """Epochs, records and messages completed by a chunk of bytes, and the counts of skipped data."""
+    """Epochs, records and messages completed by a chunk of a receiver's bytes, and counts of skipped data."""
 
-    epochs: tuple[Observations, ...]  #: Observations of one epoch each, with the channels observed in the epoch.
+    epochs: tuple[Observations, ...]  #: Observations, one object per epoch, with the channels observed in the epoch.
     navigation: Navigation | None = None
     sbas: SbasFrames | None = None
     skipped_bytes: int = 0
     bad_checksums: int = 0
     passed_over: dict[str, int] = field(default_factory=dict)
-    after: ReceiverState = field(default_factory=ReceiverState)  #: State of the stream after these bytes.
+    after: ReceiverState = field(default_factory=ReceiverState)  #: State of the decoder after these bytes.
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
-    """Yield the items completed by a chunk of a receiver's bytes, in stream order, independent of the chunk boundaries.
+    """Yield the data completed by a chunk of a receiver's bytes, in stream order and independent of chunk boundaries.
 
-    An item ends with the message that completes an epoch, or with the chunk, so that navigation records received before
-    an epoch are used for the epoch. The state for the next chunk is `ReceivedData.after` of the last item; there is at
-    least one item. Epochs with repeated or older time tags are included, and dropped by `LiveEngine.push`.
+    Each item covers the bytes up to a message that completes an epoch, or to the end of the chunk, so that navigation
+    records received before an epoch are used for the epoch. At least one item is yielded; the state for the next chunk
+    is `ReceivedData.after` of the last item. Epochs with repeated or older time tags are included; `LiveEngine.push`
+    drops them.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
@@ -76,7 +78,7 @@ def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
 
 
 def epoch_ends(buffer: Bytes) -> Indices:
-    """Return the offsets after messages that complete an epoch: RXM-RAWX, MeasEpoch, last MSM of an epoch."""
+    """Return the offsets of the ends of messages that complete an epoch: RXM-RAWX, MeasEpoch, last MSM of an epoch."""
     frames = find_frames(buffer, at_end=False)
     raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
     last = msm[rtcm.completes_epoch(frames, msm)]
@@ -103,7 +105,7 @@ def _receive(data: bytes, state: ReceiverState) -> ReceivedData:
 
 
 def single_epochs(observations: Observations) -> tuple[Observations, ...]:
-    """Return the observations of each epoch, with the channels that have a value in the epoch."""
+    """Return the observations of each epoch separately, with the channels that have a value in the epoch."""
     epochs = []
     for k in range(len(observations)):
         part = observations[k : k + 1]
@@ -124,7 +126,7 @@ Item = TypeVar("Item")
 
 
 def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState:
-    """Return the state of a stream before its first byte; for `date` see `railfix.live.run_session`."""
+    """Return the state of a decoder before the first byte; for `date` see `railfix.live.run_session`."""
     if date is None and not is_file(source):
         date = np.datetime64(time.time_ns(), "ns")  # leap seconds are irrelevant here
     return ReceiverState() if date is None else ReceiverState(stream=StreamState(time=date.astype("datetime64[ns]")))
@@ -133,7 +135,7 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """Yield the completed items of a source, and the events of its connection; for `place` see `read_source`."""
+    """Yield the data decoded from a source, and the events of the connection; for `place` see `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and find_kind(path) != "receiver":
         for piece in scan_observations(path, epochs=200):
@@ -157,7 +159,7 @@ async def next_arrival(
 ) -> Item | None:
     """Return the next item from the pumps; None after `wait_s`, or when a pump has ended with an error."""
     if not queue.empty():
-        await asyncio.sleep(0)  # signals are handled even if data arrive faster than they are processed
+        await asyncio.sleep(0)  # let the event loop handle signals even if data arrive faster than they are processed
         return queue.get_nowait()
     getting = asyncio.ensure_future(queue.get())
     running = [pump for pump in pumps if not pump.done()]
@@ -168,13 +170,13 @@ async def next_arrival(
     return None
 
 
-#: Time after every epoch.
+#: Time later than any epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
-#: Columns that must have a number in every row with values.
+#: Columns that must have a number in every row that has values besides the time.
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
-#: Number of bytes that are kept of an incomplete line; a longer line loses its beginning.
+#: Number of bytes kept of an incomplete line; the beginning of a longer line is dropped.
 _LINE_BYTES: Final = 4096
 
 
@@ -186,10 +188,10 @@ class Sensed:
     samples: SensorSamples = field(default_factory=SensorSamples)
     #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a complete table.
     until: np.datetime64
-    skipped: int = 0  #: Number of lines that are not rows, or whose time is before the previous row's time.
+    skipped: int = 0  #: Number of lines that are not rows, or have a time before the previous row.
 
     def count_unsurveyed(self, units: GroundUnits | None) -> int:
-        """Count the ranges to ground units without surveyed positions, which are not used."""
+        """Count the ranges to ground units without a surveyed position; these ranges are not used."""
         return int(np.count_nonzero(~np.isin(self.samples.ranging.station, () if units is None else units.name)))
 
 
@@ -197,9 +199,8 @@ class Sensed:
 class SensorLines:
     """Decoder of the rows of one sensor's stream."""
 
-    #: Sensor of `railfix.motion.samples.SENSORS`, and the name of its source in error messages.
-    sensor: str
-    source: str
+    sensor: str  #: Sensor, one of `railfix.motion.samples.SENSORS`.
+    source: str  #: Name of the sensor's source in error messages.
     columns: tuple[str, ...] = ()  #: Names of the columns; empty before the header line.
     until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last row.
     rest: bytes = b""  #: Incomplete last line.
@@ -209,7 +210,7 @@ class SensorLines:
         self.rest = b""
 
     def take(self, data: bytes) -> Sensed:
-        """Return the samples completed by a chunk of bytes with arbitrary boundaries.
+        """Return the samples completed by a chunk of bytes; a chunk may begin and end anywhere.
 
         Raise InputFileError if the first line is not the header of this sensor's table.
         """
@@ -241,13 +242,13 @@ class SensorLines:
         if missing:
             raise InputFileError(
                 self.source,
-                f"the first line has no column {missing[0]}; expected a header with {', '.join(needed)} of the "
-                f"{self.sensor}, then its rows",
+                f"the first line has no column {missing[0]}; expected a header with the columns "
+                f"{', '.join(needed)} of the {self.sensor} table, then the rows",
             )
         return tuple(cells)
 
     def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
-        """Return the time and values of a row, no values for a row with only a time; None for an invalid line."""
+        """Return the time and the values of a row; None for an invalid line. A row with only a time has no values."""
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))
@@ -275,23 +276,25 @@ class SensorLines:
         return SensorSamples(**samples)
 
 
-#: Largest drift of the computer's clock relative to GPS time; the stored shortest delay grows at this rate.
+#: Largest drift of the computer's clock relative to GPS time [s/s]; the stored shortest delay grows at this rate.
 DRIFT: Final = 1e-4
-#: A delay that is constant within `STEADY_S` for `ADMITTED_S` [s] and `STEADY_EPOCHS` skipped epochs is an offset of
-#: the time tags. A processing delay would decrease, or increase if the computer is too busy even to skip epochs.
+#: Time for which a delay must be constant to count as an offset of the time tags [s]. A processing delay would
+#: decrease, or increase if the computer is too busy even to skip epochs.
 ADMITTED_S: Final = 2.0
+#: Largest change of a delay that counts as constant [s].
 STEADY_S: Final = 0.2
+#: Number of epochs that must be skipped during the constant delay.
 STEADY_EPOCHS: Final = 5
 
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs relative to the shortest observed delay, for which the clocks need not agree."""
+    """Delay of epochs compared with the shortest delay so far; the clocks of receiver and computer need not agree."""
 
-    #: Delay above which epochs are skipped until the delay is a quarter of this limit [s]; may be infinite.
+    #: Delay above which epochs are skipped, until the delay has fallen to a quarter of this limit [s]; may be infinite.
     behind_s: float
     skipped: int = 0  #: Number of epochs skipped since the delay exceeded the limit.
-    reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
+    reports: list[str] = field(default_factory=list)  #: Sentences that the session still has to log.
     _shortest_ns: float | None = None
     _at_ns: int = 0
     _since_ns: int = 0
@@ -299,11 +302,11 @@ class Lag:
     _steady: int = 0
 
     def reset(self) -> None:
-        """Reset the shortest delay after a change of the tags' origin."""
+        """Forget the shortest delay after the time tags have jumped."""
         self._shortest_ns, self.skipped = None, 0
 
     def skips(self, tag_ns: int, now_ns: int) -> bool:
-        """Update the delay with an epoch, and return whether the epoch is to be skipped."""
+        """Update the delay with an epoch's tag and arrival [ns], and return whether the epoch is to be skipped."""
         delay_ns = now_ns - tag_ns
         shortest = float(delay_ns) if self._shortest_ns is None else self._shortest_ns
         shortest = min(float(delay_ns), shortest + DRIFT * (now_ns - self._at_ns))
@@ -324,7 +327,7 @@ class Lag:
             self._since_ns, self._steady_s, self._steady = now_ns, lag_s, 0
         elif self._steady >= STEADY_EPOCHS and (now_ns - self._since_ns) * 1e-9 > ADMITTED_S:
             self.reports.append(
-                f"the receivers' time is {lag_s:.1f} s later than before; {self.skipped} epochs were skipped"
+                f"the receivers' time tags are {lag_s:.1f} s older than before; {self.skipped} epochs were skipped"
             )
             self.reset()
             return False

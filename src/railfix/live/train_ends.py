@@ -1,4 +1,4 @@
-"""Reference point of a train, reduction of its antennas to this point, its two ends, and its leading end."""
+"""Reference point of a train, and positions of the antennas and the ends of the train relative to this point."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: Distance run away from the leading end after which the train has changed ends; longer than any rolling back [m].
+#: Distance run against the direction of the leading end after which the train has changed ends [m]. It is longer than
+#: any distance that a train rolls back.
 CHANGED_ENDS_M: Final = 50.0
 
 
@@ -24,7 +25,7 @@ class Ends(NamedTuple):
     If the running direction is unknown, each end may be on either side.
     """
 
-    front_m: float  #: Middle of the possible positions of the front end, positive ahead.
+    front_m: float  #: Middle of the possible positions of the front end, positive ahead of the reference point.
     spread_m: float  #: Largest distance of the front end from `front_m`.
     foremost_m: float  #: Largest distance of any part of the train ahead of the reference point.
     rearmost_m: float  #: Largest distance of any part of the train behind the reference point.
@@ -32,7 +33,7 @@ class Ends(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainFrame:
-    """Reference point of a train, and its ends.
+    """Reference point and ends of a train.
 
     The reference point is the middle between the bogies of the vehicle that carries the antennas. Without a vehicle
     file the reference point is the first antenna, and positions of a second antenna are not used.
@@ -41,15 +42,13 @@ class TrainFrame:
     trajectories: Mapping[str, Trajectory]
     facing: int  #: Direction of the vehicle's front along the line, 0 if unknown.
     running: int  #: Direction of the leading end at the start, 0 if unknown.
-    #: Distance of the train's front end ahead of the reference point, distance of the rear end behind the reference
-    #: point, and length of the train [m]; NaN if unknown.
-    front_m: float
-    rear_m: float
-    length_m: float
+    front_m: float  #: Distance by which the vehicle's front end is ahead of the reference point [m]; NaN if unknown.
+    rear_m: float  #: Distance by which the rear end is behind the reference point [m]; NaN if unknown.
+    length_m: float  #: Length of the train [m]; NaN if unknown.
 
     @classmethod
     def of(cls, trajectories: Mapping[str, Trajectory], settings: LiveSettings) -> Self:
-        """Return the frame of a train from its vehicle file and the settings, which take precedence.
+        """Return the frame of a train, from the vehicle file and the settings; the settings take precedence.
 
         Raise SettingsError if the front end is farther ahead of the reference point than the train is long.
         """
@@ -80,21 +79,21 @@ class TrainFrame:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on unknown properties of the train, and the settings that provide them."""
+        """Sentences that name unknown properties of the train, and the settings that provide them."""
         notes = []
         if not self.running:
             notes.append("the direction of the train's front end is unknown until the train has run 50 m: give a "
                          "vehicle file, or --live facing")  # fmt: skip
         if not math.isfinite(self.front_m):
             notes.append(
-                "the position of the train's front end is unknown, messages have the position of the antenna or its "
-                "vehicle: give length_m in the vehicle file, or --live front_offset_m"
+                "the position of the train's front end is unknown, so messages have the position of the reference "
+                "point: give length_m in the vehicle file, or --live front_offset_m"
             )
         if not math.isfinite(self.length_m):
-            notes.append("the train's length is unknown, messages have no safe rear end: give length_m in the vehicle "
-                         "file, or --live length_m")  # fmt: skip
+            notes.append("the train's length is unknown, so messages have no safe rear end: give length_m in the "
+                         "vehicle file, or --live length_m")  # fmt: skip
         if len(self.trajectories) > 1 and self.trajectories[self.first].body_chainage_m is None:
-            notes.append("there is no vehicle file: messages have positions of the first antenna alone")
+            notes.append("there is no vehicle file: positions are computed from the first antenna alone")
         return tuple(notes)
 
     def reference_m(self, name: str, arc_m: float) -> float:
@@ -110,14 +109,16 @@ class TrainFrame:
         return next(iter(self.trajectories))
 
     def first_antenna_ecef_m(self, name: str, arc_m: float) -> Floats:
-        """Return the first antenna's position (ECEF), shape (3,) [m], from any antenna's position along the line."""
+        """Return the first antenna's position (ECEF), shape (3,) [m], computed from an antenna's position along the
+        line.
+        """
         first, trajectory = self.trajectories[self.first], self.trajectories[name]
         if name != self.first:
             arc_m = float(first.arc_of_body(trajectory.body_at(arc_m)))
         return first.at_arc(np.float64(arc_m))
 
     def ends(self, running: int) -> Ends:
-        """Return the ends of a train that runs in a direction, 1 or -1; with 0 each end may be on either side."""
+        """Return the ends of a train; `running` is the direction of the leading end, 1 or -1, or 0 if unknown."""
         front, rear = self.front_m, self.rear_m
         if running and self.facing:
             front, rear = (front, rear) if running == self.facing else (rear, front)
@@ -125,33 +126,35 @@ class TrainFrame:
         longest, shortest = max(front, rear), min(front, rear)
         if not math.isfinite(front + rear):
             longest = shortest = math.nan
-        if running:  # it is unknown which end of the vehicle is ahead
+        if running:  # it is unknown whether the front or the rear of the vehicle is ahead
             return Ends((longest + shortest) / 2.0, (longest - shortest) / 2.0, longest, longest)
         return Ends(0.0 if math.isfinite(longest) else math.nan, longest, longest, longest)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunningEnd:
-    """Direction of the train's leading end along the chainage, from the vehicle file and from motion.
+    """Direction of the train's leading end along the chainage, from the vehicle file and the train's motion.
 
-    The train has changed ends, or an unknown leading end is determined, when the train moves away from its farthest
-    position in the opposite direction, and the distance of the reference point from this position exceeds
-    `CHANGED_ENDS_M` plus both bounds.
+    The direction is set, or changed, when the train moves away from the farthest position that it has reached in the
+    opposite direction. The distance from this position must exceed `CHANGED_ENDS_M` plus the bounds of both positions.
     """
 
     direction: int  #: 1 toward rising chainage, -1 toward falling, 0 if unknown.
-    #: Upper bound of the lowest and lower bound of the highest chainage of the reference point since the last change
-    #: [m]; infinite before the first position.
+    #: Upper bound of the lowest chainage of the reference point since the last change of direction [m]; infinite before
+    #: the first position.
     low_m: float = math.inf
+    #: Lower bound of the highest chainage of the reference point since the last change of direction [m]; minus infinity
+    #: before the first position.
     high_m: float = -math.inf
-    last_m: float = math.inf  #: Last chainage; infinite before the first.
+    last_m: float = math.inf  #: Last chainage of the reference point [m]; infinite before the first position.
 
     def after(self, reference_m: float, bound_m: float, moving: int) -> RunningEnd:
-        """Return the state after an epoch, unchanged if there is no bound; `moving` is the direction of motion."""
+        """Return the state after an epoch, unchanged without a finite bound; `moving` is the direction of motion."""
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # after a gap, or at the end of a lap of a closed line
+        # after a gap, or where the chainage of a closed line starts again
+        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction
         if moving > 0 and direction != 1 and reference_m - bound_m - low > CHANGED_ENDS_M:
@@ -163,10 +166,12 @@ class RunningEnd:
         return replace(self, direction=direction, low_m=low, high_m=high, last_m=reference_m)
 
     def sentence(self, before: RunningEnd) -> str | None:
-        """Return a sentence for the log if the direction has changed since the state `before`, otherwise None."""
+        """Return a sentence for the log if the direction differs from that of the earlier state `before`, otherwise
+        None.
+        """
         if self.direction == before.direction:
             return None
         side = "rising" if self.direction > 0 else "falling"
         if not before.direction:
-            return f"the train runs toward {side} chainage: its front end is assumed to point there"
+            return f"the train runs toward {side} chainage; its front end is assumed to point in this direction"
         return f"the train has changed ends: it has run {CHANGED_ENDS_M:g} m toward {side} chainage"

@@ -1,6 +1,6 @@
 """Compilation of all kernels at the first command on a machine; later commands load them from disk.
 
-Compilation during a live session would delay epochs by seconds, and a run would pause without a message.
+Without this step, compilation would delay epochs of a live session by seconds, and a run would pause without a message.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import TrackState
 
-#: Settings and numbers of epochs that together call every kernel except the kernels of `_look_beyond`; with the second
-#: settings there are too few satellites for 3-D positions.
+#: Settings, and numbers of epochs to process with them, that together call every kernel of single epochs except those
+#: in `_look_beyond`. With the second settings, there are too few satellites for 3-D positions.
 _SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -45,14 +45,15 @@ _WITH_FILTER: Final[tuple[dict[str, Any], int]] = ({"filter": "track", "protecti
 def prepare_kernels() -> bool:
     """Compile the kernels that have no cached machine code; return whether any were compiled.
 
-    Epochs of the demonstration are processed in one call and one by one, so that kernels are compiled for the arrays of
-    both cases. A message is written to a terminal. Raise InputFileError if the files of the demonstration are missing.
+    Epochs of the demonstration are processed both in one call and one by one, so that kernels are compiled for the
+    types of arrays in both cases. If the standard error output is a terminal, the duration is printed. Raise
+    InputFileError if the files of the demonstration are missing.
     """
     if kernels.is_compiled():
         return False
     begin = time.monotonic()
-    # numba compiles one function at a time in a process: the filter's functions, about half of them, are compiled in
-    # another process
+    # numba compiles only one function at a time in a process. The filter's functions, about half of all, are therefore
+    # compiled in another process.
     filter_process = subprocess.Popen(
         [sys.executable, "-c", f"from {__name__} import compile_filter; compile_filter()"]
     )
@@ -66,7 +67,7 @@ def prepare_kernels() -> bool:
     _process(*_WITH_FILTER, logs)
     kernels.record_compiled()
     if sys.stderr.isatty():
-        sys.stderr.write(f"compiled in {time.monotonic() - begin:.0f} s; later commands load the kernels\n")
+        sys.stderr.write(f"kernels compiled in {time.monotonic() - begin:.0f} s; later commands load them\n")
     return True
 
 
@@ -90,7 +91,7 @@ def compile_filter() -> None:
 
 
 def _read_logs() -> dict[str, Observations]:
-    """Read the first epochs of the demonstration, with a fault for RAIM to detect."""
+    """Read the first epochs of the demonstration, with a simulated fault that RAIM detects."""
     inputs, longest = demo_inputs(), max(epochs for _, epochs in (*_SINGLE_EPOCHS, _WITH_FILTER))
     logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
     strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
@@ -98,7 +99,7 @@ def _read_logs() -> dict[str, Observations]:
 
 
 def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations]) -> None:
-    """Process the first epochs of the logs with the settings `chosen`, in one call and one by one."""
+    """Process the first epochs of the logs with the settings `chosen`, first in one call and then one by one."""
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
@@ -110,7 +111,10 @@ def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations])
 
 
 def _look_beyond() -> None:
-    """Call the kernels for positions beyond a level, which the straight line of the demonstration does not require."""
+    """Call the kernels that compute the risk of positions beyond a protection level.
+
+    The straight line of the demonstration does not require these kernels.
+    """
     nothing, clock = np.zeros((1, 1)), np.zeros(1, dtype=np.intp)
     model = ModelArrays(
         nothing, clock, np.zeros((1, 1, 1)), np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.zeros((3, 3)), nothing
@@ -132,5 +136,5 @@ def _first_epochs(log: Path, count: int) -> Observations:
 
 
 def _faulty(log: Observations, satellite: str) -> Observations:
-    """Return the log with a satellite's codes 300 m too long, for RAIM to detect."""
+    """Return the log with one satellite's codes lengthened by 300 m, a fault that RAIM detects."""
     return replace(log, code_m=log.code_m + np.where(log.satellite == satellite, 300.0, 0.0))
