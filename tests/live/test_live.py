@@ -289,7 +289,7 @@ def test_two_channels_agree_and_a_difference_stops(logs: dict[str, tuple[Observa
         (["--front", "tcp://nowhere"], 4, "expected a file, tcp://HOST:PORT"),
         (["--front", "ntrip://host:2101"], 4, "MOUNT"),
         (["--front", "missing.ubx"], 3, "no such file"),
-        (["--front", "tcp://127.0.0.1:9"], 3, "cannot be connected"),
+        (["--front", "tcp://127.0.0.1:9"], 3, "connection cannot be opened"),
         (["--front", "FRONT", "--send", "xml@-"], 4, "FORM@TARGET"),
         (["--front", "FRONT", "--send", "json@udp://nowhere"], 4, "FORM@TARGET"),
         (["--front", "FRONT", "--live", "perod_s=1"], 4, "perod_s"),

@@ -75,7 +75,7 @@ def test_chunks_are_joined_however_the_header_is_written(coding: bytes) -> None:
         (b"SOURCETABLE 200 OK\r\n", "check the mount point"),
         (OK + b"Content-Type: text/html\r\n\r\n<p>", "an HTML page"),
         (OK + b"\r\n<!DOCTYPE html><html>" + bytes(40), "an HTML page"),
-        (OK + b"Content-Encoding: gzip\r\n\r\n" + gzip.compress(b"x" * 50, mtime=0), "coded as 'gzip'"),
+        (OK + b"Content-Encoding: gzip\r\n\r\n" + gzip.compress(b"x" * 50, mtime=0), "encoding 'gzip'"),
         (OK + b"\r\n" + gzip.compress(b"x" * 50, mtime=0), "compressed content"),
         (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "check user and password"),
         (OK + b"X: " + b"y" * 70_000 + b"\r\n\r\n", "answer is not HTTP"),

@@ -298,7 +298,7 @@ def test_mqtt_broker_that_asks_for_a_password(tmp_path: Path) -> None:
     try:
         asyncio.run(run("train:p%3As@"))
         for login in ("", "train:wrong@"):
-            with pytest.raises(OutputError, match="refuses the connection"):
+            with pytest.raises(OutputError, match="has refused the connection"):
                 asyncio.run(run(login))
     finally:
         process.terminate()
