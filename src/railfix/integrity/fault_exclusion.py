@@ -81,14 +81,14 @@ def exclude_faults(
     limits: RaimLimits | None = None,
     fix_limits: FixLimits | None = None,
 ) -> tuple[Ranges, LineFix, RaimResult]:
-    """Exclude up to two faulty satellites per epoch and return the ranges, re-solved positions and test results.
+    """Exclude up to two faulty satellites per epoch and return the remaining ranges, new positions and test results.
 
     The sum of squared residuals is compared with a chi-square threshold (P4, false-alarm probability 1e-3), or with 100
     m^2 (P1 table 6, mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4)). A satellite or
-    pair is excluded if the remaining ranges pass and if the errors of the excluded ranges exceed the limit. A pair is
-    not excluded if the robust fit of the epoch keeps a range of the pair, because the other satellites may then be the
-    faulty ones. Where a fault remains unresolved, the position is computed from the ranges kept by the robust fit
-    (`RaimResult.faulty`).
+    pair is excluded if the remaining ranges pass the test and the errors of the excluded ranges exceed the limit. A
+    pair is not excluded if the robust fit of the epoch keeps a range of the pair, because other satellites may then be
+    the faulty ones. Where a fault remains unresolved, the position is computed from the ranges kept by the robust fit,
+    and `RaimResult.faulty` is true.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def exclude_faults(
     antennas, limits, fix_limits = AntennaRows.on(line), limits or RaimLimits(), fix_limits or FixLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),))
     if not (scale > 0.0).all(where=np.isfinite(scale)):
-        raise ValueError("scale must be positive: standard deviation of the ranges over the sigmas of the weights")
+        raise ValueError("scale must be positive: standard deviation of the ranges divided by the sigma of the weights")
     test = _detect(fix, ranges.redundancy, scale, limits)
     raim = _untested(test, ranges.weight.shape, scale)
     raim.outcome[test.testable] = Outcome.PASSED
@@ -132,7 +132,7 @@ def exclude_faults(
         return ranges, fix, raim
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
-    # Without the fault, another section may fit best; the remaining ranges must also be consistent on that section.
+    # After an exclusion, another section may fit best; the remaining ranges must also be consistent on the new section.
     still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
     raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim
@@ -172,10 +172,10 @@ def _second_attempt(
     limits: RaimLimits,
     fix_limits: FixLimits,
 ) -> Exclusion:
-    """Repeat the exclusion at unresolved epochs, linearised at positions without the satellite of the largest residual.
+    """Repeat the exclusion at unresolved epochs at a position without the satellite that has the largest residual.
 
-    On a curve, a large fault moves the position to a part of the line with another direction, where the
-    linear model is not valid for the true position.
+    On a curve, a large fault moves the position to a part of the line with another direction. A model linearised there
+    is not valid for the true position.
     """
     worst = np.zeros((len(epochs), ranges.code_m.shape[1]), dtype=bool)
     worst[np.arange(len(epochs)), worst_channel(model)] = True

@@ -30,7 +30,7 @@ _LEAST_FREEDOM: Final = 2
 class LastingErrorLimits(Settings):
     """Limits of the test for persistent range errors."""
 
-    #: Time constant of the mean residual. The default is a minute, because reflections are shorter on a moving train.
+    #: Time constant of the mean residual. The default is a minute, because reflections end sooner on a moving train.
     memory_s: float = Field(default=60.0, gt=0)
     #: Clipping limit of a residual, in standard deviations of the weights or, if larger, of the receiver's noise.
     clipped: float = Field(default=2.0, gt=0)
@@ -57,7 +57,7 @@ class LastingErrorState:
 
 
 class BiasLimits(NamedTuple):
-    """Limits of the test for persistent errors, and limits of the re-solved positions."""
+    """Limits of the test for persistent errors, and limits for the positions computed after a rejection."""
 
     lasting: LastingErrorLimits = LastingErrorLimits()
     fix: FixLimits = FixLimits()
@@ -85,7 +85,7 @@ def reject_persistent_biases(
 
     An error of twice the noise passes the single-epoch test of P4, so the clipped residuals are averaged over time. The
     satellite with the largest mean is rejected first. The positions are then computed again, and the next satellite is
-    rejected by the new residuals.
+    chosen by the new residuals.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def reject_persistent_biases(
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
-    """Return the mask (T, K) of each epoch's used range with the largest absolute mean, if above the limit."""
+    """Return a mask (T, K) of each epoch's used range with the largest absolute mean, if the mean exceeds `share`."""
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)

@@ -17,7 +17,7 @@ from railfix.positioning.range_arrays import Ranges
 class PointStatus(IntEnum):
     """Result of the validation of a conventional position."""
 
-    #: Residuals and dilution passed. Without a redundant range, the residuals are not tested.
+    #: Residuals and dilution of precision passed. Without a redundant range, the residuals are not tested.
     VALID = 0
     #: No position.
     NO_POSITION = 1

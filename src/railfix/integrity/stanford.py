@@ -86,8 +86,8 @@ def stanford(
     error_m : array_like, shape (T,) [m]
         Error along the track, signed or absolute; NaN without a position or without a reference.
     level_m : array_like, shape (T,) [m]
-        Protection level; infinite where no error can be excluded, NaN without a position. Where an error is known but
-        no level, the level counts as infinite.
+        Protection level; infinite where no error can be excluded, NaN without a position. Where the error is known but
+        the level is missing, the level counts as infinite.
     windows_s : sequence of float [s]
         Lengths of the continuity windows. The default of 15 s is taken from aviation approaches, and 60 s is a travel
         time between two stations.

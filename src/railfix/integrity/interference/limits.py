@@ -22,7 +22,7 @@ class Suspicion(IntEnum):
     NONE = 0
     JAMMING_SUSPECTED = 1
     SPOOFING_SUSPECTED = 2
-    #: All satellites are consistent with one error of the time tags.
+    #: One common error of the time tags explains the ranges of all satellites.
     TIME_TAGS = 3
     #: The 3-D positions have left the map, without a sign of spoofing or of a time-tag error.
     LEFT_MAP = 4
@@ -34,13 +34,13 @@ class Sign(IntFlag):
     """Signs of interference; one epoch may have several."""
 
     NONE = 0
-    #: The receiver reports jamming: UBX MON-RF, MON-HW and SEC-SIG (critical), SBF RFStatus (not cancelled).
+    #: The receiver reports jamming in UBX MON-RF, MON-HW or SEC-SIG (critical), or in SBF RFStatus (not cancelled).
     RECEIVER_JAMMING = 1 << 0
     #: The C/N0 of all satellites has fallen by nearly the same amount.
     CN0_FALL = 1 << 1
     #: The front-end gain of the receiver has fallen.
     GAIN_FALL = 1 << 2
-    #: The receiver reports spoofing: UBX SEC-SIG (affirmed), SBF RFStatus.
+    #: The receiver reports spoofing in UBX SEC-SIG (affirmed) or SBF RFStatus.
     RECEIVER_SPOOFING = 1 << 3
     #: All satellites have the same C/N0, as from one transmitter.
     EQUAL_CN0 = 1 << 4
@@ -54,7 +54,7 @@ class Sign(IntFlag):
     CONSTELLATIONS_PART = 1 << 8
     #: Consistent 3-D positions have left the map laterally.
     LEFT_MAP = 1 << 9
-    #: The distance travelled by satellite positions deviates from the wheel distance.
+    #: The distance between satellite positions deviates from the wheel distance.
     WHEEL_PARTS = 1 << 10
     #: One common error of the time tags explains the ranges.
     TIME_TAGS = 1 << 11
@@ -78,26 +78,26 @@ class InterferenceLimits(Settings):
     """
 
     use: Literal["on", "off"] = "on"
-    least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test over all satellites.
-    #: Minimum fall of C/N0 below the recent peak, as the median of all satellites.
+    least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test that compares satellites.
+    #: Minimum fall of C/N0 below the recent peak, computed as the median over all satellites.
     fall_db: float = Field(default=5.0, gt=0)
     #: Largest standard deviation of the falls over the satellites. A jammer raises the noise of all channels equally;
     #: walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
-    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
+    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time after which a satellite's C/N0 is used.
     #: Minimum fall of the front-end gain, as a fraction of the recent peak. While a receiver starts without
     #: interference, the fall reaches 14 %.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
     #: Standard deviation of C/N0 over the satellites up to which C/N0 counts as equal. In open sky, this standard
     #: deviation is 1.2 dB or more.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Minimum step of the codes relative to the Dopplers, minus whole milliseconds. Phone clocks step by 30 m.
+    #: Minimum step of the codes relative to the Dopplers, whole milliseconds subtracted. Phone clocks step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
     drift_jump_mps: float = Field(default=10.0, gt=0)  #: Minimum jump of the clock drift.
     speed_jump_mps: float = Field(default=5.0, gt=0)  #: Minimum jump of the 3-D velocity.
     position_jump_m: float = Field(default=30.0, gt=0)  #: Minimum jump of the 3-D position.
-    #: Minimum distance of the 3-D position from the line that is a sign. A yard is some 100 m wide.
+    #: Minimum distance of the 3-D position from the line that counts as a sign. A yard is some 100 m wide.
     off_map_m: float = Field(default=100.0, gt=0)
     #: Minimum estimated error of the time tags. For correct tags, the estimated error reaches 0.05 s in towns, and
     #: 0.13 s with a phone and seven satellites.
@@ -105,7 +105,7 @@ class InterferenceLimits(Settings):
     tag_sigmas: float = Field(default=6.0, gt=0)  #: Minimum estimated error of the time tags, in standard deviations.
     #: Time for which all positions must fail a check before positions are considered unreliable.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Minimum of each jump, and of the distance from the line beyond `position_jump_m`, in standard deviations.
+    #: Minimum of each jump, and of the excess of the distance from the line over `position_jump_m`, in sigmas.
     jump_sigmas: float = Field(default=10.0, gt=0)
     #: Minimum difference between the positions and clocks of two constellations, in standard deviations.
     part_sigmas: float = Field(default=15.0, gt=0)
@@ -120,11 +120,11 @@ class InterferenceLimits(Settings):
     part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which a difference of constellations must persist.
     #: Length of the window over which satellite and wheel distances are compared.
     wheel_window_s: float = Field(default=120.0, gt=0)
-    wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of this window, for example after a slip.
+    wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or gap.
     wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference between satellite and wheel distance.
-    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum difference of these distances in standard deviations.
-    #: Whether the filter's protection level covers a pull along the track that the comparison with the wheel has not
-    #: detected yet. The level is then two to four times as large.
+    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum of this difference in standard deviations.
+    #: Whether the filter's protection level covers a pull of the positions along the track that the comparison with the
+    #: wheel has not detected yet. With "on", the level is two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
     #: Number of standard deviations of the distance difference that `wheel_level` adds to the level. The default of 2.1
     #: assumes a probability of 1e-7 that a pull has begun within the window, and a risk of 1e-9.
@@ -133,7 +133,7 @@ class InterferenceLimits(Settings):
     wheel_scale: float = Field(default=0.01, gt=0)
     #: Relative standard deviation of later changes of the wheel circumference (creep).
     wheel_change: float = Field(default=0.001, gt=0)
-    #: Acceleration above which the wheel has slipped and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
+    #: Wheel acceleration that counts as a slip, so that the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
     #: Time for which a suspicion, other than suspected spoofing, remains after its last sign.
     jamming_release_s: float = Field(default=10.0, ge=0)
@@ -155,7 +155,7 @@ def suspicion(causes: Bits) -> Codes:
     If several causes are possible, the cause that explains most signs is returned. A common time-tag error comes first,
     because it displaces positions and clocks in the same way as a spoofer. Spoofing precedes leaving the map, because
     leaving the map explains neither jumps nor equal C/N0 nor differing constellations. Satellites with individual
-    errors have been excluded before.
+    errors have already been excluded.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -186,8 +186,8 @@ def hold_signs(
 ) -> tuple[Masks, Masks, HeldState]:
     """Apply holding and release times to conditions; return two masks and the state.
 
-    The first mask marks conditions that have been true for their holding time, the second conditions within their
-    release time.
+    The first mask marks conditions that have been true for their holding time, the second mask marks conditions that
+    are within their release time.
 
     An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
     sufficient. Signs and masks have the shape (T, C), holding and release times the shape (C,) [s]. A condition with a

@@ -80,7 +80,7 @@ class MotionSigns:
     position_jump_sigmas: Floats
     #: Largest difference between the positions and clocks of any two constellations, in standard deviations; (T,).
     part_sigmas: Floats
-    off_line_m: Floats  #: Distance of the 3-D position from the line, shape (T,); NaN until a position has been on it.
+    off_line_m: Floats  #: Distance of the 3-D position from the line, shape (T,); NaN before the first position on it.
     #: Excess of `off_line_m` over `InterferenceLimits.position_jump_m` in standard deviations, shape (T,).
     off_line_sigmas: Floats
     tag_error_s: Floats  #: Median time-tag error of the last epochs, positive for late tags; shape (T,).
@@ -88,7 +88,7 @@ class MotionSigns:
 
 
 class MotionFit(NamedTuple):
-    """Single-epoch fits of the ranges of T epochs, of one or several antennas."""
+    """Single-epoch fits to the ranges of one or several antennas, T epochs."""
 
     fixes: Fix
     part_sigmas: Floats  #: As in `MotionSigns`.
@@ -169,7 +169,7 @@ def _length(covariance: Floats) -> Floats:
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
-    """Return the last accurate fix before each epoch, and the last accurate fix of the chunk (or else `start`)."""
+    """Return the last accurate fix before each epoch, and the last of the chunk; `start` where there is none."""
     if len(good) == 1:
         return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))
@@ -193,7 +193,7 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return by how much a position is beyond a train's reach from the previous one, in m and in sigmas.
+    """Return the distance by which a position is out of reach from the previous position, in m and in sigmas, (T,).
 
     The previous position is extrapolated with the velocity at that position. Without a velocity, the train may have
     moved in any direction at the largest speed of a train.
@@ -212,7 +212,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Strings, Floats, Floats, Datetimes]]:
-    """Return the median change of codes relative to Dopplers, minus whole milliseconds (T,) [m], and the last codes."""
+    """Return the median change of codes relative to Dopplers (T,) [m], whole milliseconds removed, and last codes."""
     young = seconds(inputs.time[0] - state.since) <= limits.longest_gap_s
     joined = join_channels(inputs.channel, [state.channel], [young])
     code, rate = (joined.arrange(values, np.nan) for values in (state.code_m, state.rate_mps))

@@ -15,7 +15,7 @@ _RIDGE: Final = 1e-9  #: Loose prior weight of the unknowns, for conditioning.
 
 
 class MotionInputs(NamedTuple):
-    """Ranges of T epochs by K channels, with the lines of their antennas."""
+    """Ranges of T epochs by K channels, and the lines of the antennas."""
 
     time: Datetimes  #: Shape (T,).
     break_before: Masks  #: True where an epoch is not compared with the previous epoch, shape (T,).
@@ -29,7 +29,7 @@ class MotionInputs(NamedTuple):
     corrected_code_m: Floats  #: Corrected pseudoranges, shape (T, K).
     sigma_m: Floats  #: Standard deviations of the corrected pseudoranges, shape (T, K).
     used: Masks  #: Channels without a rejection reason, shape (T, K).
-    named: Masks  #: Channels rejected only because of an error of this one satellite, shape (T, K).
+    named: Masks  #: Channels rejected only for an error of their own satellite, shape (T, K).
     noise_scale: Floats  #: Ratio of the receiver's range standard deviation to `sigma_m`, shape (T,).
     clock_offset_m: Floats  #: Known offsets between the receiver clocks, shape (T, G).
     clock_sigma_m: Floats  #: Standard deviations of these offsets, shape (T, G).

@@ -16,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 
-#: Order of magnitude of a satellite's range rate, by which the design column of the error is divided [m/s].
+#: Order of magnitude of a satellite's range rate, by which the design column of the time-tag error is divided [m/s].
 _RATE_MPS: Final = 500.0
 _TAG_EPOCHS: Final = 10  #: Largest number of epochs over which the median error is computed.
 _TAG_LEAST: Final = 3  #: Smallest number of epochs over which the median error is computed.
@@ -28,8 +28,8 @@ _ROUNDS: Final = 2  #: Number of reweighted fits per step.
 _FITS_WELL: Final = 3.0  #: Multiple of the median residual up to which residuals have full weight.
 _SHOWN: Final = 3.0  #: Time-tag errors above this many standard deviations are compared with the alternatives.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's distance from its line, across and up.
-_LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree on an error.
-#: Residuals up to this many standard deviations agree; the cost contains residuals clipped at this limit.
+_LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree with a time-tag error.
+#: Residuals up to this many standard deviations count as consistent. In the cost, residuals are clipped at this limit.
 _AGREES: Final = 5.0
 #: Minimum reduction of the cost by an accepted time-tag error. The value exceeds the cost of one clipped residual,
 #: because a time-tag error can absorb one bad code.
@@ -61,11 +61,11 @@ class _TagFit(NamedTuple):
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     """Return the common time-tag error, positive for late tags, and its standard deviation, shape (T,) [s].
 
-    Satellites that were rejected as faulty are fitted, too, because a time-tag error makes satellites appear faulty.
-    Where the error is significant, or the position is doubtful, the line is used as a constraint. The standard
-    deviation is then infinite unless redundant rows agree, and the cost is clearly lower than without a time-tag error
-    and without the rejected satellites. The cost is the sum of the squared normalised residuals of all codes and of the
-    line, clipped at `_AGREES`. Error and standard deviation are NaN where they cannot be determined.
+    The fit includes satellites rejected as faulty, because a time-tag error makes satellites appear faulty. Where the
+    error is significant, or the position is doubtful, the line is used as a constraint. The standard deviation is then
+    infinite unless enough redundant rows agree and the cost is clearly lower than the cost of a fit without a time-tag
+    error and without the rejected satellites. The cost is the sum of the squared normalised residuals of all codes and
+    of the line, clipped at `_AGREES`. Both values are NaN where they cannot be determined.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
@@ -85,7 +85,7 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
     # without a redundant range, the accepted ranges fit exactly, and the rejected ranges count as wrong
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise scale of the fit with a time-tag error, at most the receiver's, which such an error may have increased
+    # noise scale of the fit with a time-tag error, limited to the noise scale of the receiver, but at least 1
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -152,10 +152,10 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 
 
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median of the last time-tag errors, its size in standard deviations, and the last errors.
+    """Return the median of the last time-tag errors, its absolute value in standard deviations, and the last errors.
 
     The standard deviation is the larger of two values: the median of the epochs' standard deviations, and the robust
-    spread of their errors. The results are NaN for fewer than `_TAG_LEAST` epochs.
+    spread of the time-tag errors. The results are NaN for fewer than `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
     lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))

@@ -16,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Standard deviation added to that of positions, for satellite and atmospheric errors that change over minutes [m].
+#: Standard deviation of satellite and atmospheric errors that change over minutes [m]; added to that of positions.
 _LEAST_M: Final = 1.0
 #: Largest speed at which a tachometer may have no output [m/s].
 _SLOW_MPS: Final = 0.5
@@ -139,11 +139,11 @@ def _wheel_distances(
 def _compare(
     samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
 ) -> tuple[Floats, Floats, Masks]:
-    """Compare the distances over the window before each sample from `first` on.
+    """Compare satellite and wheel distances over the window before each sample, from sample `first` on.
 
     Return differences, bounds, and the mask of differences that exceed their limits.
 
-    The wheel scale factor is estimated from the part before each window and applied to the wheel distance.
+    The wheel scale factor, estimated from the part before each window, is applied to the wheel distance.
     """
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))
@@ -153,7 +153,7 @@ def _compare(
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Return satellite minus wheel distance, wheel distance, and their variance without the position at `b`."""
+        """Return satellite minus wheel distance, wheel distance, and the variance of the difference except for `b`."""
         arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
             arc, distance = np.abs(arc), np.abs(distance)

@@ -30,7 +30,7 @@ from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
-#: Number of bisections for a level, which reduce its interval from 1e4 m to less than a tenth of a micrometre.
+#: Number of bisections for a level. They reduce the interval from 1e4 m to less than a tenth of a micrometre.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
 _BLOCK_SIZE: Final = 4_000_000  #: Number of elements of the largest array for a block of epochs.
@@ -63,15 +63,15 @@ class AraimBudget(Settings):
 class AraimGeometry:
     """N observations at each of T epochs: the ranges and, with a map, the two constraints of the map."""
 
-    #: Partial derivatives of each observation by the P unknowns (position, then one clock per constellation), shape
-    #: (T, N, P). Values of unused observations are ignored.
+    #: Partial derivatives of each observation with respect to the P unknowns (position, then one clock per
+    #: constellation), shape (T, N, P). Values of unused observations are ignored.
     design: Floats
     sigma_int_m: Floats  #: Standard deviations for integrity, shape (T, N); NaN for unused observations.
     sigma_acc_m: Floats  #: Standard deviations for accuracy, shape (T, N); NaN for unused observations.
     bias_m: Floats  #: Largest nominal bias of each observation, shape (T, N).
     prior: Floats  #: Prior probability of a fault of a single observation, shape (N,).
-    together: Masks  #: Sets of observations that are faulty together (of a constellation, or of the map), shape (C, N).
-    together_prior: Floats  #: Prior probability of a fault of each set, shape (C,).
+    together: Masks  #: Sets of observations with a common fault (of a constellation or the map), shape (C, N).
+    together_prior: Floats  #: Prior probability of the common fault of each set, shape (C,).
 
     @property
     def used(self) -> Masks:
@@ -229,7 +229,7 @@ class SatelliteSupport(Protocol):
         """Return whether the support is valid at epochs, shape (T,)."""
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return sentences on the validity of the support at epochs, shape (T,)."""
+        """Return notes, one sentence each, on the validity of the support at epochs, shape (T,)."""
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
         """Return the support of each channel from the name of its satellite ("G07"); NaN without support."""

@@ -1,9 +1,9 @@
-"""Possible positions on the line, away from its tangent, under the fault hypotheses of a protection level.
+"""Possible positions on the line but away from the tangent, under the fault hypotheses of a protection level.
 
-A level bounds the error along the tangent. Where the line bends, or passes close to itself, the position without a
-satellite can be a point of the line away from the tangent. Under each hypothesis of the level, the sum of squared
-residuals is a quadratic form of the position. This form is evaluated along the line unless a bound excludes positions
-away from the tangent.
+A level bounds the error along the tangent. Where the line bends, or passes close to itself, the position computed
+without a faulty satellite can be a point of the line away from the tangent. Under each hypothesis of the level, the sum
+of squared residuals is a quadratic form of the position. This form is evaluated along the line unless a bound excludes
+positions away from the tangent.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from railfix.positioning.search_index import SearchIndex
 
 #: Largest distance searched [m], at which the linear model of a range has an error of 0.7 m.
 _FURTHEST_M: Final = 5000.0
-_NEGLIGIBLE: Final = 0.01  #: Fraction of the risk of a sample that positions outside the search radius may have.
+_NEGLIGIBLE: Final = 0.01  #: Fraction of a sample's risk that is allowed for positions outside the search radius.
 
 
 class Forms(NamedTuple):
@@ -125,7 +125,7 @@ def _around(
         Start point and unit vector of each section, along, across and up relative to the position.
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of sections beyond the level and off the tangent from the position; infinite for other sections.
+        Distance from the position, for sections beyond the level and off the tangent; infinite for other sections.
     """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)

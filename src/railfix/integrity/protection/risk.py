@@ -1,9 +1,9 @@
 """Integrity risk of a protection level, and its allocation to fault hypotheses.
 
 The risk per hour (P1 2.4: 1e-7, RTCA DO-229D) is divided by the number of independent samples in an hour. The risk of a
-sample, less the probability of faults that are not hypotheses, is allocated to the hypotheses of the epoch. A
-hypothesis is a set of shared faults (of a constellation, of the low satellites of a side, of the map) and of faulty
-single satellites. Hypotheses with equal shared faults and equal numbers of single satellites form a class.
+sample, minus the probability of faults that are not hypotheses, is allocated to the hypotheses. A hypothesis is a set
+of shared faults (of a constellation, of the low satellites of a side, of the map) and of faulty single satellites.
+Hypotheses with equal shared faults and equal numbers of single satellites form a class.
 """
 
 from __future__ import annotations
@@ -68,21 +68,21 @@ class RiskBudget(Settings):
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
     #: Fractions of an epoch's risk for the parts of the level (no, one and two faults), with a sum of at most 1. The
     #: level is lowered from the largest part until the sum of all tails equals the sum of the fractions. Doubling a
-    #: fraction lowers a K of 6 by only 0.1, and a K of 3 by 0.2, so the default is thirds.
+    #: fraction lowers a K of 6 by only 0.1, and a K of 3 by 0.2, so the default is a third each.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     #: Fraction of the risk for faults that are not hypotheses. If these faults are more probable, further faults become
     #: hypotheses, up to four simultaneous satellites and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite, and again for epochs with two.
+    #: Fraction of the risk for epochs with one excluded satellite; the fraction for epochs with two is equal.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability per epoch that noise alone makes the separations inconsistent; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability that the signal of a satellite is faulty, by constellation.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    #: Additional probability of a local fault (multipath, interference) of a satellite. The value is an assumption
-    #: until it is measured on the line (P1 7).
+    #: Additional probability of a local fault (multipath, interference) of a satellite. The default is an assumption
+    #: until the probability is measured on the line (P1 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
     #: Probability that the map is wrong by more than its stated error, for example because of a parallel track, heights
     #: without the geoid, or a different reference frame. The value is an assumption. With 0, a wrong map is no
@@ -162,7 +162,7 @@ class RiskBudget(Settings):
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
-    """Return the sums over all sets of 0, 1, ..., `most` faults of the products of their priors, shape (T, most + 1).
+    """Return, for k = 0 to `most`, the sum over all sets of k faults of the product of their priors, (T, most + 1).
 
     `prior` has the shape (T, M). Column k bounds the probability of k or more faults. The sums are computed by Newton's
     identities.
@@ -180,7 +180,7 @@ def set_sums(prior: Floats, most: int) -> Floats:
 
 #: Largest number of shared faults in a hypothesis; the probability of more shared faults is subtracted from the risk.
 _MOST_SHARED: Final = 3
-FEW: Final = 2  #: Largest number of epochs for which the allocation is cached; a live chunk of two antennas has two.
+FEW: Final = 2  #: Allocations are cached only for up to this number of epochs; a live chunk has one per antenna.
 #: Number of cached allocations; they are used again when satellites reappear from behind obstacles.
 REMEMBERED: Final = 512
 _MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class, the number of sets of four of 34 satellites.
@@ -223,10 +223,10 @@ def allocate(
 ) -> Allocation:
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    The following classes are always hypotheses: single satellites, alone and with a wrong map; pairs of satellites,
-    where pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and every
-    class that is more probable than the risk for unchecked faults. `out`, shape (T,), is the number of excluded
-    satellites; `sides`, shape (T, S, M), are the sets of satellites that may be faulty together.
+    The hypotheses are the following classes: single satellites, alone and with a wrong map; pairs of satellites, where
+    pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and every class
+    that is more probable than the risk for unchecked faults. `out`, shape (T,), is the number of excluded satellites;
+    `sides`, shape (T, S, M), are the sets of satellites that may be faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
@@ -277,7 +277,7 @@ def _allocate(
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
     members = np.concatenate([used[:, None] & of_letter, sides], axis=1)
-    # A constellation needs at least one used satellite to be a shared fault; a side needs two.
+    # A shared fault of a constellation needs at least one used satellite; a fault of a side needs two.
     nominal = np.array([risk.constellation_prior[s] for s in letters] + [risk.side_prior] * sides.shape[1])
     least = np.array([1] * len(letters) + [2] * sides.shape[1])
     event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)

@@ -34,7 +34,7 @@ _OF_MORE: Final = 3  #: Index of the tails of three or more faults among the kin
 
 
 class Cause(IntEnum):
-    """Hypothesis that uses most of the risk of an epoch at its level, or the reason for an infinite or missing level.
+    """Hypothesis that uses most of an epoch's risk, or the reason for an infinite or missing protection level.
 
     A fault affects a satellite, a constellation, a side of the track (or both sides), or the map.
     """
@@ -55,7 +55,7 @@ class Cause(IntEnum):
     THREE_FAULTS = 6
     #: Infinite level: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
-    #: Infinite level as for `UNCHECKED`, mostly because of faults of a constellation, alone or with satellites.
+    #: Infinite level as for `UNCHECKED`, mostly because of faults of a constellation, alone or with single satellites.
     UNCHECKED_CONSTELLATION = 8
     #: Infinite level as for `UNCHECKED`, mostly because of faults of one or both sides of the track.
     UNCHECKED_SIDE = 9
@@ -72,13 +72,13 @@ class ProtectionLevel(NotebookTable):
     #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. The level
     #: is at most the largest of the following parts, which need not use their risk allocations fully.
     level_m: Floats
-    #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the total probability of the
-    #: hypotheses of a part is within its risk allocation.
+    #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the hypotheses of a part have a
+    #: total probability within the allocation of this part.
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
     sigma_m: Floats  #: Standard deviation of the position along the track without a fault, shape (T,).
-    #: Factor K of each part, shape (T,); -inf where not required.
+    #: Factor K of each part, shape (T,); -inf where the part is 0 for this reason.
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
@@ -106,9 +106,9 @@ class MapDeviation(NamedTuple):
     """Information on the map error across and up in addition to the map sigmas."""
 
     bias_m: ArrayLike = 0.0  #: Map offset not covered by the sigmas, shape (T, 2) or (2,).
-    #: Offset across and up of the antenna position computed without the map, shape (T, 2) [m], and its inverse
-    #: covariance, shape (T, 2, 2) [1/m^2] (0 if unknown). If given, a wrong map is a hypothesis with the prior
-    #: `RiskBudget.map_prior`.
+    #: Offset across and up of the antenna position computed without the map, shape (T, 2) [m], and the inverse
+    #: covariance of this offset, shape (T, 2, 2) [1/m^2] (0 if unknown). If given, a wrong map is a hypothesis with the
+    #: prior `RiskBudget.map_prior`.
     seen: tuple[Floats, Floats] | None = None
 
 
@@ -161,8 +161,8 @@ def protection_level(
     if excluded.ndim == 2:
         if (excluded & model.used).any():
             raise ValueError(
-                "the model uses satellites that were excluded; make it from the ranges and positions that "
-                "exclude_faults returns, which are without them"
+                "the model uses excluded satellites; build it from the ranges and positions returned by "
+                "exclude_faults, which no longer contain these satellites"
             )
         excluded = excluded.sum(axis=1)
     out = _broadcast(np.asarray(excluded, dtype=np.int64), (epochs,))

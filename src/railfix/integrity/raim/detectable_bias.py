@@ -33,8 +33,8 @@ class Reliability:
     """Reliability of T epochs by M channels for the chi-square test."""
 
     noncentrality: Floats  #: Noncentrality lambda for the epoch's degrees of freedom, shape (T,); NaN if not testable.
-    #: Range error missed with the stated probability; infinite if no other channel tests it; NaN if unused; shape (T,
-    #: M).
+    #: Range error missed with the stated probability; infinite if no other channel tests the range; NaN if the range is
+    #: unused; shape (T, M).
     minimal_detectable_bias_m: Floats
     #: Position error per unit of the statistic's square root, shape (T, M); NaN for unused channels.
     slope_m: Floats
@@ -43,7 +43,7 @@ class Reliability:
     worst: Indices  #: Channel of the largest single slope, shape (T,); -1 if no channel has a slope.
     #: Standard deviation along the line, or in space along the longest axis of the horizontal ellipse, shape (T,).
     position_sigma_m: Floats
-    #: Position error due to a fault missed with the stated probability, largest slope times sqrt(lambda), shape (T,).
+    #: Position error due to a fault missed with the stated probability: the largest slope times sqrt(lambda), (T,).
     fault_level_m: Floats
     noise_level_m: Floats  #: Noise part of the level, K sigma, shape (T,).
     #: Sum of fault and noise level, shape (T,); infinite where a fault cannot be detected; NaN without a position.
@@ -104,7 +104,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
     """Return the noncentrality that the chi-square test misses with probability `missed_detection` (P4), same shape.
 
-    NaN below 1 degree of freedom.
+    The result is NaN below 1 degree of freedom.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)

@@ -40,7 +40,7 @@ class RaimLimits(Settings):
     #: Largest number of satellites excluded at an epoch, 0 to 2; 2 in P1 2.3(4).
     max_excluded: int = Field(default=2, ge=0, le=2)
     min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
-    #: Probability that noise makes the true exclusion fit worse than a competing exclusion by the separation
+    #: Probability that noise makes the correct exclusion fit worse than a competing exclusion by the separation
     #: (chi-square, one degree of freedom). If another exclusion of as many satellites passes and fits worse by less
     #: than the separation, the epoch is inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
@@ -106,7 +106,7 @@ def detect(
         error, residuals of a `Constrained` position do not. Both residuals are equal only for an exact map (a sigma of
         a millimetre), as in P1.
     freedom : array_like of int, shape (T,)
-        Ranges minus unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space with ``- 3`` for ``- 1``.
+        Ranges minus unknowns: ``ranges.n_used - ranges.n_clocks - 1`` on the line, ``- 3`` instead in space.
     scale : array_like, shape (T,) or ()
         Ratio of the receiver's range standard deviation to the sigmas of the weights. Not used in fixed mode.
     """
@@ -178,7 +178,7 @@ class Exclusion:
     best: Indices
     #: Channels of the closest competing exclusion, the next passing subset of as many channels, (T, 2); -1 for none.
     alternative: Indices
-    #: Error of the channels of `best` relative to the others, positive for a long range; NaN for others; shape (T, M).
+    #: Error of the channels of `best` relative to the others, positive if too long; NaN for the others; shape (T, M).
     own_error_m: Floats
     #: Statistic without the channels of `best`, shape (T,); the original statistic where no subset passes.
     statistic_after: Floats

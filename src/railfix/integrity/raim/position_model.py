@@ -1,8 +1,8 @@
 """Linear model of the ranges for RAIM, on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks and the map error
-across and up, an unknown with a prior, are eliminated. The residual projector is ``S = I - R K R^T - B Q B^T``, where R
-has 1/sigma in the column of the satellite's clock, K is the covariance of the clocks at a known position, B is the
+P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks are eliminated, and
+so are the map errors across and up, which have a prior. The residual projector is ``S = I - R K R^T - B Q B^T``, where
+R has 1/sigma in the column of the satellite's clock, K is the covariance of the clocks at a known position, B is the
 design with the clocks eliminated, and Q is the covariance of the position. The residuals are ``nu = S y``, and ``WSSE =
 y^T S y`` is chi-square distributed with `LinearModel.freedom` degrees of freedom.
 """
@@ -49,8 +49,8 @@ class LinearModel:
     root_weight: Floats  #: 1/sigma of each range, shape (T, M) [1/m]; 0 for unused ranges.
     clock: Indices  #: Receiver clock of each channel as an index into the groups of the ranges, shape (M,).
     clock_covariance_m2: Floats  #: Covariance of the clocks at a known position (K), shape (T, G, G).
-    #: Derivative of the whitened range by the position, clocks eliminated (B), shape (T, M, 3) [1/m]; 0 for unused
-    #: ranges.
+    #: Derivative of the whitened range with respect to the position, with the clocks eliminated (B), shape (T, M, 3)
+    #: [1/m]; 0 for unused ranges.
     design: Floats
     #: Covariance of the position, prior included (Q), shape (T, 3, 3); NaN where the position is undetermined.
     covariance_m2: Floats
@@ -108,7 +108,7 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Redundancy numbers (diagonal of S), shape (T, M); 0 for ranges unused, or tested by no other range.
+        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused ranges and ranges tested by no other range.
 
         A redundancy number is the fraction of a range error that appears in the residual of the same range.
         """
@@ -126,7 +126,7 @@ class LinearModel:
 
     @cached_property
     def gain_m(self) -> Floats:
-        """Derivative of the position by each whitened range, shape (T, M, interest) [m]."""
+        """Derivative of the position with respect to each whitened range, shape (T, M, interest) [m]."""
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
