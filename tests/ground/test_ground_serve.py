@@ -621,7 +621,7 @@ def test_a_wrong_file_of_a_centre_is_one_sentence(
     open_to_all = tmp_path / "password"
     open_to_all.write_text("secret")
     done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--password", str(open_to_all)])
-    assert "others can read it" in " ".join(done.output.split())
+    assert "can be read by others" in " ".join(done.output.split())
 
 
 def test_interference_that_a_train_suspects_is_an_alarm_until_it_ends(

@@ -1,6 +1,6 @@
 """Messages from the centre to a train: movement authority with speed limits, and order to brake.
 
-Each message is a canonical CBOR array: kind of the message, version, and fields.
+Each message is a canonical CBOR array of the kind of the message, the version, and the fields.
 """
 
 from __future__ import annotations

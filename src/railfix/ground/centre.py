@@ -121,9 +121,9 @@ class CentreLimits(Settings):
     #: Largest delay of a train's clock behind the times of the train's positions. The time between two positions is
     #: assumed to be longer by this value, because the delay of the clock may vary.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest accepted lead over the newest sequence number, immediately after this number has arrived.
+    #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of the largest accepted lead per second since the newest sequence number has arrived.
+    #: Increase of this largest lead per second since the newest number arrived.
     rate: float = Field(default=20.0, gt=0)
 
     @model_validator(mode="after")
@@ -142,11 +142,11 @@ class TrainRecord:
     sequence: int = -1  #: Newest sequence number received, -1 before the first.
     session: int = 0  #: Session that `sequence` belongs to; the on-board unit draws a new identifier at each start.
     retired: tuple[int, ...] = ()  #: Identifiers of earlier sessions, whose late messages are rejected.
-    counted_s: float | None = None  #: Centre's clock at the arrival of the newest sequence number [s].
+    counted_s: float | None = None  #: Time on the centre's clock when the newest sequence number arrived [s].
     rejected: str | None = None  #: Reason why the newest report was rejected, None if it was accepted.
     message: TrainMessage | None = None  #: Newest report with a position.
-    heard_s: float = 0.0  #: Centre's clock (monotonic) at the arrival of `message` [s].
-    measured_s: float = 0.0  #: Centre's clock at the instant for which the position of `message` is valid [s].
+    heard_s: float = 0.0  #: Time on the centre's clock (monotonic) when `message` arrived [s].
+    measured_s: float = 0.0  #: Time on the centre's clock for which the position of `message` is valid [s].
     shown_m: float | None = None  #: Displayed position of the front end [m].
     #: Reported minus displayed position when the train last reported again after simulated running, positive in running
     #: direction [m].

@@ -57,7 +57,7 @@ def correct_interval(
     track: int,
     lapsed: bool = False,
 ) -> Changed:
-    """Return the state with the interval of a stopped train set by hand, and the reason for a refusal.
+    """Set the interval of a stopped train; return the new state, and the reason if the order is refused.
 
     The train's route and authority end, and the train's locks on points are removed. The train must therefore have
     reported that it obeys an order to brake, and no authority in transit may be able to end that order. This is not
@@ -98,7 +98,7 @@ def enter_train(
     front_m: float,
     track: int,
 ) -> Changed:
-    """Return the state with a train added at any position, and the reason for a refusal.
+    """Add a train at a given position; return the new state, and the reason if the order is refused.
 
     The train need not have reported.
     """
@@ -117,7 +117,7 @@ def enter_train(
 def _refused_overlap(
     state: Interlocking, train: TrainInterval, layout: Layout, points: Mapping[PointName, PointState]
 ) -> Changed:
-    """Return the state with a train added, or the reason for a refusal if another train's interval overlaps."""
+    """Add a train unless another train's interval overlaps; return the new state, and the reason for a refusal."""
     pieces = pieces_of(train, layout)
     for other in state.trains.values():
         if other.train != train.train and overlap(pieces, pieces_of(other, layout)):
@@ -136,10 +136,11 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 
 
 def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
-    """Return the state without a train; the sections of the train's interval become occupied by unreported vehicles.
+    """Remove a train; the sections of the train's interval then count as occupied by vehicles that do not report.
 
-    A section is freed by its detection, or by the order of a person who has seen that the section is free. As in
-    `correct_interval`, no authority in transit may permit the train to run.
+    A section becomes free when its detection reports it free, or by the order of a person who has seen that it is free.
+    As in `correct_interval`, no authority in transit may permit the train to run. Return the new state, and the reason
+    if the order is refused.
     """
     known = state.trains.get(train)
     if known is None:
@@ -152,15 +153,15 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # a section that is a whole station is barred only if the train is on the points, as the tracks are separate
-        # sections
+        # a section that is a whole station is barred only if the train is on the points, because the tracks are
+        # separate sections
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None
 
 
 def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
-    """Return the state in which train `other` is joined to train `lead` ahead of it, and the reason for a refusal.
+    """Join train `other` to train `lead` ahead of it; return the new state, and the reason if the order is refused.
 
     The joined train has the number `lead`, the sum of both lengths, and an interval that includes both intervals.
     """
@@ -192,10 +193,10 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
 
 
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
-    """Return the state in which the part of a train behind the train's first `length_m` is the new train `other`.
+    """Divide a train: the part behind the train's first `length_m` becomes the new train `other`.
 
-    Until the parts are apart, their intervals overlap by the uncertainty of the position. The second value is the
-    reason for a refusal.
+    Until the parts are apart, their intervals overlap by the uncertainty of the position. Return the new state, and the
+    reason if the order is refused.
     """
     known = state.trains.get(train)
     if known is None:

@@ -41,7 +41,7 @@ def _severity(verdict: TriangleVerdict) -> int:
 
 @dataclass(kw_only=True)
 class StopOrder:
-    """Order to stop, with the times from sending it to its acknowledgement and to the train's standstill [s]."""
+    """Order to stop a train; times from sending to acknowledgement, and from sending to standstill [s]."""
 
     number: int
     sent_s: float
@@ -81,7 +81,7 @@ class ControlCentre:
     rejected: Counter[str] = field(default_factory=Counter)  #: Number of rejected reports, by reason.
     stop_s: float | None = None
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Orders to stop, by train.
-    #: Commits to the store; in the process of a centre, a thread carries them out.
+    #: Commits to the store; in a running centre, they are carried out in a thread.
     commits: Commits = field(default_factory=Commits)
     #: Function that requests the detection of points; `Supervision.set_detected` processes the answer.
     ask: Callable[[PointName], None] = lambda _: None

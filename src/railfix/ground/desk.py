@@ -65,7 +65,7 @@ class OrderDesk:
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
-        """Return None if this order confirms an earlier one in time, otherwise a request to confirm it."""
+        """Return None if this order confirms an earlier order in time, otherwise a request to confirm this order."""
         key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
@@ -133,7 +133,7 @@ class OrderDesk:
         return None
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
-        """Return the state after the change of trains named by `of`, and the reason for a refusal."""
+        """Return the state after the change that `of` names, and the reason if the change is refused."""
         state, layout = self.supervision.state, self.supervision.layout
         train = number_of(values, "train")
         if isinstance(train, str):

@@ -1,4 +1,4 @@
-"""Simulated points, as railfix has no interface to real points."""
+"""Simulated points, because railfix has no interface to real points."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class SimulatedPoints:
     _answers: dict[PointName, int | None] = field(default_factory=dict)
 
     def command(self, point: PointName, track: int) -> None:
-        """Begin to move points to a track."""
+        """Start to move a set of points to the position for the given track."""
         self._moving[point] = self.clock() + self.move_s, track
         self._answers[point] = None
 
     def ask(self, point: PointName) -> None:
-        """Request the detection of points; the next call of `take_detected` returns it."""
+        """Request the detection of points; the next call of `take_detected` returns the detected track."""
         self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
 
     def take_detected(self) -> Mapping[PointName, int | None]:

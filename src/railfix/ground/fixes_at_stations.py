@@ -38,7 +38,7 @@ from railfix.run.processor_setup import parse_position
 FALLEN_DBHZ = 6.0
 #: Number of preceding epochs over which the median of the mean C/N0 is computed.
 USUAL_EPOCHS: Final = 600
-#: Time tags of different receivers that round to the same multiple of this interval are one epoch.
+#: Time tags of different receivers that round to the same multiple of this interval belong to one epoch.
 SAME_EPOCH = np.timedelta64(100, "ms")
 
 
@@ -46,7 +46,7 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 class StationFixes(FrozenArrays):
     """Single point positions of N receivers at T epochs.
 
-    Where they are computed here, all receivers use the same satellites and weights at each epoch.
+    If the fixes are computed by this module, all receivers use the same satellites and weights at each epoch.
     """
 
     time: Datetimes  #: Epochs common to all logs, rounded to 0.1 s; shape (T,).
@@ -80,7 +80,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     common = [name for name in names[0] if all(name in other for other in names[1:])]
     common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
     if not common:
-        raise MismatchError("the logs have no satellite on the same signal in common; the same signals are needed")
+        raise MismatchError("no satellite is in all logs on one signal; record the same signals with all receivers")
     time, rows_of = _common_epochs([log.time for log in logs])
     tags = np.stack([log.time[rows] for log, rows in zip(logs, rows_of, strict=True)])
     satellite, signal = (np.array(column) for column in zip(*common, strict=True))
@@ -136,11 +136,11 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 
 
 def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
-    """Read the positions of three receivers (`computed`), or compute them from their observations.
+    """Read the positions of three receivers if `computed`, otherwise compute them from the observations.
 
-    `points` are the known points as texts, one per log; without `points`, the positions in the headers of the logs are
-    used. Raise SettingsError if navigation files or points are required but missing, or if navigation files are given
-    with `computed`. Raise MismatchError if a header has no position, or the logs have no satellite or no epoch in
+    `points` are the known points as strings, one per log; without `points`, the positions in the headers of the logs
+    are used. Raise SettingsError if navigation files or points are required but missing, or if navigation files are
+    given with `computed`. Raise MismatchError if a header has no position, or the logs have no satellite or no epoch in
     common.
     """
     known = np.array([parse_position(text, "--point") for text in points])
@@ -185,7 +185,7 @@ def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]
     epochs = [round_tags(time) for time in times]
     common = reduce(np.intersect1d, epochs)
     if not len(common):
-        raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
+        raise MismatchError("the logs have no epoch in common; provide logs of the same time")
     return common, [np.searchsorted(epoch, common) for epoch in epochs]
 
 
@@ -232,10 +232,10 @@ _LONGEST_QUEUE: Final = 1000
 class StationStreams:
     """Fixes of receivers at known points, computed from epochs as they arrive.
 
-    An epoch is used once every receiver has sent it; older waiting epochs are then dropped. If a receiver is silent, no
-    fixes are computed, and the monitor detects that fixes are late. Records from the streams are added to `navigation`.
-    Only epochs at whole seconds are used. `counts` has the number of epochs by outcome: "used", "incomplete" or
-    "without common satellites".
+    An epoch is used once every receiver has sent it; older epochs that still wait are then dropped. If a receiver is
+    silent, no fixes are computed, and the monitor detects that fixes are late. Records from the streams are added to
+    `navigation`. Only epochs at whole seconds are used. `counts` has the number of epochs by outcome: "used",
+    "incomplete" or "without common satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:
@@ -290,7 +290,7 @@ async def stream_fixes(
 ) -> AsyncIterator[StationFixes]:
     """Yield the fixes of each epoch until every source has ended.
 
-    Sources are written as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files and
+    Sources are written as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receiver files and
     RINEX files). Raise InputFileError if a source cannot be opened, or fails and cannot be opened again.
     """
     stations = StationStreams(points_ecef_m, navigation=navigation)

@@ -105,9 +105,9 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest accepted delay in excess of the shortest observed delay.
     #: Largest relative drift between the clocks of both ends; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Largest accepted lead over the newest sequence number, immediately after this number has arrived.
+    #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of the largest accepted lead per second since the newest sequence number has arrived.
+    #: Increase of this largest lead per second since the newest number arrived.
     rate: float = Field(default=100.0, gt=0)
 
 
@@ -185,7 +185,7 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Reset after a restart of the sender, because its sequence numbers and its clock begin anew."""
+        """Reset after a restart of the sender, because the sender's sequence numbers and clock start again."""
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None

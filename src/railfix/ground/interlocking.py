@@ -131,7 +131,7 @@ def route_requested(
     nearby: NearbyTrains | None = None,
     stopped: Mapping[int, str] | None = None,
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
-    """Return the state with a route to the next station, the points to be moved, and the reason for a refusal.
+    """Set a route to the next station; return the new state, the points to be moved, and the reason for a refusal.
 
     `nearby` and `stopped` (`stop_orders`) are computed if they are not given.
     """
@@ -161,7 +161,7 @@ def route_requested(
 
 
 def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: Mapping[int, str]) -> str | None:
-    """Return the reason for refusing a route, other trains' intervals not considered; None if there is no reason."""
+    """Return the reason for refusing a route, without regard to other trains' intervals; None if there is no reason."""
     target = here.station + here.direction
     if here.asked_m is not None:
         return "a shorter authority is being agreed with the train"
@@ -230,7 +230,7 @@ def is_free(state: Interlocking, point: PointName, layout: Layout, nearby: Nearb
 
 
 def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether an interval, or a barred section, includes points."""
+    """Return whether any train's interval, or any barred section, includes a set of points."""
     zone: Piece = (0, *layout.zone_m(point))
     if barred(state, [zone], layout) is not None:
         return True
@@ -266,7 +266,7 @@ def due_commands(
 
 
 def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
-    """Return the state with points released that a safe rear end passed `InterlockingLimits.release_s` ago."""
+    """Release points `InterlockingLimits.release_s` after a safe rear end has left them; return the new state."""
     points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
         if not point.locked:

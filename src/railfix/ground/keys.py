@@ -183,7 +183,7 @@ def _pair(name: str, signing: ec.EllipticCurvePrivateKey, *, days: int) -> dict[
 def _signed(
     name: str, public: ec.EllipticCurvePublicKey, signing: ec.EllipticCurvePrivateKey, *, days: int
 ) -> x509.Certificate:
-    """Return a certificate of a name, signed by the authority."""
+    """Return a certificate for a name, signed by the authority."""
     now = datetime.now(UTC)
     builder = (
         x509.CertificateBuilder()

@@ -21,7 +21,7 @@ from railfix.track.network import Network
 
 #: Name of a set of points: number of the station, and end of the station (-1: lower chainage, 1: higher chainage).
 PointName = tuple[int, int]
-#: Largest number of gradients in one authority, and largest number of speed restrictions.
+#: Largest number of gradients in one authority; the same limit applies to speed restrictions.
 MOST_PARTS: Final = 16
 #: Piece of track: lane, lower chainage [m] and upper chainage [m]. Lane 0 is the single track including the sets of
 #: points; lane 2 k + t is track t of station k.
@@ -50,7 +50,7 @@ class LoopStation(Settings):
 
 
 class Gradient(Settings):
-    """Gradient that applies from a chainage to that of the next gradient; before the first, the line is level."""
+    """Gradient that applies up to the chainage of the next gradient; before the first gradient, the line is level."""
 
     from_m: float
     #: Gradient in thousandths, positive where the track rises with the chainage.
@@ -92,7 +92,7 @@ class Layout(Settings):
         return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
 
     def blocks_between(self, low_m: float, high_m: float) -> range:
-        """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k the line before k."""
+        """Return the numbers of the blocks in an interval: station k is 2 k + 1, and the line before it is 2 k."""
         return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
 
     @cached_property
@@ -251,7 +251,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
 
 
 def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats], begin_m: float) -> LoopStation:
-    """Return the station with two tracks that begins at a chainage; track 1 is the first of the two."""
+    """Return the station that begins at a chainage; track 1 is the first of its two tracks."""
     if abs(lengths_m[0] - lengths_m[1]) > LENGTHS_M:
         raise MismatchError(
             f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; a "

@@ -41,8 +41,8 @@ class LinkLimits(Settings):
 
     #: Longest time from a frame to its echo; a later echo counts as a miss. A centre delays echoes by up to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)
-    misses: int = Field(default=3, ge=1)  #: Consecutive misses after which the spare link is used.
-    good: int = Field(default=10, ge=1)  #: Consecutive answers before the normal link is used again.
+    misses: int = Field(default=3, ge=1)  #: Number of consecutive misses after which the spare link is used.
+    good: int = Field(default=10, ge=1)  #: Number of consecutive answers before the normal link is used again.
     good_s: float = Field(default=30.0, ge=0)  #: Minimum time on the spare link before the normal link is used again.
     window: int = Field(default=60, ge=1)  #: Number of newest frames from which the response rate is computed.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.

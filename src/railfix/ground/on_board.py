@@ -66,11 +66,12 @@ class OnBoard:
 
     direction: int
     #: End of the authority, initially the front end. Authorities move this end forward. At a request of the centre, an
-    #: authority moves it back if the train can stop before the new end.
+    #: authority moves the end back if the train can stop before the new end.
     end_m: float
 
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
-    #: Identifier in the reports, drawn at each start; authorities that answer a report of another start are rejected.
+    #: Session identifier in the reports, drawn at each start. Authorities that answer a report of another session are
+    #: rejected.
     session: int = 0
     number: int = -1  #: Number of the newest authority, -1 before the first.
     stopped: bool = False  #: Whether the newest authority is an order to stop.
@@ -110,7 +111,7 @@ class OnBoard:
         """Store the train's safe ends and speed.
 
         Whether the train can stop before a shorter end is decided by the farther of its last two stopping positions, so
-        that a single wrong position cannot cause the train to accept that end.
+        that a single wrong position cannot cause the train to accept the shorter end.
 
         A train that has rolled back brakes until it gets a new authority, because earlier authorities do not cover its
         new position. Without a position or a speed, the last position is extrapolated (`OnBoardLimits.placeless_s`).

@@ -1,4 +1,4 @@
-"""Position messages of a train in JSON lines, which are live or replayed from a recording."""
+"""Position messages of a train in JSON lines, either live or replayed from a recording."""
 
 from __future__ import annotations
 

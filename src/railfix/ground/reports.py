@@ -3,9 +3,10 @@
 `CHECKS` detect reports that contradict earlier reports; they cannot prove a report correct. Condition C12 of
 ``docs/safety.md`` excludes errors that these checks do not detect.
 
-The safe rear end moves to a position that two consecutive reports confirm, in which the train is complete and has the
-configured length. A report that contradicts the record of its train stops this train and the trains next to it. After
-any contradiction, the interval is extended to the reported position, but no farther than the train can have run.
+The safe rear end moves to a position that two consecutive reports confirm. Both reports must state that the train is
+complete and has the configured length. A report that contradicts the record of its train stops this train and the
+trains next to it. After any contradiction, the interval is extended to the reported position, but no farther than the
+train can have run.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
 #: Largest sum of the over-reading and under-reading amounts of an accepted report [m].
 WIDEST_M: Final = 1000.0
-#: Shortest time between two positions that is assumed when an interval is extended, and largest age of a sent position
-#: [s].
+#: Lower bound of the time between two positions that is assumed when an interval is extended [s]. It also covers the
+#: largest age of a position at sending.
 INSTANT_S: Final = 5.0
 
 
@@ -62,7 +63,7 @@ class PlacedReport:
     message: TrainMessage
     layout: Layout
     limits: InterlockingLimits
-    granted: int  #: Number of the newest authorities.
+    granted: int  #: Number of the authorities that were sent last.
     skipped: tuple[int, int]  #: `Interlocking.skipped`.
     #: Longest time since the previous position [s]: negative if the time of the new position is before that of the
     #: previous one, None if unknown, as at the first report.
@@ -311,7 +312,7 @@ def report_received(
     A change of ends is accepted only at standstill inside the train's station; afterwards the interval still includes
     the earlier position. A report that contradicts the train's record stops the train, and can only extend the
     interval. Reports without a position, and reports older than the newest, have no effect. `elapsed_s` is the longest
-    time since the previous position by the centre's clock, where known.
+    time since the previous position according to the centre's clock, where known.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):

@@ -44,7 +44,8 @@ from railfix.track.network_read import read_network
 STEP_S = 0.1
 #: Longest wait at the end of the process for a commit in progress [s].
 ENDING_S = 3.0
-#: Thresholds of the garbage collector, chosen for rare full collections; one takes 0.3 s with a thousand connections.
+#: Thresholds of the garbage collector, chosen so that full collections are rare; a full collection takes 0.3 s with a
+#: thousand connections.
 COLLECTION = 10_000, 20, 50
 #: Name of the document with the stations and trains to which the database belongs.
 _BELONGS_TO = "stations and trains"
@@ -90,7 +91,7 @@ class TriangleInputs(Settings):
 
 
 class CentreFile(Settings):
-    """Configuration file of a centre; its paths are relative to the folder of the file."""
+    """Configuration file of a centre; paths in the file are relative to the folder of the file."""
 
     keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key``, written by ``railfix ground keys``.
     listen: dict[LinkName, Address]  #: Address of each bearer.
@@ -106,7 +107,7 @@ class CentreFile(Settings):
     #: Trains, with their positions at the first start; at later starts, positions are read from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: SQLite file, or the address of an SQL database (``postgresql+psycopg://...``).
-    log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
+    log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Number of newest log lines that the database keeps.
     #: Whether a train that approaches the end of its track is given the route to the next station automatically.
     routes: Literal["automatic", "by hand"] = "automatic"
     speed_mps: float = Field(default=20.0, gt=0)  #: Highest speed of the reference run curve, for simulated running.
@@ -115,7 +116,7 @@ class CentreFile(Settings):
     #: Reference triangle that monitors satellite positioning. With a triangle, all trains are stopped at the first
     #: start until the stop is released by hand. Without a triangle, satellite positioning is not monitored.
     triangle: TriangleInputs | None = None
-    centre: CentreLimits = CentreLimits()  #: Limits of reports.
+    centre: CentreLimits = CentreLimits()  #: Limits for the reports of trains.
     interlocking: InterlockingLimits = InterlockingLimits()  #: Limits of the interlocking.
     monitor: MonitorLimits = MonitorLimits()  #: Limits of the monitor of satellite positioning.
 
@@ -124,7 +125,7 @@ class CentreFile(Settings):
         if set(self.listen) != set(BEARERS):
             raise ValueError("listen must have an address for each of A and B")
         if bool(self.stations) == bool(self.network):
-            raise ValueError("give the line either by stations or by network")
+            raise ValueError("specify the line either by stations or by network")
         if self.network:
             return self  # the settings are checked again once the stations are known
         layout, numbers = self.layout, [train.number for train in self.trains]
@@ -268,7 +269,7 @@ async def run_centre(
 async def _run_until(
     end: asyncio.Event, work: Coroutine[Any, Any, None], judge: Coroutine[Any, Any, None], *, for_s: float | None
 ) -> None:
-    """Run the centre's tasks until the event `end`, the end of `work`, or for a time; raise an error of `work`."""
+    """Run the centre's tasks until `end` is set, `work` ends or `for_s` has passed; raise an error of `work`."""
     working, ending, judging = (asyncio.create_task(each) for each in (work, end.wait(), judge))
     await asyncio.wait([working, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
     if working.done():
@@ -282,7 +283,7 @@ async def _run_until(
 def _centre(
     settings: CentreFile, keys: Path, store: Store, points: SimulatedPoints
 ) -> tuple[ControlCentre, CentreLinks]:
-    """Return the centre with its stored state, and the links that pass reports to it."""
+    """Return the centre with its stored state, and the links that pass reports to the centre."""
     supervision = Supervision(
         layout=settings.layout,
         state=at_start(settings.layout, settings.intervals()),
@@ -315,7 +316,7 @@ def _centre(
 
 
 def _stored_points(store: Store) -> dict[PointName, int]:
-    """Return the track of each set of simulated points, as last detected, or else commanded, in the database."""
+    """Return the last detected, or else commanded, track of each set of simulated points from the database."""
     texts = store.documents(HEAD)
     points = from_documents(texts).points if texts else {}
     return {name: point.detected or point.wanted for name, point in points.items()}
@@ -413,7 +414,7 @@ def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputFileError(path, f"cannot be read as a password ({error})") from None
     if shared:
-        raise InputFileError(path, "others can read it; allow only its owner to (chmod 600)")
+        raise InputFileError(path, "can be read by others; restrict it to its owner (chmod 600)")
     if not lines or not lines[0]:
         raise InputFileError(path, "is empty; a password in its first line was expected")
     people: dict[str, str] = {}

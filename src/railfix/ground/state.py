@@ -30,10 +30,10 @@ class InterlockingLimits(Settings):
     overlap_m: float = Field(default=0.0, ge=0)
     #: Time from the passage of a train's safe rear end to the release of the points.
     release_s: float = Field(default=3.0, ge=0)
-    #: Longest time until the field answers a request for the detection of points; after it, trains on these points are
-    #: stopped.
+    #: Longest time until the field answers a request for the detection of points. After this time, trains on these
+    #: points are stopped.
     answer_s: float = Field(default=10.0, gt=0)
-    #: Longest time between two answers of a section's detection; after it, the section's state is unknown.
+    #: Longest time between two answers of a section's detection; after this time, the section's state is unknown.
     detection_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration of a train; used between two reports that have speeds.
@@ -63,15 +63,16 @@ class TrainInterval:
     #: started.
     measured_ns: int | None = None
     speed_mps: float | None = None  #: Speed of the newest report; None if unknown.
-    #: Ends of the train by the newest report with a position, contradicted or not; lower chainage first [m].
+    #: Ends of the train according to the newest report with a position, even if that report contradicts the record;
+    #: lower chainage first [m].
     reported_m: tuple[float, float] | None = None
-    contradiction: str | None = None  #: Contradiction between this report and the record; None without one.
+    contradiction: str | None = None  #: Contradiction between that report and the record, None without one.
     held_end_m: float | None = None  #: End of the train's authority according to its newest report.
     #: Number of the newest authority, sent or named by a report, by which the train may run. None before the first
     #: authority. Also None after a report that names an order to brake with this or a later number, because no
     #: authority in transit can end that order.
     runs_by: int | None = None
-    stop: str | None = None  #: Reason why the train is stopped, until it is released by hand.
+    stop: str | None = None  #: Reason why the train is stopped, None if it is not; kept until a release by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests the shorter end.
     held: bool = False  #: Whether the train has returned a route; the next route is then set by hand.
@@ -131,7 +132,7 @@ class PointState:
     detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
     #: Whether the command to move to `wanted` has been given, or is not needed.
     commanded: bool = True
-    #: Trains that lock the points, each with the time at which it releases them [s]; None until its rear end has
+    #: Trains that lock the points, each with the time at which its lock ends [s]; None until the train's rear end has
     #: passed.
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
@@ -164,7 +165,7 @@ class Interlocking:
     stopped: bool = False  #: Whether satellite positioning is suspended: no authority is extended, and no route is set.
     granted: int = 0  #: Number of the authorities that were sent last.
     #: Last authority number stored in the database at this start, and first number issued after it. Authorities with
-    #: numbers between them were issued from a state that is newer than the stored one.
+    #: numbers between these two were issued from a newer state than the stored state.
     skipped: tuple[int, int] = (0, 0)
     #: Sections (`Layout.sections`) into which no authority reaches, each with the reason
     #: (`railfix.ground.stops.CLOSED`, `OCCUPIED` or `UNKNOWN`).

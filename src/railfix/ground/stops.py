@@ -1,4 +1,4 @@
-"""Stops of one train, all trains, a section, or trains whose intervals overlap, and their release by hand.
+"""Stops of one train, all trains, a section, or trains whose intervals overlap, and the release of trains by hand.
 
 Until the release, every granted interval stays occupied. A train accepts a shorter end of its authority if it can stop
 before this end. Every authority sent after the request has the shorter end, and the train rejects authorities with
@@ -79,11 +79,11 @@ def parted_cleared(state: Interlocking) -> Interlocking:
 
 
 def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Interlocking, str | None]:
-    """Return the state with the stop of one train released by hand, and the reason for a refusal.
+    """Release the stop of one train by hand; return the new state, and the reason if the release is refused.
 
     Points under the train's interval are locked for the train again, because a train that has rolled back may have
-    released them. The next report determines the line of the train. The route is shortened to the farthest of its
-    stations that the train's front end has reached.
+    released these points. The next report determines the line of the train. The route is shortened to the farthest
+    station on the route that the train's front end has reached.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -133,7 +133,7 @@ def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[Po
 
 
 def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
-    """Return a section in a train's interval that is barred for a reason in `BARS`, and this reason, or None."""
+    """Return a section in a train's interval barred for a reason in `BARS`, and this reason; None if there is none."""
     occupied = pieces_of(train, layout)
     bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
     return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)
@@ -155,7 +155,7 @@ def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Inter
 
 
 def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[str]) -> Interlocking:
-    """Return the state with those sections detected as occupied barred that overlap no train's interval."""
+    """Bar the sections that are detected as occupied and overlap no train's interval; return the new state."""
     for section in sections:
         pieces = layout.sections[section]
         if (section, OCCUPIED) not in state.bars and not any(
@@ -168,7 +168,7 @@ def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[st
 def ask_route_back(
     state: Interlocking, train: int, layout: Layout, *, limits: InterlockingLimits
 ) -> tuple[Interlocking, str | None]:
-    """Return the state in which a train is requested to return its route, and the reason for a refusal."""
+    """Request a train to give back its route; return the new state, and the reason if the order is refused."""
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"

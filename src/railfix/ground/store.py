@@ -193,7 +193,7 @@ class Store:
             return self._connection.execute(sql.select(DOCUMENTS.c.text).where(DOCUMENTS.c.name == name)).scalar()
 
     def documents(self, beginning: str) -> dict[str, str]:
-        """Return the texts whose names have a prefix."""
+        """Return the texts whose names start with `beginning`."""
         named = sql.select(DOCUMENTS.c.name, DOCUMENTS.c.text).where(
             DOCUMENTS.c.name.startswith(beginning, autoescape=True)
         )

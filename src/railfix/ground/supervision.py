@@ -44,7 +44,8 @@ ROUTE_AHEAD_M = 700.0
 AUTHORITY_S = 1.0
 #: Smallest number of authority numbers that are skipped at a restart.
 SKIPPED: Final = 1 << 20
-#: Time after the answered report at which an authority has certainly lapsed on board [s]; it exceeds `LONGEST_FRESH_S`.
+#: Time after the sending of the answered report when an authority has certainly lapsed on board [s]; above
+#: `LONGEST_FRESH_S`.
 LAPSED_S: Final = 60.0
 #: Largest relative drift between the clocks of a train and the centre.
 CLOCK_DRIFT: Final = 1e-4
@@ -66,16 +67,16 @@ class Supervision:
     records: dict[int, TrainRecord] = field(default_factory=dict)
     routes_set: int = 0
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since authorities were last computed.
-    #: Time of the last authority sent to a train [s], and whether it was an order to stop.
+    #: Time at which the last authority was sent to each train [s], and whether this authority was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
-    #: Time at which a train was last sent an authority that permits it to run [s].
+    #: Time at which each train was last sent an authority that permits it to run [s].
     granted_s: dict[int, float] = field(default_factory=dict)
 
     #: Order to brake of each stopped train: time of the last sending [s] (infinite once acknowledged), and number.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)
     #: Numbers of all orders to brake sent to each train since the start.
     issued: dict[int, set[int]] = field(default_factory=dict)
-    begun_s: float = -math.inf  #: Centre's clock at a start with a stored state [s].
+    begun_s: float = -math.inf  #: Time on the centre's clock when the centre started from a stored state [s].
     #: Trains that must report before any authority is extended or any route is set (`begin_again`).
     awaited: set[int] = field(default_factory=set)
     #: Whether each section is detected as occupied; None if there is no answer, or the last answer is too old.
@@ -178,7 +179,7 @@ class Supervision:
         earlier process. The stored detection of points is dropped.
 
         Authority numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers
-        of every earlier start. If that clock was set back, they still exceed the numbers in the database.
+        of every earlier start. If the computer's clock was set back, the numbers still exceed those in the database.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
         first = max(last + SKIPPED, wall_us)
@@ -219,7 +220,7 @@ class Supervision:
         return reason
 
     def ask_route_back(self, train: int) -> str | None:
-        """Request a train to return its route to the next station; return the reason for a refusal."""
+        """Request a train to give back its route to the next station; return the reason for a refusal."""
         self.state, reason = ask_route_back(self.state, train, self.layout, limits=self.limits)
         return reason
 
@@ -375,7 +376,7 @@ def counts(reason: Rejection | None) -> bool:
 def standing_train(
     number: int, *, direction: int, front_m: float, length_m: float, bound_m: float, station: int, track: int
 ) -> TrainInterval:
-    """Return the interval of a train at rest in a station, whose front is known within a bound."""
+    """Return the interval of a train at rest in a station; the front is known within `bound_m`."""
     ahead = front_m + direction * bound_m
     return TrainInterval(
         train=number,

@@ -125,7 +125,7 @@ class SimulatedTrain:
 class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
 
-    Subclasses transmit the messages in `send_report` and `exchange`.
+    Subclasses implement `send_report` and `exchange`, which transmit the messages.
     """
 
     trains: dict[int, SimulatedTrain]

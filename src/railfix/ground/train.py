@@ -39,8 +39,8 @@ async def run_train(
 ) -> tuple[int, int]:
     """Send the newest position every second, and write authorities and changes of braking as lines of JSON.
 
-    The function returns the numbers of reports sent and of authorities received. After the last position, it ends when
-    the last report is answered, or after `ANSWER_S`.
+    The function returns the numbers of reports sent and of authorities received. After the last position, the function
+    ends when the last report is answered, or after `ANSWER_S`.
 
     The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as
     `railfix.io.train_message.to_json` writes them, by default from the standard input; other lines are reported as

@@ -90,8 +90,8 @@ def limits_for_false_stops(
     sigma_m : float [m]
         Standard deviation of a fix per axis.
     own_sigma_m : float [m]
-        Standard deviation per axis of the part of the error that is not common to all receivers; this part of both
-        receivers makes up the error of a side.
+        Standard deviation per axis of the part of the error that is not common to all receivers. The error of a side is
+        the difference of these parts of its two receivers.
     stops_per_year : float
         Accepted number of false stops per year.
     independent_s : float [s]
@@ -243,7 +243,7 @@ class MonitorState:
     receiver: int = -1  #: Receiver that the cause names; -1 if the cause names none.
     since_s: float = 0.0  #: Time of the stop [s].
     complete_s: float = 0.0  #: Time of the last set of three fixes [s].
-    #: Time since which all fixes have been healthy [s]; None if the newest are not healthy.
+    #: Time since which all fixes have been healthy [s]; None if the newest fixes are not healthy.
     healthy_since_s: float | None = None
 
 

@@ -33,11 +33,12 @@ with needs_extra():
 EVENT_S: Final = 0.5
 #: A log-in ends after this time without an order [s].
 SESSION_S: Final = 1800.0
-#: Number of wrong passwords from one address within `WRONG_S` after which further log-ins from there are refused.
+#: Number of wrong passwords from one address within `WRONG_S` after which further log-ins from this address are
+#: refused.
 MOST_WRONG: Final = 10
 #: Time for which a wrong password is counted [s].
 WRONG_S: Final = 60.0
-#: A connection without a complete request is ended after this time to twice this time [s].
+#: A connection without a complete request is ended after one to two times this time [s].
 REQUEST_S: Final = 10.0
 #: Largest number of connections; further connections are refused.
 MOST_CONNECTIONS: Final = 500
@@ -120,7 +121,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     newest: tuple[float, str, bool] | None = None
 
     def snapshot_text() -> tuple[str, bool]:
-        """Return the snapshot as JSON, computed at most once per `EVENT_S`, and whether it is the last."""
+        """Return the snapshot as JSON, computed at most once per `EVENT_S`, and whether this snapshot is the last."""
         nonlocal newest
         now = time.monotonic()
         if newest is None or now - newest[0] >= 0.9 * EVENT_S:
@@ -204,8 +205,8 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 async def _values(request: Request) -> dict[str, Any] | None:
     """Return the JSON object of a request; None if the request has no object of at most `_LONGEST_BODY` bytes.
 
-    The content type must be ``application/json``: a page of another site cannot send it without a preflight request,
-    which is refused.
+    The content type must be ``application/json``: a page of another site cannot send this type without a preflight
+    request, which is refused.
     """
     if request.headers.get("content-type") != "application/json":
         return None
@@ -232,7 +233,7 @@ class _TimedProtocol(H11Protocol):
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to check the connection every `REQUEST_S`; close the peer's oldest idle ones beyond `MOST_IDLE`."""
+        """Begin to check the connection every `REQUEST_S`; close the peer's oldest idle connections."""
         super().connection_made(transport)
         peer = id(self.server_state), self.client[0] if self.client else ""
         mine = self.waiting.setdefault(peer, {})

@@ -25,7 +25,7 @@ _GRADIENT_CHANGE: Final = 0.003  #: Smallest change of gradient that is a featur
 _CURVATURE_CHANGE_1PM: Final = 1e-3
 #: Smallest likelihood ratio of the accepted position to any other position in the window.
 _LIKELIHOOD_RATIO: Final = 1e3
-_GAP_SIGMAS: Final = 3.0  #: Largest deviation of the distance from the last accepted feature, in sigmas.
+_GAP_SIGMAS: Final = 3.0  #: Largest deviation of the distance since the last accepted feature, in sigmas.
 _FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity, in units of its variance.
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
@@ -82,9 +82,9 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
     """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
-    A feature is at the middle of its change. For a measured line, `least` has a lower bound of changes at each point,
-    shape (N,), by quantity. A change must then also exceed the root sum of squares of the bounds at the two ends of the
-    change.
+    A feature is at the middle of its change. For a measured line, `least` has, for each quantity, a lower bound of
+    changes at each point, shape (N,). A change must then also exceed the root sum of squares of the bounds at its two
+    ends.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []

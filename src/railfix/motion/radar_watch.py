@@ -14,13 +14,13 @@ from railfix.motion.samples import RadarSpeeds
 
 _WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].
 _LEAST_SPEEDS: Final = 10  #: Minimum number of speeds in a window that is used.
-#: Largest time between a radar speed and the satellite-derived speed with which it is compared [ns].
+#: Largest time difference between a radar speed and the satellite-derived speed with which it is compared [ns].
 _NEAR_NS: Final = 150_000_000
 _MOVING_MPS: Final = 3.0  #: Lowest speed of the train at which speeds are compared [m/s].
 _LEAST_BEFORE: Final = 5  #: Minimum number of windows before a step.
 _MOST_BEFORE: Final = 20  #: Maximum number of windows before a step.
 _AFTER: Final = 3  #: Number of windows after a step.
-_SILENT: Final = 2  #: Number of consecutive windows without a radar speed that raises an alarm.
+_SILENT: Final = 2  #: Number of consecutive windows without a radar speed after which an alarm is raised.
 _STEP: Final = 0.01  #: Smallest reported step of the ratio.
 _SCATTERS: Final = 5.0  #: Smallest reported step, as a multiple of the scatter of the windows before the step.
 _LEAST_SCATTER: Final = 0.001  #: Lower bound of the scatter of the windows before the step.
@@ -46,7 +46,7 @@ class RadarAlarm:
             return f"radar: no speed since {at} while the train moves; check whether snow or dirt covers the radar"
         after, before = (f"{round(100.0 * share, 1) + 0.0:+.1f} %" for share in (self.after, self.before))
         return (
-            f"radar: from {at} on, its speeds differ from satellite speeds by {after} ({before} before); "
+            f"radar: from {at} on, its speeds differ from satellite-derived speeds by {after} ({before} before); "
             "check the mounting of the radar"
         )
 
@@ -64,9 +64,10 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Add radar and satellite-derived speeds, later than all previous ones, and return the alarms raised.
+        """Add radar and satellite-derived speeds, and return the alarms raised.
 
-        All arrays have shape (N,). `right_mps` are the satellite-derived speeds. Speeds that were not measured are NaN.
+        All arrays have shape (N,). `time` must be later than all previous times. `right_mps` are the satellite-derived
+        speeds. Speeds that were not measured are NaN.
         """
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])

@@ -1,7 +1,7 @@
 """Samples of the on-board sensors as read-only arrays, and formulas of Doppler radar and two-way ranges (P2 3).
 
 Times are GPS times in ascending order. Values are NaN where nothing was measured. If a radar beam points by an angle
-alpha below the direction of travel, the relative error of its speed is ``tan(alpha)`` times the error of alpha.
+alpha below the direction of travel, the relative error of the speed is ``tan(alpha)`` times the error of alpha.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """N passages of the train's reader over a balise; of a group of balises, only the listed balise has a reading."""
+    """N passages of the train's reader over balises; in a group of balises, only the listed balise has a reading."""
 
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity of the balise, shape (N,).
     #: Standard deviation along the line, reported by the reader; NaN if not reported; shape (N,).

@@ -1,17 +1,17 @@
-r"""Slip, slide, low speed and rolling away, detected from the vehicle's pitch (P2 2.1) and bridged by inertia.
+r"""Detection of slip, slide, low speed and rolling away by the vehicle's pitch (P2 2.1), and speed during these states.
 
 While the wheel rolls, ``sin(theta_T) = (f_x - a_T) / g`` from accelerometer and tachometer is the sine of the pitch.
 During a slip, this sine exceeds the gradient of any line. There are two rules:
 
 * ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient and the pitching of the body. The rule
-  only detects a change of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
+  detects only changes of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
 * ``"map"`` compares the pitch with the gradient of the line at the present position, and has a latch: a slip ends only
   when the wheel has returned to the inertial speed and the pitch agrees, or when wheel and train are at rest.
 
-During a slip, speed and distance are integrated from the accelerometer minus the components of pitch and offset, from
-`LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. Without a gyro, the pitch of the line
-is used where the position is known. With a gyro, the pitch is the integral of the pitch rate, with a slow correction to
-the line or, where the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
+During a slip, speed and distance are integrated from the accelerometer, corrected for pitch and offset. The integration
+starts `LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. Without a gyro, the pitch of
+the line is used where the position is known. With a gyro, the pitch is the integral of the pitch rate, with a slow
+correction to the line or, where the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class MotionState(IntEnum):
     EXPIRED = 7  #: The inertial speed is too old or implausible; there is no speed.
 
 
-#: Limit of the difference between the pitch sines of vehicle and line; it equals 0.15 m/s2 between wheel and train.
+#: Limit of the difference between the pitch sines of vehicle and line, equivalent to an acceleration of 0.15 m/s2.
 _MAP_LIMIT: Final = 0.015
-#: Lower bound of the limit, in standard deviations of the difference while the wheel rolls. This bound is needed
+#: Lower bound of this limit, in standard deviations of the difference while the wheel rolls. This bound is needed
 #: because a pitching body accelerates the accelerometer, the more the higher the accelerometer is mounted.
 _NOISE_SIGMAS: Final = 5.0
-_NOISE_S: Final = 30.0  #: Time constant of the estimated standard deviation.
+_NOISE_S: Final = 30.0  #: Time constant of the estimate of this standard deviation.
 _LATCH_MPS: Final = 0.15  #: Difference of wheel and inertial speeds within which a slip ends.
 _LATCH_SHARE: Final = 0.01  #: The same difference as a fraction of the speed; the larger of both differences is used.
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
@@ -60,10 +60,10 @@ SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
 _STANDING_MPS: Final = 0.5  #: Largest inertial speed that agrees with a stationary wheel.
 _PITCH_S: Final = 20.0  #: Time constant with which the pitch integrated from the gyro is corrected.
-#: Largest plausible sine of the pitch; a line has at most 0.035, and the rest is a margin for body and mounting.
+#: Largest plausible sine of the pitch: 0.035 for the line, and a margin for body and mounting.
 _STEEPEST: Final = 0.1
 _FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
-#: Time for which the body still pitches after a stop. After this time, its pitch is used as the pitch at standstill.
+#: Time for which the body pitches after a stop. Later, the measured pitch is used as the pitch at standstill.
 _SETTLING_S: Final = 2.0
 _ROLLING_LIMIT: Final = 0.002  #: Change of the pitch sine since standstill that indicates rolling away.
 _ROLLING_S: Final = 0.3  #: Time for which this change must persist.
@@ -76,7 +76,7 @@ class SlipLimits(Settings):
     #: Whether the pitch is compared with the gradient of the line ("map"), or with the constant `p2_limit`, without
     #: latch and look-back ("p2").
     rule: Literal["map", "p2"] = "map"
-    #: Largest sine of the pitch without slip, for the rule "p2": 35 permille of line (P2 2.1) and 10 permille of body.
+    #: Largest sine of the pitch without slip in "p2": 35 permille for the line (P2 2.1), 10 permille for the body.
     p2_limit: float = Field(default=0.045, gt=0)
     confirm_s: float = Field(default=0.1, ge=0)  #: Time for which the limit must be exceeded before a slip is declared.
     #: Drift of the inertial speed, by which the speed limit of the latch grows. 1e-3 of gravity covers accelerometer
@@ -98,7 +98,7 @@ class SlipResult:
     #: inertial speed is integrated. At the end of the slip, the distance is corrected for the difference of wheel and
     #: inertial speeds, which is assumed to have grown linearly.
     distance_m: Floats
-    #: Sine of the pitch by wheel and accelerometer minus `pitch`; NaN without pulses; shape (N,).
+    #: Sine of the pitch from wheel and accelerometer, minus `pitch`; NaN without pulses; shape (N,).
     metric: Floats
     smooth: Floats  #: `metric` minus the accelerometer offset, low-pass filtered with `SMOOTHING_S`; shape (N,).
     pitch: Floats  #: Sine of the reference pitch; NaN before the first estimate; shape (N,).
@@ -344,7 +344,7 @@ class _Automaton:
                 self._look_back(inertial, dt)
 
     def _look_back(self, inertial: float, dt: float) -> None:
-        """Recompute speed and distance by inertia, beginning shortly before the detection."""
+        """Recompute speed and distance from the inertial acceleration, beginning shortly before the detection."""
         begin = self._age - LOOK_BACK_S - self.limits.confirm_s - SMOOTHING_S
         past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
         if not past:

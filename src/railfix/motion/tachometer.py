@@ -19,7 +19,7 @@ from railfix.motion.samples import TachometerPulses
 
 #: Names of speed units by their conversion factors from m/s.
 _UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
-#: Largest relative deviation from the factor of a unit: more than wheel wear (2 %), less than between two units.
+#: Largest relative deviation from a unit's factor. Wheel wear is at most 2 %, and two units differ by 15 % or more.
 _UNIT_SHARE: Final = 0.05
 LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Speeds below this limit are not returned: 1 km/h (P2 1).
 
@@ -29,7 +29,7 @@ class TachometerLimits(Settings):
 
     wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: Wheel diameter that is configured on board.
     pulses_per_turn: int = Field(default=60, ge=1)  #: Pulses per turn of the wheel, after multiplication of edges.
-    #: Time over which a speed is computed. P2 3.2 gives 0.1 s as the usual smoothing of a tachometer. If the teeth are
+    #: Time over which a speed is computed. The usual smoothing time of a tachometer is 0.1 s (P2 3.2). If the teeth are
     #: uneven, use the time of a full turn.
     window_s: float = Field(default=0.1, gt=0)
     silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which the speed is NaN.
@@ -87,8 +87,8 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
 def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
     """Return the index of the pulse at which the window of each pulse `last` starts.
 
-    The window starts at the last pulse that is at least `window_s` earlier, and at least one pulse earlier; near the
-    start, at the first pulse.
+    The window starts at the last pulse that is at least `window_s` earlier, and at least one pulse earlier. If there is
+    no such pulse, it starts at the first pulse.
     """
     start = np.searchsorted(time, time[last] - timedelta(np.full(len(last), window_s)), side="right") - 1
     return np.asarray(np.maximum(np.minimum(start, last - 1), 0), dtype=np.intp)
@@ -145,7 +145,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
     """Return the number of lost and doubled pulses detected up to each instant, shape (N,).
 
-    A fault is detected two pulses after it occurs. Lost pulses that `pulse` numbers show are not counted.
+    A fault is detected two pulses later. Lost pulses that are evident from missing `pulse` numbers are not counted.
     """
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
