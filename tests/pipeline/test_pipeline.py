@@ -243,7 +243,7 @@ def test_epochs_out_of_order_are_refused(step: int) -> None:
     front = clean_observations()["front"]
     time = front.time.copy()
     time[2] = time[1] + step * np.timedelta64(1, "ms")
-    with pytest.raises(ValueError, match=r"front: epoch 2 \(.*\) is not after .*; give epochs in order of time"):
+    with pytest.raises(ValueError, match=r"front: epoch 2 \(.*\) is not after .*; pass epochs in order of time"):
         processor().process({"front": replace(front, time=time)})
 
 

@@ -292,7 +292,7 @@ def test_an_arc_that_goes_on_after_a_newer_one_of_its_channel_is_an_error():
     again = phases.arc_id.copy()
     again[150:] = again[:10]
     again = np.where(phases.arc_id >= 0, np.maximum(again, 0), -1)
-    with pytest.raises(ValueError, match="an arc has phases after a newer arc of its channel; number arcs with"):
+    with pytest.raises(ValueError, match="an arc has phases after the start of a newer arc of its channel; assign"):
         phase_positions(time, ranges, replace(phases, arc_id=again), LINE, start)
 
 

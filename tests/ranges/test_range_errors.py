@@ -333,7 +333,7 @@ def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: 
     other = make_processor(
         parse_config({"filter": "off", "error_model": str(tmp_path / "m.toml"), "screens": []}), *_nothing()
     )
-    assert any("its conditions differ from this run's: screens: model elevation" in note for note in other.notes)
+    assert any("its conditions differ from those of this run: screens: model elevation" in note for note in other.notes)
 
 
 def _nothing() -> tuple[Navigation, dict[str, Trajectory]]:

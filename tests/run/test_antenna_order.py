@@ -74,7 +74,7 @@ def test_exchanged_logs_are_noted_whichever_way_the_train_faces_and_runs(
     assert right.note is None
     exchanged = order_of(way, facing=facing, reference=reference, exchanged=True)
     assert exchanged.measure()[0] == pytest.approx(-SPACING_M, abs=4.0 * exchanged.measure()[1])
-    assert "behind those of the rear log, but should be 18.2 m ahead by the vehicle file" in exchanged.note
+    assert "should be 18.2 m ahead of those of the rear log, but they are" in exchanged.note
 
 
 def test_what_is_not_certain_is_not_noted() -> None:

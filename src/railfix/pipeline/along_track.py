@@ -45,7 +45,7 @@ _WEIGHED_BY_FILTER: Final = (
 )
 #: Rejection reasons that apply to the code only; the filter still uses the satellite's phase and Doppler.
 _CODE_ALONE: Final = Reason.GROSS_ERROR
-#: At standstill, the speed plus two sigmas is below this limit [m/s]: 1 km/h, below which tachometers give no output.
+#: The train is at standstill if the speed plus two sigmas is below this [m/s]: 1 km/h, the lower limit of tachometers.
 STANDSTILL_MPS: Final = 1.0 / 3.6
 #: Number of sigmas up to which positions beyond an end of the line are moved to the end.
 _END_SIGMAS: Final = 4.0
@@ -53,9 +53,9 @@ _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
 #: Half-width of the gate of two-way ranges around the predicted range, in standard deviations.
 _GATE_SIGMAS: Final = 3.0
-#: Minimum half-width toward long ranges [m]. Echoes arrive late, and are separable from 0.3 m on (P2, table 3).
+#: Minimum half-width of the gate for long ranges [m]. Echoes arrive late, and are separable from 0.3 m (P2, table 3).
 _LATE_M: Final = 0.6
-#: Vertical error of the ionospheric model that the filter's displacements (`slow_code_m`, `TILT_M`) assume [m].
+#: Vertical error of the ionospheric model for which the filter's displacements (`slow_code_m`, `TILT_M`) are valid [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
 #: Length of the blocks of GPS time that the filter processes if there are sensors [ns].
 _BLOCK_NS: Final = 5_000_000_000
@@ -133,7 +133,7 @@ def single_epochs(solution: Solution, interference: Interference | None, config:
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
-    """Raise finite levels to at least `bound_m`, the largest position error that the wheel distance does not reveal."""
+    """Raise finite levels to at least `bound_m`, the largest position error that wheel distances would not reveal."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
         tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
@@ -155,7 +155,7 @@ def _against_wheel(
 def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions, doubtful where distance or speed of the two antennas are inconsistent, and the state.
+    """Mark positions as doubtful where the two antennas' positions or speeds disagree; return them and the state.
 
     `spacing` has the screen's verdicts, shape (T,), or is None. A rejection also applies to the `held_s` seconds after
     its epoch.
@@ -187,7 +187,7 @@ def with_passings(
 
 
 def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
-    """Return positions with `status` and infinite levels at doubtful epochs; NaN levels are kept."""
+    """Return positions whose doubtful epochs have the given `status` and infinite levels; NaN levels are kept."""
     if not doubtful.any():
         return tracked
     reported = np.where(doubtful, np.int8(status), tracked.status)
@@ -319,7 +319,7 @@ def _find_fix(tracked: Tracked) -> FilterFix:
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:
     """Return arc lengths on the trajectory, shape (T,) [m].
 
-    A position beyond an end by at most the larger of four sigmas and 30 m is moved to that end. Positions further out
+    A position beyond an end by at most the larger of four sigmas and 30 m is moved to that end. Positions farther out
     are NaN.
     """
     arc, end = tracked.arc_m, trajectory.arc_m[-1]
@@ -340,8 +340,8 @@ def gnss_epochs(
     A code is the corrected pseudorange, NaN at unsure epochs and where it has a rejection reason outside
     `_WEIGHED_BY_FILTER`. Its standard deviation is the range sigma times `noise_scale`, shape (T,).
 
-    Carrier phases are corrected for satellite clock and troposphere. Dopplers are not, because the drift of a satellite
-    clock and the tropospheric rate are only some millimetres per second.
+    Carrier phases are corrected for satellite clock and troposphere. Dopplers are not corrected, because the drift of a
+    satellite clock and the tropospheric rate are only some millimetres per second.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state
@@ -372,9 +372,8 @@ def compute_tilt_scale(ranges: CorrectedRanges, line: Line, klobuchar: Floats | 
     """Return `GnssEpochs.tilt_scale`, shape (T,).
 
     The scale is 0 for ionosphere-free codes, and 1 where SBAS or a base station corrects the ranges or no model is
-    used. Otherwise it is the error of the Klobuchar model in metres, at least 1: the fraction
-    `NominalErrors.ionosphere_share` of the vertical delay at the beginning of the line, which does not depend on the
-    satellites in view.
+    used. Otherwise it is the error of the Klobuchar model in metres, at least 1. This error is the fraction
+    `NominalErrors.ionosphere_share` of the vertical delay at the beginning of the line, for any satellites in view.
     """
     one = np.ones(len(ranges.time))
     if klobuchar is None or config.dual_frequency_sbas:

@@ -1,8 +1,8 @@
-"""Order of two antennas of one vehicle by their positions.
+"""Test of the order of two antennas of one vehicle by their positions.
 
-Each antenna is positioned on its own trajectory, with its own offset from the vehicle. If the two logs are exchanged,
-or if the vehicle is turned round, each position still fits the ranges of its log. The front antenna then appears behind
-the rear antenna, by the distance by which it should be ahead.
+Each antenna is positioned on its own trajectory, with its own offset from the vehicle. If the two logs are swapped, or
+if the vehicle faces the other way, each position still fits the ranges of its log. The front antenna then appears
+behind the rear antenna, by the distance by which it should be ahead.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from railfix.screens.pairs import pair_epochs
 from railfix.track.trajectory import Trajectory
 
 #: Length of a stretch of the line [m]. The pairs of positions on one stretch count as one sample, because the same
-#: reflections affect them.
+#: reflections affect all of them.
 _STRETCH_M: Final = 50.0
-#: Minimum number of stretches for a verdict; a train at rest has too few.
+#: Minimum number of stretches for a verdict; a train at rest is on too few stretches.
 _LEAST_STRETCHES: Final = 4
 #: The antennas are in the wrong order if the front antenna is behind the rear antenna by more than this number of
 #: sigmas.
@@ -109,7 +109,7 @@ class AntennaOrder:
             return None
         first, second = ("front", "rear") if self.distance_m > 0.0 else ("rear", "front")
         return (
-            f"the positions of the {first} log are {-ahead:.1f} m (sigma {sigma:.1f} m) behind those of the {second} "
-            f"log, but should be {right:.1f} m ahead by the vehicle file: the logs are exchanged (--front, --rear), or "
-            "the vehicle faces the other way (facing)"
+            f"according to the vehicle file, the positions of the {first} log should be {right:.1f} m ahead of those "
+            f"of the {second} log, but they are {-ahead:.1f} m (sigma {sigma:.1f} m) behind: the logs are swapped "
+            "(--front, --rear), or the vehicle faces the other way (facing)"
         )

@@ -1,8 +1,8 @@
-"""Balises and virtual balises: filter positions at the readings, and the passing of each balise.
+"""Balises and virtual balises: readings as measurements of the filter, and the passing of each balise.
 
 The interval of a passing is the time during which ``|m - s| <= L``, with the arc length m of the balise, the filter's
-position s and the protection level L of that position. The train certainly changes from one side of the balise to the
-other in this interval, in either direction of travel.
+position s and the protection level L of that position. Within this interval, the train certainly moves from one side of
+the balise to the other, in either direction of travel.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ AGAIN_S: Final = 60.0
 
 
 class BaliseLimits(Settings):
-    """Balise reader on the vehicle."""
+    """Position of the balise reader on the vehicle, and accuracy of readings."""
 
     #: Distance of the reader ahead of the vehicle's middle, or ahead of the antenna if there is no vehicle file.
     ahead_m: float = 0.0
@@ -86,9 +86,9 @@ def balise_epochs(
 #: Possible verdicts on a passing or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
-#: Odometer accuracy by SUBSET-041 5.2.1.1: a constant [m], and a fraction of the distance since the last balise read.
+#: Odometer accuracy by SUBSET-041 5.2.1.1: a constant [m], plus a fraction of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
-#: Longest time between epochs for interpolation, and between a reading and the time at which its balise was passed [s].
+#: Longest time between epochs for interpolation, and between a reading and the passing of its balise [s].
 _APART_S: Final = 2.0
 #: A reading is wrong if the balise and the filter's position differ by more than this number of sigmas.
 _CONTRADICTION_SIGMAS: Final = 5.0
@@ -132,9 +132,9 @@ class PassingState:
     over: Datetimes  #: Time at which the filter's position was last over the balise, shape (M,).
     over_values: Floats  #: `_VALUES` at the time `over`, and odometer accuracy; shape (M, 6).
     read: Datetimes  #: Time of the last correct reading of each balise, shape (M,).
-    #: Readings after the last epoch, which are compared in the next chunk.
+    #: Readings after the last epoch, which are compared with the filter's positions in the next chunk.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Time and filter position [m] of each correct reading, from the last reading older than `_APART_S` on.
+    #: Time and filter position [m] of each correct reading, starting with the last reading older than `_APART_S`.
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -227,7 +227,7 @@ def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.date
 def _pass(
     listed: ListedBalises, arcs_m: Floats, turn_m: float, time: Datetimes, values: Floats, state: PassingState
 ) -> tuple[list[Passing], PassingState]:
-    """Return the passings that ended, and the state after the epochs."""
+    """Return the passings that ended in a chunk, and the state after the chunk."""
     level = np.where(np.isfinite(values[:, 3]), values[:, 3], np.inf)[:, None]
     ahead = short_distance_m(arcs_m - values[:, :1], turn_m)
     far = np.abs(ahead) > 0.25 * turn_m
@@ -247,7 +247,7 @@ def _pass(
             continue
 
         def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
-            """Return the time at which a value is zero between two epochs; the earlier epoch if unknown."""
+            """Return the time at which a value is zero between two epochs; the earlier epoch if it is unknown."""
             span = float(seconds(time[k] - time[k - 1]))
             known = np.isfinite(first - last) and first != last and span <= _APART_S
             return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))

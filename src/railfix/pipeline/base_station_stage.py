@@ -28,7 +28,7 @@ from railfix.ranges.base_station import LONGEST_AGE_S, BaseErrors
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Half length of an artificial north-south track through the station, which the corrections require [deg]; about 50 m.
+#: Half length of the artificial north-south track through the station that the corrections require [deg]: about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch with a known station position so far, so no errors are subtracted"
 #: Station positions within this distance count as equal [m].
@@ -55,11 +55,11 @@ class BaseState:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Note on a station that had no epoch with a known position so far; empty for other stations."""
+        """Note that no epoch with a known station position has been received so far; empty otherwise."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
-        """Return the received data with the errors of the station and, without errors, a note."""
+        """Return the received data with the station's range errors, or with a note if there are none."""
         notes = tuple(note for note in received.notes if note != _NO_EPOCH)
         return replace(received, base=self.errors, notes=(*notes, *self.notes))
 
@@ -69,8 +69,8 @@ class BaseStation:
 
     The station's pseudoranges are corrected like those of the train, and smoothed by carrier phase where available.
     Smoothing reduces the station's noise, but not its multipath. With "stream" the position is taken from the headers
-    of the observations. The state restarts if the position changes by more than a centimetre, as at a change of virtual
-    station.
+    of the observations. The state restarts if this position changes by more than a centimetre, for example at a change
+    of virtual station.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
@@ -87,7 +87,7 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Return the state after more observations of the station, without errors too old for epochs after `began`."""
+        """Add observations of the station to the state; drop errors too old for epochs after `began`."""
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
@@ -152,7 +152,7 @@ class BaseStation:
 
 
 def check_base(config: Config, base: BaseStation | None) -> None:
-    """Raise SettingsError if the settings require a missing base station, or do not allow the base station given."""
+    """Raise SettingsError if the settings require a missing base station, or do not allow the given base station."""
     if config.carrier == "fixed" and base is None:
         raise SettingsError("carrier = fixed: integers require a base station (--base); otherwise set carrier = float")
     if config.sbas and base is not None:

@@ -80,9 +80,9 @@ def smooth_ranges(
     config: Config,
     states: Sequence[CarrierState],
 ) -> tuple[CorrectedRanges, list[CarrierState]]:
-    """Return the ranges with smoothed codes, but with the weights of raw codes, and the new state of each antenna.
+    """Return ranges that have smoothed codes and the weights of raw codes, and the new state of each antenna.
 
-    Smoothing does not raise the weights, because multipath and the error floor do not average out as white noise does.
+    Smoothing does not raise the weights, because multipath and the error floor do not average out like white noise.
     """
     obs = corrected.observations
 
@@ -152,7 +152,7 @@ def code_and_phase(
 
 
 def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks, dict[tuple[str, str], int]]:
-    """Return a mask (T, K), true where a new arc of the base station's phase begins, and each channel's last arc."""
+    """Return a mask (T, K) of the starts of arcs of the base station's phases, and the last arc of each channel."""
     assert corrected.base is not None
     keys = list(zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True))
     before = np.array([state.base_arc.get(key, -1) for key in keys], dtype=np.int64)
@@ -176,7 +176,7 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return wavelengths, and groups of channels with a common clock and signal; group -1 is GLONASS, never fixed."""
+    """Return wavelengths, and groups of channels with a common clock and signal; -1 for GLONASS (never fixed)."""
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

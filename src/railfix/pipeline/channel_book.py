@@ -28,7 +28,7 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     return tuple(notes)
 
 
-#: Number of cached sets of channels.
+#: Largest number of cached sets of channels.
 _REMEMBERED: Final = 64
 
 

@@ -1,4 +1,4 @@
-"""Chunk of epochs between the stages of the pipeline."""
+"""Data of a chunk of epochs that the stages of the pipeline pass on."""
 
 from __future__ import annotations
 

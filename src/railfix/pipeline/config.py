@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
 
 
-#: Measurements that the filter along the track can use, with their names in the column `sources`.
+#: Names of the measurements that the filter along the track can use, as in `Config.filter_sources`.
 FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range"]
 FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
     "code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range",
@@ -86,7 +86,7 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
 if TYPE_CHECKING:
 
     class ScreenSettings(Settings):
-        """Limits of the screens, one field for each screen; at run time the fields are those of `SCREENS`."""
+        """Limits of the screens; at run time, there is one field for every screen in `SCREENS`."""
 
         elevation: ElevationLimits = ElevationLimits()
         cn0: Cn0Limits = Cn0Limits()
@@ -105,7 +105,7 @@ OFF_MAP_S: Final = 10.0
 
 
 class Config(ScreenSettings):
-    """Positioning settings, each with its default and the default's source.
+    """Positioning settings, with their defaults and the sources of the defaults.
 
     Attributes
     ----------
@@ -124,41 +124,40 @@ class Config(ScreenSettings):
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first observed signal is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    #: Number of codes combined per satellite; one with SBAS on L1 or a base station.
+    #: Number of codes combined per satellite; always one with SBAS on L1 or a base station.
     frequencies: Literal["one", "two"] = "one"
     two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of two codes.
     #: Active screens; health and validity of the satellites are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
-    #: File with the mean C/N0 over elevation, written by ``railfix cn0-curve``; without a file only the floor is used.
+    #: File with the mean C/N0 by elevation, written by ``railfix cn0-curve``. Without a file, only the floor is used.
     cn0_curve: Path | None = None
-    #: Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of the check, or
-    #: dropped as P1 does.
+    #: Treatment of the coordinates of positions with a failed check (`reasons.CHECK_FAILED`): they are kept, with the
+    #: status of the check, or dropped as in P1.
     failed_checks: Literal["keep", "drop"] = "keep"
     #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds this
     #: limit is `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared
-    #: with the limit. P4 takes a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed
-    #: checks.
+    #: with the limit. P4 accepts a car length, 20 m; the preset "strict" uses 10 m and drops failed checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)
     #: Minimum number of satellites for a position. P1 3.2 uses 3; with 2, positions on curves are ambiguous.
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)  #: Largest along-track dilution [m/m] of a position.
-    #: Probability that noise alone moves a position off the map; the noise is estimated from the residuals of the 3-D
-    #: fit.
+    #: Probability that noise alone makes a position count as off the map. The noise is estimated from the residuals of
+    #: the 3-D fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
-    #: Probability of another track above which positions on a network are neither `ok` nor `tracking`, and have no
-    #: level. `railfix which-track` uses the same limit.
+    #: Probability that the train is on another track, above which positions on a network are neither `ok` nor
+    #: `tracking`, and have no level. `railfix which-track` uses the same limit.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the ionospheric delay.
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.
-    #: Largest age of a navigation record, which also must be valid.
+    #: Largest age of a navigation record; older records are not used, even if they are valid.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: Standard deviation of the map that replaces the track's own (P1: 0.30 m in plan, 0.60 m in height).
+    #: Standard deviation of the map, in place of the value in the track file (P1: 0.30 m in plan, 0.60 m in height).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
     #: Test for persistent range errors of a minute and longer.
     lasting_errors: LastingErrorLimits = LastingErrorLimits()
-    #: Selection of consistent ranges of an epoch, from which clock offsets and noise are estimated.
+    #: Selection of an epoch's consistent ranges, from which inter-system biases and noise are estimated.
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
     interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
@@ -169,14 +168,15 @@ class Config(ScreenSettings):
     #: Messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free codes
     #: of GPS L1 C/A and L5, and of Galileo E1 and E5a. With L5, satellites without both codes are rejected.
     sbas_band: Literal["L1", "L5"] = "L1"
-    #: GEO whose messages are used; "best" is the GEO with the most usable fast corrections (on L5: most corrections).
+    #: GEO whose messages are used; "best" is the GEO with the most usable corrections (on L1: fast corrections).
     sbas_prn: int | Literal["best"] = "best"
     #: SBAS time-outs, use of message type 0, and treatment of missing degradation data.
     sbas_limits: SbasLimits = SbasLimits()
     base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
-    #: File with overbounds of the range errors by direction and C/N0, written by ``railfix error-model``. In the
-    #: protection level no range sigma is below its overbound; weights, screens and RAIM use `noise`. Without the file,
-    #: the level uses `noise` times the noise scale estimated so far, which does not bound the tails.
+    #: File with overbounds of the range errors by direction and C/N0, written by ``railfix error-model``. For the
+    #: protection level, each range sigma is raised at least to the sigma of the overbound. Weights, screens and RAIM
+    #: use `noise` alone. Without the file, the level uses `noise` times the noise scale estimated so far, which does
+    #: not bound the tails.
     error_model: Path | None = None
     #: Satellite and atmospheric errors that are added to a model of local errors without SBAS.
     nominal: NominalErrors = NominalErrors()
@@ -187,17 +187,17 @@ class Config(ScreenSettings):
     #: in 3-D. Not with SBAS.
     integrity_support: Path | None = None
     araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
-    #: Largest protection level of an available position. P4 takes a car length, 20 m.
+    #: Largest protection level of an available position. P4 uses a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
-    #: Chainage intervals in which local faults cannot be bounded and no level is given. ``railfix error-model`` prints
-    #: the intervals that it finds.
+    #: Chainage intervals in which local faults cannot be bounded, and the level is infinite. ``railfix error-model``
+    #: prints the intervals that it finds.
     no_level_m: tuple[tuple[float, float], ...] = ()
-    #: Whether the protection level of P4 is computed, too: the largest slope times the largest undetected bias.
+    #: Whether the protection level of P4 is computed as well: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
     #: Use of the carrier phase: none; smoothing of codes; or code and phase together from this and earlier epochs, with
     #: float ambiguities, or with integer ambiguities, which require a base station ("fixed"). On recordings, smoothing
-    #: helps most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither removes large
-    #: errors.
+    #: helps most on a phone, and float ambiguities help most under open sky. In towns, where arcs last seconds, neither
+    #: removes large errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
@@ -221,7 +221,7 @@ class Config(ScreenSettings):
     @model_validator(mode="before")
     @classmethod
     def _on_preset(cls, values: Any) -> Any:
-        """Merge the given settings over the preset; the validation of the field `preset` rejects an unknown preset."""
+        """Override the preset with given settings; the validation of the field `preset` rejects an unknown preset."""
         if not isinstance(values, dict):
             return values
         return _over(PRESETS.get(str(values.get("preset", "default")), {}), values)
@@ -230,7 +230,7 @@ class Config(ScreenSettings):
     @classmethod
     def _some_system_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not value or len(set(value)) != len(value):
-            raise ValueError("give at least one constellation, each once")
+            raise ValueError("specify at least one constellation, and each only once")
         return value
 
     @field_validator("screens")
@@ -279,7 +279,7 @@ class Config(ScreenSettings):
 
     @cached_property
     def fix_limits(self) -> FixLimits:
-        """Limits of the stages from the 3-D position to the position on the line."""
+        """Limits of the 3-D position, the section search and the position on the line."""
         return FixLimits(self.min_satellites, self.single_point, self.section, self.constrained)
 
     @cached_property
@@ -294,7 +294,7 @@ class Config(ScreenSettings):
 
 
 def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge settings over a preset; groups are merged by key, but limits given as an object replace the preset's."""
+    """Override a preset. Groups are merged by key, but limits given as an object replace the whole group."""
     both = {**preset, **values}
     for name, group in preset.items():
         given = values.get(name)

@@ -1,4 +1,4 @@
-"""Exclusion of persistent and single faults from the ranges of a chunk, and noise scales."""
+"""Exclusion of persistent and single faults from the ranges of a chunk, and estimation of noise scales."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Ratio of an epoch's residual variance to the assumed variance above which noise is not the cause: (100 sigmas)^2.
+#: Largest ratio of an epoch's residual variance to the assumed variance that noise is assumed to cause: (100 sigmas)^2.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -50,7 +50,7 @@ def check_ranges(
     config: Config,
     states: Sequence[AntennaState],
 ) -> tuple[CorrectedRanges, Ranges, CheckedPositions, list[AntennaState]]:
-    """Return the ranges and positions after the exclusion of persistent and then of single faults, and noise scales.
+    """Exclude persistent faults and then single faults; return the ranges, the positions with noise scales, and states.
 
     The robust scale, which RAIM uses, is estimated from mutually consistent ranges. The reported scale is estimated
     from the ranges that remain after RAIM.
@@ -118,7 +118,7 @@ def _chi_square_limit(risk: float, freedom: int) -> float:
 
 
 def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Masks:
-    """Return the epochs whose ranges contradict the map, or place the antenna beyond an end of the map, shape (T,).
+    """Return the epochs whose ranges contradict the map, or indicate a position beyond an end of the map, shape (T,).
 
     Ranges contradict the map if the position on the line fits significantly worse than the 3-D position (chi-square
     test with `Config.off_map_risk`). The difference of the weighted squares is divided by the residual variance of the

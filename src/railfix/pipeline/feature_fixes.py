@@ -1,4 +1,4 @@
-"""Positions from features of the line that the vehicle body has passed."""
+"""Positions from features of the line, such as curves, that the vehicle body has passed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Minimum number of whole metres passed without a break for a comparison with a feature.
+#: Minimum number of whole metres, passed without a break, for a comparison with a feature.
 _LEAST_POINTS: Final = 30
 
 
@@ -63,7 +63,7 @@ _FEATURE_SIGMA_M: Final = 0.5
 
 @dataclass(frozen=True)
 class TrackFeatures:
-    """Features of a track for the vehicle body that carries an antenna, computed when the first rates are given."""
+    """Features of a track for the vehicle body that carries an antenna, computed at the first call of `locate`."""
 
     track: Track
     trajectory: Trajectory
@@ -127,13 +127,11 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the measured profile with a feature; `noise` has the sigma of the wheel position and those of the
-    profile.
-    """
+    """Compare the profile with a feature; `noise` has the sigma of the wheel position and the profile's sigmas."""
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
-    # The profile is in rising arc length: for a reversing or turned vehicle the sign of the pitch changes, but the sign
-    # of the heading does not.
+    # The profile refers to rising arc length. For a reversing or turned vehicle, the sign of the pitch changes, but the
+    # sign of the heading does not.
     passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
     place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
     profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
@@ -173,7 +171,7 @@ def feature_fixes(
     metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
     kept, last, done = int(2.5 * HALF_LENGTH_M), state.last, state.done_m
     breaks = np.flatnonzero(~usable)
-    # stretches of usable ticks, each ended by an unusable tick
+    # each stretch of usable ticks ends at an unusable tick
     edges = np.concatenate([[-1], breaks, [len(usable)]])
     for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         if begin >= 0:

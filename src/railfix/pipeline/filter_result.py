@@ -26,7 +26,7 @@ from railfix.tracking.result import is_bounded
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Filter position at an epoch, from which dead reckoning by the wheel restarts every few seconds."""
+    """Filter position at an epoch; dead reckoning by the wheel restarts from such a position every few seconds."""
 
     time: np.datetime64
     #: Arc length; NaN if the filter has no unique position.
@@ -43,7 +43,7 @@ class FilterFix:
 class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
-    noise_scale: Floats  #: Ratio of the receiver's code noise to the range sigmas.
+    noise_scale: Floats  #: Code noise of the receiver divided by the range sigmas.
     #: Single-epoch positions. After an outage, codes are used again once these positions agree with dead reckoning.
     arc_m: Floats
     sigma_m: Floats
@@ -94,7 +94,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
 
     tracked: Tracked  #: Output of the filter, with the channels of `AntennaResult.corrected`.
     trajectory: Trajectory  #: Trajectory of the antenna.
-    #: Positions on the trajectory; positions slightly beyond an end are moved to it, NaN further out; shape (T,).
+    #: Positions on the trajectory. Positions slightly beyond an end are moved to the end; NaN farther out; shape (T,).
     arc_m: Floats
     #: Direction: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
     direction: Codes
@@ -103,7 +103,8 @@ class AlongTrack(LineCoordinates, NotebookTable):
     sensed: SensedMotion
     #: Distance between the positions of both antennas minus the antenna spacing; NaN where not compared; shape (T,).
     spacing_error_m: Floats
-    wheel: WheelSigns | None = None  #: Comparison of satellite with wheel distances; None without a wheel.
+    #: Comparison of satellite-derived distances with wheel distances; None without a wheel.
+    wheel: WheelSigns | None = None
     passings: tuple[Passing, ...] = ()  #: Passed balises and virtual balises, and wrong readings.
 
     @property
@@ -128,7 +129,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:
-        """Return the medians of sigma and level in metres, as texts."""
+        """Return the medians of sigma and level in metres, as strings."""
         tracked = self.tracked
         return {"median sigma [m]": median_text(tracked.sigma_m), "median level [m]": median_text(tracked.level_m)}
 
@@ -144,7 +145,7 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class SmoothedTrack(NotebookTable):
-    """Positions of T epochs, each from all measurements before and after it."""
+    """Positions of T epochs, each from all measurements of the run."""
 
     time: Datetimes  #: Time tags, shape (T,).
     arc_m: Floats  #: Arc length, shape (T,).

@@ -20,7 +20,7 @@ from railfix.screens import Screened, Verdict
 
 #: Name of this stage's verdict.
 NAME: Final = "two_frequencies"
-#: Correlation arc of the ionospheric model error, 1000 km [rad].
+#: Arc over which the ionospheric model error is correlated [rad]: 1000 km.
 _IONOSPHERE_ARC: Final = 0.157
 #: Deviation of a delay from a plane over the sky, as a fraction of the delay. Galileo delays deviate by 0.06 of 1.5 m
 #: at a station in a solar minimum, 0.02 of 3.9 m on a drive in Japan, 0.05 of 6.4 m on a roof in Japan in 2024 (Walter
@@ -35,9 +35,7 @@ def combine_frequencies(
     ionosphere_sigma_m: float,
     states: Sequence[TwoFrequencyState],
 ) -> tuple[CorrectedRanges, Combined, Verdict, list[TwoFrequencyState]]:
-    """Return ranges with combined codes, the combination, a verdict that lowers weights of inconsistent codes, and
-    states.
-    """
+    """Combine codes; return ranges, the combination, a verdict that lowers inconsistent codes' weights, and states."""
     usable, second = corrected.reason == 0, corrected.second
     assert second is not None
     code = np.where(usable, corrected.corrected_code_m, np.nan)
@@ -76,9 +74,7 @@ def combine_frequencies(
 
 
 def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: Floats) -> Floats:
-    """Return sigmas of the ionospheric model error: offset, two gradients and satellite remainder, shape (T, K, 4)
-    [m].
-    """
+    """Return sigmas of the ionospheric model error, (T, K, 4) [m]: offset, two gradients, satellite remainder."""
     obliquity, azimuth = thin_shell_obliquity(ranges.elevation_deg), np.radians(ranges.azimuth_deg)
     offset = vertical_m[:, None] * obliquity
     to_pierce_point = np.radians(90.0 - ranges.elevation_deg) - np.arccos(1.0 / obliquity)

@@ -37,7 +37,7 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Rejection reasons of ranges that contradict other ranges, as the ranges of a spoofer do.
+#: Rejection reasons of ranges that contradict other ranges; spoofed ranges can have these reasons.
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
@@ -58,7 +58,7 @@ _FAILED: Final = np.isin(np.arange(len(Status)), [
     Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
 _IN_DOUBT: Final = _FAILED | (np.arange(len(Status)) == Status.UNCERTAIN)
-#: Suspicions, the statuses that each of them outranks, and the status that replaces these statuses.
+#: For each suspicion: the statuses that it outranks, and the status that replaces them.
 _STATUS_BY_CAUSE: Final = (
     (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
     (Suspicion.SPOOFING_SUSPECTED, _UNDER_SPOOFING, Status.SPOOFING_SUSPECTED),
@@ -117,7 +117,7 @@ def _motion_inputs(
         inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1]) & np.isfinite(consistent[part, 0])
         off_line[part] = np.where(inside, offset, np.nan)
     usable = (reason & ~_CONTRADICTED) == 0
-    # errors that cannot be identified may be due to a spoofer or to the time tags
+    # errors that cannot be attributed to single satellites may be due to a spoofer or to the time tags
     named = _named_as_wrong(reason, corrected.channels.groups) & ~corrected.unsure[rows, None]
     return MotionInputs(
         time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
@@ -135,7 +135,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return a mask of satellites with individual errors, where they are too few for a spoofer; shape (T, K)."""
+    """Return a mask (T, K) of satellites with individual errors, at epochs with too few of them for a spoofer."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -256,9 +256,9 @@ def _on_all_epochs(
 
 
 def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
-    """Return the statuses of positions (T,), replaced by interference statuses where interference is more serious.
+    """Return the statuses of positions (T,); interference statuses replace the statuses that they outrank.
 
-    `suspected` is the `Suspicion` of all antennas' epochs, concatenated; empty if the check is off.
+    `suspected` has the `Suspicion` of each antenna's epochs; it is empty if the check is off.
     """
     if not suspected:
         return status
@@ -278,7 +278,7 @@ def judge_interference(
     """Return the interference and the new state of each antenna; None where `InterferenceLimits.use` is off.
 
     Interference is checked at the first epoch of each second, and the result applies to all epochs of the second. A
-    break or an alarm between two checks is included in the second check.
+    break or an alarm between two checks is taken into account in the second check.
     """
     if limits.use == "off":
         return [None] * len(states), states

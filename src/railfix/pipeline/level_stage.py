@@ -35,12 +35,12 @@ from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Kinds of protection levels: with hypotheses of local faults only, because SBAS covers satellite faults; or also with
-#: hypotheses of satellite faults (solution separation).
+#: Kinds of protection levels. With SBAS, which covers satellite faults, the hypotheses are local faults only.
+#: Otherwise, satellite faults are added (solution separation).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
-#: True for statuses that raise an alarm, by status number.
+#: Whether a status raises an alarm, by status number.
 _ALARMING: Final = np.array(
     [status in (*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET) for status in range(max(Status) + 1)]
 )
@@ -55,7 +55,7 @@ def choose_basis(config: Config) -> str:
 
 
 def prior_basis_text(facts: Mapping[str, Any]) -> str:
-    """Return a sentence that states whether the priors of a run's levels (`level_facts`) are measured and supported."""
+    """Return a sentence on whether the fault priors of a run's levels (`level_facts`) are measured and supported."""
     words = {
         "indicative": "indicative: priors of faults are assumed, not measured on this line; no hourly risk is claimed",
         "measured": "priors of local faults are measured on this line, risk.map_prior is assumed",
@@ -104,7 +104,7 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 
 def get_risk_budget(config: Config) -> RiskBudget:
-    """Return the risk budget in use, which with SBAS has local faults only, because SBAS covers satellite faults."""
+    """Return the risk budget in use; with SBAS, which covers satellite faults, it has local faults only."""
     return config.risk if choose_kind(config) == "separation" else config.local_risk
 
 
@@ -121,7 +121,7 @@ def level_stage(
     offset: MapOffset,
     config: Config,
 ) -> tuple[ProtectionResult | None, Masks]:
-    """Return protection levels (None if not computed), and a mask (T,): a position beyond the level is possible."""
+    """Return protection levels (None if not computed), and a mask (T,) of possible positions beyond the level."""
     fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
@@ -171,7 +171,7 @@ def protection_levels(
 
 
 def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
-    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and the model's noise scale, 1 (T,)."""
+    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and its noise scale: ones, (T,)."""
     weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
     found = fix.constrained
     model = linear_model(replace(ranges, weight=weight), antennas, found.arc_m, section=found.section)
@@ -182,8 +182,8 @@ def late_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, 
     """Return masks (T, S, K) of S sets of satellites whose codes can be delayed simultaneously; `heading_deg` is the
     azimuth of the track, shape (T,).
 
-    The sets are low satellites left and right of the track, and with `RiskBudget.late_sides` "all" also satellites
-    ahead and behind.
+    The sets are the low satellites left and right of the track. If `RiskBudget.late_sides` is "all", there are two more
+    sets: the satellites ahead and behind.
     """
     off_heading = np.radians(azimuth_deg - heading_deg[:, None])
     right, low = np.sin(off_heading) > 0, elevation_deg < risk.side_elevation_deg
@@ -215,7 +215,7 @@ def apply_verdicts(
 
 
 def _where_it_holds(level: ProtectionLevel, has: Masks, chainage_m: Floats, config: Config) -> ProtectionLevel:
-    """Return the levels, removed at epochs without coordinates, and infinite in stretches without a level."""
+    """Return the levels: NaN at epochs without coordinates, infinite in the stretches of `Config.no_level_m`."""
     values = {
         name: np.where(has, value, np.nan) if value.dtype == np.float64 else value
         for name, value in vars(level).items()
@@ -240,8 +240,8 @@ def compute_araim(
 ) -> AraimResult:
     """Compute ARAIM levels of positions on the line, shape (T,).
 
-    The integrity sigmas combine the message's URA, the atmosphere of `Config.nominal` and the scaled range noise;
-    accuracy and thresholds use URE instead of URA. `corrected` has the rejection reasons of all stages.
+    The integrity sigmas combine the URA of the message, the atmospheric errors of `Config.nominal` and the scaled range
+    noise. Accuracy and thresholds use the URE instead of the URA. `corrected` has the rejection reasons of all stages.
     """
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
@@ -300,7 +300,7 @@ def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
 
 
 def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: float) -> AraimGeometry:
-    """Return the geometry on a line, axes along, across and up, with the map as two more observations.
+    """Return the geometry on a line (axes along, across and up), with the map as two additional observations.
 
     `plan_m` and `height_m` are standard deviations of the map [m]; `prior` is the probability that both are wrong.
     """

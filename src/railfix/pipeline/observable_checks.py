@@ -24,11 +24,12 @@ from railfix.ranges.corrected import CorrectedRanges
 _LEAST_RATE_MPS: Final = 100.0
 #: Minimum number of satellites for a factor; at least one more must be observed, for the median rate.
 _LEAST_SATELLITES: Final = 3
-#: From this number on, one satellite may deviate. Of four, one with a cycle slip changes the factors of the others.
+#: With at least this number of satellites, one may deviate. Among four, a satellite with a cycle slip changes the
+#: factors of the others.
 _MANY: Final = 6
 #: Largest deviation of a satellite's factor from the median factor.
 _SPREAD: Final = 0.3
-#: Largest deviation of a correct factor from 1; the speed of the train causes a deviation.
+#: Largest deviation of a correct factor from 1, to which the speed of the train contributes.
 _RIGHT: Final = 0.5
 #: Longest time between two epochs whose phases are compared [s].
 _LONGEST_S: Final = 35.0
@@ -55,11 +56,10 @@ class ObservableState:
 def check_observables(
     corrected: CorrectedRanges, state: ObservableState
 ) -> tuple[CorrectedRanges, list[str], ObservableState]:
-    """Return an antenna's ranges without Dopplers and phases of wrong sign or unit, a note on each fault, and the
-    state.
+    """Remove Dopplers and phases of wrong sign or unit; return ranges, a note on each fault, and the state.
 
-    The ratio of observed to computed values of a constellation applies until the next estimate. Before the first
-    estimate, the ratio over all constellations applies.
+    The estimated ratio of observed to computed values of a constellation applies until the next estimate. Before the
+    first estimate, the ratio of all constellations together applies.
     """
     second = corrected.time.astype("datetime64[s]")
     chosen = np.diff(second, prepend=np.array([state.time], dtype=second.dtype)) != np.timedelta64(0, "s")
@@ -96,7 +96,7 @@ def check_observables(
 
 
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
-    """Return the factor between observed and computed satellite rates, shape (T,); NaN where it is unclear.
+    """Return the ratio of observed to computed satellite rates, shape (T,); NaN where it is unclear.
 
     The rates of one constellation have shape (T, K); their median over the satellites is subtracted at each epoch. The
     factor is the median of the satellites' ratios.
@@ -116,7 +116,7 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
 
 
 def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
-    """Return the factor of each epoch, shape (T,): the last known factor of the `chosen` epochs, initially `before`."""
+    """Return the factor at each epoch (T,): the last known factor of the `chosen` epochs so far, or `before`."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[last][np.cumsum(chosen)])
@@ -163,5 +163,5 @@ def _sentence(kind: int, letter: str, factor: float, wavelength_m: float) -> str
         metres = "metres a second" if kind == 0 else "metres"
         wrong = f"are in {metres}, not in {_UNITS[kind]}{', and have the wrong sign' if factor < 0.0 else ''}"
     else:
-        wrong = f"are {factor:.2g} times what the satellites' motion gives: their unit is not {_UNITS[kind]}"
+        wrong = f"are {factor:.2g} times the values computed from satellite motion: their unit is not {_UNITS[kind]}"
     return f"the {_KINDS[kind]} of {_NAMES.get(letter, letter)} {wrong}; they are not used"

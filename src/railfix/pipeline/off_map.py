@@ -30,7 +30,7 @@ class OffMapState:
     #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
     #: `off`.
     since: np.datetime64 = _NEVER
-    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of offsets from `since` on.
+    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of the offsets from `since` on.
     away: Floats = field(default_factory=lambda: np.zeros(2))  #: Decayed sum and number of offsets off the map.
     away_at: np.datetime64 = _NEVER  #: Time of the last offset in `away`.
 
@@ -40,12 +40,12 @@ def off_map_epochs(
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state for the next chunk.
 
-    The train leaves the map once all positions of the last `least_s` are off the map; a single position can be off the
-    map by reflected signals. The train returns once all positions of the same length of time are on the map, and their
-    mean offset is at most a metre or half of the mean offset off the map; on an unmapped track beside the line, single
-    positions fit the map by chance. The first position of a log decides alone. `on_map` and `off_map` mark epochs whose
-    ranges fit the map, and epochs whose ranges contradict it; `offset_m` is the offset of 3-D positions to the right of
-    the line, NaN if unknown; shapes (T,).
+    The train leaves the map once all positions of the last `least_s` are off the map; because of reflected signals, a
+    single position can be off the map. The train returns once all positions of the last `least_s` are on the map, and
+    their mean offset is at most a metre or half of the mean offset off the map. This second condition is needed because
+    single positions on an unmapped track beside the line fit the map by chance. At the start of a log, the first
+    position alone decides. `on_map` and `off_map` mark epochs whose ranges fit the map, and epochs whose ranges
+    contradict it; `offset_m` is the offset of 3-D positions to the right of the line, NaN if unknown; shapes (T,).
     """
     off, known, since, back = state.off, state.known, state.since, state.back
     away, away_at = state.away, state.away_at

@@ -16,7 +16,7 @@ from railfix.tracking import Line
 _OUTAGE_S: Final = 2.0
 #: Number of positions that must agree before codes are used again.
 _AGREEING: Final = 3
-#: Relative standard deviation of a sensor distance since the start of a block.
+#: Standard deviation of a sensor distance since the start of a block, as a fraction of the distance.
 _DISTANCE_SHARE: Final = 0.01
 #: Minimum standard deviation of a single epoch at the end of a tunnel [m], because of multipath at the portal.
 _LEAST_SIGMA_M: Final = 2.0
@@ -48,8 +48,8 @@ def gated_codes(
     """Return the epochs whose codes are not yet used, shape (T,), and the state for the next chunk.
 
     After an outage, single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
-    again with the third consecutive position within `SensorLimits.return_sigmas` of the combined standard deviation,
-    and after `SensorLimits.return_s` in any case. Without a sensor distance no code is rejected.
+    again from the third consecutive position within `SensorLimits.return_sigmas` combined standard deviations, or after
+    `SensorLimits.return_s` in any case. Without a sensor distance no code is rejected.
 
     `observed` marks epochs with codes, `distance_m` is the sensor distance since the previous epoch, `place_m` and
     `sigma_m` are single-epoch positions; shape (T,) each, NaN where missing. `state` has the filter's position at the

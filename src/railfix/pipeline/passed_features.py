@@ -1,4 +1,4 @@
-"""Rates of the vehicle body, and the search for features of the line that it has passed."""
+"""Rates of the vehicle body, and the interface of the search for features of the line that the body has passed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-#: Lowest speed at which the rates are used [m/s].
+#: Lowest speed at which the rates of the body are used [m/s].
 SLOWEST_MPS: Final = 1.0
 
 
@@ -58,7 +58,7 @@ class FeatureState:
 
 
 class PassedFeature(NamedTuple):
-    """Position measured by a feature that the train has passed."""
+    """Position measured with a feature of the line that the train has passed."""
 
     tick: int  #: Index of the tick after which the feature was passed.
     correction_m: float  #: Measured position minus wheel position.

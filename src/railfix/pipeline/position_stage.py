@@ -74,7 +74,7 @@ def position_stage(
     corrected, ranges, checked, states = check_ranges(corrected, ranges, antennas, fix, config, states)
     fix, scale = checked.fix, checked.scale
     constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
-    # ranges that are inconsistent in space contradict every map
+    # ranges that agree with no 3-D position agree with no position on a map
     unresolved = corrected.unsure | _contradict(fix.point, ranges.space_redundancy, scale)
     off_map = checked.off_map & ~unresolved
 
@@ -122,7 +122,7 @@ def position_stage(
 
 
 def _with_protection_level(checked: CheckedPositions, config: Config) -> RaimResult:
-    """Return the result of RAIM; if it is on, with RAIM's protection level, NaN where an unidentified fault remains."""
+    """Return the result of RAIM, with RAIM's protection level if it is on; NaN where an unidentified fault remains."""
     raim = checked.raim
     if "raim" not in config.screens or config.raim_protection != "on":
         return raim
@@ -140,15 +140,15 @@ def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBias
     return alone
 
 
-#: Ratio of the residual variance of a 3-D fit to the receiver's range variance, above which ranges are inconsistent.
+#: Ranges are inconsistent if the residual variance of a 3-D fit exceeds the receiver's range variance by this factor.
 _CONTRADICT: Final = 25.0
 
 
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions for the test of the map, without `excluded` satellites at inconsistent epochs.
-    Positions are NaN where the remaining ranges are inconsistent, or the faulty range cannot be identified.
+    """Return ranges and 3-D positions for the test of the map. At inconsistent epochs, `excluded` satellites are
+    removed. Positions are NaN where the remaining ranges are inconsistent, or the faulty range cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
@@ -162,7 +162,7 @@ def _consistent(
 
 
 def _contradict(point: SinglePoint, freedom: Integers, scale: Floats) -> Masks:
-    """Return the epochs whose ranges, with the given redundancy, are inconsistent in space, shape (T,)."""
+    """Return the epochs whose ranges (redundancy `freedom`) are inconsistent with a 3-D position, shape (T,)."""
     return np.asarray((freedom >= 1) & (point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2))
 
 
@@ -224,8 +224,8 @@ def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, 
     """Return the squared distance to the best alternative position times its probability (T,) [m^2]; 0 if there is
     none.
 
-    The weighted squares at the alternative are larger by the excess x, so that its probability is ``1/(1 + exp(x/2))``
-    (normal likelihoods, equal priors).
+    With weighted squares larger by the excess x, the alternative has the probability ``1/(1 + exp(x/2))`` (normal
+    likelihoods, equal priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)

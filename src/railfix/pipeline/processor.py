@@ -1,8 +1,8 @@
 """Positioning of chunks of epochs, from observations to the results of the filter.
 
 `EpochProcessor` has the constant data of a run (settings, trajectories, error model). `process` takes a chunk of
-observations with the navigation records, SBAS messages and sensor samples received since the previous chunk, and the
-state after that chunk; it returns every intermediate result and the new state. A live epoch is a chunk of length one;
+observations, the navigation records, SBAS messages and sensor samples received since the previous chunk, and the state
+after the previous chunk. It returns every intermediate result and the new state. A live epoch is a chunk of length one;
 the results do not depend on the division into chunks.
 """
 
@@ -73,16 +73,16 @@ class EpochProcessor:
     Parameters
     ----------
     config : Config
-        The files named in it are not read here; pass their contents, as
+        The files named in the configuration are not read; pass their contents, as
         `railfix.run.processor_setup.make_processor` does.
     trajectories : mapping of str to Trajectory
         Trajectories of the antennas "front", "rear", or both.
     navigation : Navigation, optional
-        Navigation records known from the start; others may be given with each chunk. Without records here, the first
-        chunk must have some; otherwise `process` raises `SettingsError`.
+        Navigation records known from the start; further records can be passed with each chunk. Without records here,
+        `process` raises `SettingsError` unless records are given with the first chunk.
     corrections : MessageCorrections, optional
         SBAS corrections (`railfix.ranges.sbas.SbasState`) from the messages known from the start, required if and only
-        if ``config.sbas`` requests SBAS. Further messages may be given with each chunk.
+        if ``config.sbas`` requests SBAS. Further messages can be passed with each chunk.
     models : Models, optional
     stations : Stations, optional
     screens : sequence of Screen, optional
@@ -180,7 +180,7 @@ class EpochProcessor:
         return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything except the threads, which another process creates itself."""
+        """Return everything except the threads; another process creates threads of its own."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
     @cached_property
@@ -190,7 +190,7 @@ class EpochProcessor:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the initial data, and on screens that cannot be run."""
+        """Notes on the initial data, and on settings that cannot be satisfied, such as screens without input."""
         return (*self.received.notes, *self._lacking)
 
     def _inactive_notes(self) -> tuple[str, ...]:
@@ -242,7 +242,7 @@ class EpochProcessor:
         Raises
         ------
         ValueError
-            The epochs of an antenna are not in ascending order, or do not begin after the end of `state`.
+            The epochs of an antenna are not in ascending order, or do not begin after the last epoch of `state`.
         SettingsError
             One of the conditions of the class applies, an antenna has no trajectory, or there are no navigation
             records.
@@ -267,7 +267,7 @@ class EpochProcessor:
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Chunk, State]:
-        """Return the ranges of one chunk after the screens, as the first part of `process`, with the same parameters.
+        """Apply the screens to the ranges of one chunk: the first part of `process`, with the parameters of `process`.
 
         The parts of `process` use and replace different members of the state. Different parts can therefore process
         successive chunks at the same time, if each part keeps a state of its own.
@@ -318,7 +318,7 @@ class EpochProcessor:
         return chunk, copy_with(state, received=received, antennas=after, base=base_state)
 
     def position(self, chunk: Chunk, state: State) -> tuple[Chunk, State]:
-        """Return the chunk with the positions of single epochs, as the second part of `process`."""
+        """Add the positions of single epochs to the chunk: the second part of `process`."""
         antennas, own_states = chunk.antennas, [state.antennas.get(name) or AntennaState() for name in chunk.names]
         corrected, solution, own_states = position_stage(
             chunk.corrected, chunk.slips, antennas, self.config, own_states
@@ -342,7 +342,7 @@ class EpochProcessor:
         return chunk, copy_with(state, antennas=after)
 
     def along_track(self, chunk: Chunk, state: State) -> tuple[Result, State]:
-        """Return the single-epoch and filter results of one chunk, as the third part of `process`.
+        """Apply the filter, and return all results of one chunk: the third part of `process`.
 
         Parameters
         ----------
@@ -419,7 +419,7 @@ def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> No
     """Raise ValueError if an epoch is not after the preceding epoch in this chunk or in the state `before`."""
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
-        raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")
+        raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; pass epochs in order of time")
     if before is not None and len(time) and time[0] <= before.ended:
         raise ValueError(
             f"{name}: the chunk begins at {time[0]}, not after {before.ended}, the last epoch of the given state"

@@ -53,7 +53,7 @@ class State(NotebookTable):
     """State after a chunk: everything that the next chunk needs."""
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
-    #: Navigation records and SBAS messages so far; None means the data given to the processor.
+    #: Navigation records and SBAS messages so far; with None, the processor's initial data are used.
     received: Received | None = None
     base: BaseState | None = None  #: State of the base station.
     fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.

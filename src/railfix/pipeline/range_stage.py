@@ -38,7 +38,7 @@ class RangeErrorModel(Protocol):
         """Return the overbounding sigma and bias of observations, shape (T, K) [m]; NaN without a value."""
 
     def missing_parts(self) -> tuple[str, ...]:
-        """Return one sentence for each part that is missing because an earlier version of railfix wrote the file."""
+        """Return a sentence on each missing part of a model that an earlier version of railfix wrote."""
 
 
 class Models(NamedTuple):
@@ -123,12 +123,12 @@ def _apply_error_model(
 
 
 def error_model_notes(model: RangeErrorModel | None, config: Config) -> tuple[str, ...]:
-    """Return sentences on differences between the error model's conditions and the run's, and on missing parts."""
+    """Return sentences on conditions in which the error model and the run differ, and on missing parts of the model."""
     if model is None:
         return ()
     notes, own = model.missing_parts(), collect_conditions(config)
     if model.conditions is not None and (differences := condition_differences(model.conditions, own)):
-        return (f"error model: its conditions differ from this run's: {'; '.join(differences)}", *notes)
+        return (f"error model: its conditions differ from those of this run: {'; '.join(differences)}", *notes)
     return notes
 
 

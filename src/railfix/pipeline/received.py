@@ -19,14 +19,14 @@ from railfix.ranges.sources import BroadcastSource, CorrectionSource, choose_ion
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
 
-#: Types of the elements of record tables, by the name of their array type (`railfix.core.arrays`).
+#: Element types in record tables, by the name of the array type (`railfix.core.arrays`).
 _ELEMENTS: Final[dict[str, Any]] = {
     "Strings": "<U3",
     "Datetimes": "datetime64[ns]",
     "Floats": np.float64,
     "Integers": np.int64,
 }
-#: Shapes of two-dimensional fields in a table without rows.
+#: Shapes of the two-dimensional fields of a table without rows.
 _EMPTY: Final[dict[str, tuple[int, ...]]] = {
     **dict.fromkeys(("position_ecef_m", "velocity_ecef_mps", "acceleration_ecef_mps2"), (0, 3)),
     "inter_signal_s": (0, 6),
@@ -107,7 +107,7 @@ def correction_source(received: Received, config: Config) -> CorrectionSource:
 
 
 def with_base_station(source: CorrectionSource, received: Received, config: Config) -> CorrectionSource:
-    """Return the source with the errors that a base station has measured; without a station, return it unchanged."""
+    """Return the source with the errors measured by a base station; without a station, return the source unchanged."""
     if received.base is None:
         return source
     return BaseStationSource(
@@ -118,7 +118,7 @@ def with_base_station(source: CorrectionSource, received: Received, config: Conf
 def known_from_start(
     config: Config, *, navigation: Navigation | None = None, corrections: MessageCorrections | None = None
 ) -> Received:
-    """Return the data known before the first epoch: all data when reading files, none on a running train.
+    """Return the data known before the first epoch: all data when files are read, none on a running train.
 
     Raise SettingsError if SBAS is combined with precise ephemerides.
     """
@@ -126,7 +126,7 @@ def known_from_start(
 
 
 def check_corrections(config: Config, corrections: MessageCorrections | None) -> None:
-    """Raise SettingsError if SBAS is requested without corrections, or the reverse, or if the frequencies differ."""
+    """Raise SettingsError if only one of SBAS setting and corrections is given, or if their frequencies differ."""
     if bool(config.sbas) != (corrections is not None):
         given, state = "not given" if corrections is None else "given", "on" if config.sbas else "off"
         raise SettingsError(
@@ -148,11 +148,11 @@ def receive(
 ) -> Received:
     """Return the received data after new navigation records and messages; return `before` without new data.
 
-    `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped, and
-    so are repeated and expired records, except for a satellite's newest record. Newer coefficients and precise
-    ephemerides replace the older ones. With SBAS, every satellite is rejected until its corrections are complete. Raise
-    SettingsError if SBAS is combined with precise ephemerides, if the messages do not match the corrections, or if
-    there are no corrections.
+    `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped.
+    Repeated and expired records are dropped as well, except for a satellite's newest record. Newer coefficients and
+    precise ephemerides replace the older ones. With SBAS, every satellite is rejected until its corrections are
+    complete. Raise SettingsError if SBAS is combined with precise ephemerides, if the messages do not match the
+    corrections, or if there are no corrections.
     """
     if navigation is None and messages is None:
         return before
@@ -217,7 +217,7 @@ def merge_navigation(old: Navigation, new: Navigation) -> Navigation:
 
 
 def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
-    """Return the rows of two tables, without duplicates from the second."""
+    """Return the rows of both tables; rows of `new` that duplicate a row of `old` are left out."""
     known = set(zip(*(getattr(old, name).tolist() for name in key), strict=True))
     rows = zip(*(getattr(new, name).tolist() for name in key), strict=True)
     fresh = np.array([row not in known for row in rows], dtype=bool)
@@ -227,7 +227,7 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 def _with_ionosphere(received: Received, config: Config) -> Received:
     """Return the data with the Klobuchar coefficients in use, and notes if other models were requested."""
     if received.corrections is not None and received.corrections.dual_frequency:
-        # the Klobuchar model stays on for the screens; it cancels in the ionosphere-free combination
+        # the screens still use the Klobuchar model; its delays cancel in the ionosphere-free combination
         modelled = _with_ionosphere(replace(received, corrections=None), config)
         note = (
             f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} requested, ionosphere-free codes used "

@@ -1,4 +1,4 @@
-"""Columns of the result tables: name, unit, meaning, source of the values and decimals, each stated once.
+"""Columns of the result tables: their names, units, meanings, decimals, and sources of their values.
 
 Tables of positions, observations and the filter (polars, Parquet, CSV), arrays with named axes (xarray) and the
 reference document are made from the same `Column` objects.
@@ -30,12 +30,12 @@ from railfix.screens import SCREENS, ScreenColumn
 from railfix.tracking import Kind
 
 Source = TypeVar("Source")
-#: Unit of a column by the last part of the column's name.
+#: Unit of a column, by the last part of the column's name.
 UNITS: Final[Mapping[str, str]] = {
     "m": "m", "mm": "mm", "mps": "m/s", "mps2": "m/s^2", "deg": "deg", "dbhz": "dB-Hz", "permille": "permille",
     "1pm": "1/m", "s": "s", "db": "dB",
 }  # fmt: skip
-#: Decimals of numbers (0.1 mm for lengths) and of angles in CSV files.
+#: Decimals of numbers in CSV files (0.1 mm for lengths).
 DECIMALS: Final = 4
 DECIMALS_DEG: Final = 9
 
@@ -46,9 +46,9 @@ class Column(Generic[Source]):
 
     name: str  #: Name, ending with the unit if there is one: ``along_sigma_m``.
     meaning: str
-    #: Path of the values in the source of a table (``raim.statistic``), by default the name; or a function of the
-    #: source, or None if the source lacks the values. The values are an array with epochs on axis 0, or one value for
-    #: all rows; values of a column with `words` are indices of words.
+    #: Attribute path of the values in the source of a table (``raim.statistic``), by default the name. Otherwise a
+    #: function of the source, or None if the source lacks the values. The values are an array with epochs on axis 0, or
+    #: one value for all rows. If the column has `words`, the values are indices of words.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words to which integer values refer, by index.
@@ -84,7 +84,7 @@ class Column(Generic[Source]):
         return pl.Series(values=values.tolist() if values.dtype.kind == "U" else np.array(values), dtype=kind)
 
     def array(self, values: NDArray[Any] | str | None, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return values as an array of a given shape: words as text, absent numbers as NaN, absent words blank."""
+        """Return values as an array of a given shape: words as text, absent numbers as NaN, absent words as blank."""
         if values is None or isinstance(values, str):
             absent = "" if self.words or self.dtype == pl.String else np.nan
             return np.full(shape, absent if values is None else values)
@@ -205,14 +205,13 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "integers_fixed",
-            "number of carrier-phase differences fixed to integers; 0 for a float or code solution (`carrier = fixed`)",
+            "with `carrier = fixed`: number of phase differences fixed to integers; 0 for a float or code solution",
             "phase.n_fixed",
             dtype=pl.Int16(),
         ),
         Column(
             "integer_risk_ppm",
-            "probability that any of the fixed integers, or where none is fixed any of the best candidates, "
-            "is wrong [1e-6]",
+            "probability that a fixed integer is wrong or, where none is fixed, that a best candidate is wrong [1e-6]",
             lambda r: None if r.phase is None else 1e6 * r.phase.integer_risk,
         ),
         Column(
@@ -223,12 +222,12 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_fault_free_m",
-            "protection level for noise alone, with the part of the risk for noise; may exceed `protection_level_m`",
+            "protection level for noise alone and the risk allocated to noise; may exceed `protection_level_m`",
             "protection.level.fault_free_m",
         ),
         *of_one_meaning(
             "protection level for faults of one satellite, and of two satellites; 0 where these faults are less "
-            "probable than the part of the risk for them",
+            "probable than the risk allocated to them",
             protection_one_fault_m="protection.level.one_fault_m",
             protection_two_faults_m="protection.level.two_fault_m",
         ),
@@ -267,14 +266,14 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_status",
-            "`available` within the alarm limit; `unavailable`, also if the position is in doubt; `alarm`: the "
+            "`available`: level within the alarm limit; `unavailable`: larger level or doubtful position; `alarm`: the "
             "ranges contradict the level, or a check has failed",
             "protection.status",
             words=tuple(s.name.lower() for s in LevelStatus),
         ),
         Column(
             "araim_level_m",
-            "ARAIM level along the line from the integrity support message, with the map as a constraint",
+            "ARAIM level along the line, from the integrity support message and with the map as a constraint",
             lambda r: None if r.araim is None else r.araim.along.level_m[:, 0],
         ),
         Column(
@@ -305,7 +304,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "map_offset_up_m", "mean height of the 3-D positions of the last minutes above the line", "map_offset.up_m"
         ),
         *of_one_meaning(
-            "smallest offset, across and up, that the status `map_offset` detects (99 %)",
+            "smallest offset, across and up, that the test for the status `map_offset` detects with 99 % probability",
             map_detectable_across_m=lambda r: r.map_offset.detectable_m[:, 0],
             map_detectable_up_m=lambda r: r.map_offset.detectable_m[:, 1],
         ),
@@ -316,7 +315,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference",
-            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status differs; or another cause of "
+            "`none`, `jamming_suspected` or `spoofing_suspected`, even where the status differs; or another cause of "
             "the signs: `time_tags`, `left_map`, `contradicted`",
             "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
@@ -364,7 +363,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         *_screen_columns("observations", _get_screened_channels),
         Column(
             "second_share",
-            "two frequencies: weight of the second code, negative toward the ionosphere-free combination, empty if the "
+            "two frequencies: weight of the second code; negative toward the ionosphere-free combination; empty if the "
             "first code is used alone",
             lambda o: _second(o, lambda r, _: r.share),
         ),
@@ -385,8 +384,8 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "raim_own_error_m",
-            "screen `raim`: error of faulty satellites relative to all other ranges; empty where the "
-            "robust fit rejected them",
+            "screen `raim`: error of a faulty satellite's range relative to all other ranges; empty where the "
+            "robust fit rejected the range",
             lambda o: o.on_all_channels(o.result.raim.own_error_m),
         ),
         Column(

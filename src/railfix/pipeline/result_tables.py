@@ -45,18 +45,18 @@ if TYPE_CHECKING:
 
 
 def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
-    """Return `POSITION_COLUMNS` of one antenna, one row per epoch, also without a position."""
+    """Return `POSITION_COLUMNS` of one antenna, one row per epoch, including epochs without a position."""
     return make_table(POSITION_COLUMNS, result, len(result.time), antenna=name)
 
 
 def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Return the rows of all antennas in order of time, then of the antennas as given."""
+    """Return the rows of all antennas in order of time; rows of the same time are in the order of `parts`."""
     table = pl.concat(parts)
     return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return `POSITION_COLUMNS`, one row per epoch and antenna, in order of time, then of the antennas as given."""
+    """Return `POSITION_COLUMNS`, one row per epoch and antenna, in order of time and then of `result.antennas`."""
     check_type(result, Result, "result")
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
@@ -187,10 +187,10 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             lambda r: r.direction + 1,
             words=("falling", "unknown", "rising"),
         ),
-        Column("standstill", "whether the speed, including two sigmas, is below 1 km/h", dtype=pl.Boolean()),
+        Column("standstill", "whether the speed plus two sigmas is below 1 km/h", dtype=pl.Boolean()),
         Column(
             "branch_probability",
-            "probability of the given position against other positions on the line",
+            "probability of the published position, as opposed to other positions on the line",
             "tracked.probability",
         ),
         Column("hypotheses", "number of possible positions", "tracked.hypotheses", dtype=pl.Int16()),
@@ -214,8 +214,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "over_reading_m",
-            "largest distance of the train behind the position: the level, at least 2 % of the distance since codes "
-            "were used (`L_DOUBTOVER` minus `Q_LOCACC`)",
+            "largest distance of the train behind the position: the level, or 2 % of the distance since codes were "
+            "used, if larger (`L_DOUBTOVER` minus `Q_LOCACC`)",
             "tracked.amount_m",
         ),
         Column("under_reading_m", "largest distance of the train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
@@ -244,7 +244,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("force_offset_mps2", "estimated offset of the accelerometer", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
-            "factor on the map's length error of 0.03 m per root metre; above 1 if pseudoranges contradict this error",
+            "factor on the map's length error of 0.03 m per root metre; above 1 if pseudoranges indicate larger errors",
             "tracked.map_scale",
         ),
         Column(
@@ -276,7 +276,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "wheel_difference_m",
-            "distance over the last two minutes by satellites minus the distance by the wheel",
+            "satellite-derived distance over the last two minutes minus the wheel distance",
             "wheel.difference_m",
         ),
         *(
@@ -288,7 +288,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             for kind, unit, what in (
                 (Kind.WHEEL, "m", "distance since the previous epoch"),
                 (Kind.RADAR, "m", "distance since the previous epoch"),
-                (Kind.FORCE, "mps2", "mean specific force forward"),
+                (Kind.FORCE, "mps2", "mean forward specific force"),
                 (Kind.PLACE, "m", "position from a feature of the line"),
                 (Kind.BALISE, "m", "position of a balise"),
                 (Kind.RANGE, "m", "range to a ground unit"),
@@ -331,7 +331,7 @@ def train_table(result: Result) -> pl.DataFrame:
 
 
 def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
-    """Return rows of `train_table` with `SMOOTHED_COLUMNS` added; `smoothed` has them by antenna, in the same order."""
+    """Add `SMOOTHED_COLUMNS` to rows of `train_table`; `smoothed` has these columns by antenna, in order of time."""
     antenna = table["antenna"].to_numpy()
     values = {name: np.full(len(table), np.nan) for name in SMOOTHED_COLUMNS}
     for name, rows in smoothed.items():
@@ -371,8 +371,8 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         Column("balise", "name in the list, or identity that was read", _getter("balise"), dtype=pl.String()),
         Column(
             "verdict",
-            "`virtual`: no balise; `read`, `missing`: passed with and without a reading; `contradicts`: read where the "
-            "filter excludes it; `not_listed`",
+            "`virtual`: virtual balise passed; `read`: balise passed with a reading; `missing`: passed without one; "
+            "`contradicts`: read at a place that the filter excludes; `not_listed`: read, but not in the list",
             _getter("verdict"), words=VERDICTS,
         ),
         Column("chainage_m", "chainage in the list", _getter("chainage_m")),

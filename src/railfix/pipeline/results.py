@@ -31,7 +31,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
     """Results of one antenna at T epochs: positions, except those that the status drops, and intermediate results.
 
     Range arrays have the K channels that the settings allow (`corrected`). Properties have all M channels of the
-    observations; these are the channels of all antennas if observations of several antennas are given together.
+    observations. If the observations of several antennas were processed together, these include all antennas' channels.
     """
 
     trajectory: Trajectory  #: Trajectory of the antenna.
@@ -115,7 +115,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def bound_sigma_m(self) -> Floats:
-        """Minimum sigma of each range in the level, by the error model; 0 without a model; shape (T, M)."""
+        """Minimum sigma of each range in the level, from the error model; 0 without a model; shape (T, M)."""
         return self.on_all_channels(self.corrected.bound_sigma_m)
 
     @property
@@ -159,7 +159,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
 
     def summary(self) -> dict[str, str]:
-        """Return the medians of sigma and level in metres, as texts."""
+        """Return the medians of sigma and level in metres, as strings."""
         level = np.empty(0) if self.protection is None else self.protection.level.level_m
         return {"median sigma [m]": median_text(self.along_sigma_m), "median level [m]": median_text(level)}
 
@@ -167,7 +167,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Config) -> dict[str, AntennaResult]:
     """Return the single-epoch results by antenna, without coordinates that the final status drops.
 
-    If the filter along the track is on, its comparison of satellite with wheel distances adds a sign of interference.
+    If the filter along the track is on, its comparison with wheel distances can add a sign of interference.
     """
     results = {}
     for k, (name, rows) in enumerate(chunk.rows.items()):

@@ -30,7 +30,7 @@ def screen_antennas(
     ionosphere_sigma_m: float,
     states: Sequence[AntennaState],
 ) -> tuple[Chunk, list[AntennaState]]:
-    """Return the chunk after the screens of single antennas (`screens`, with their limits), and new states.
+    """Apply the screens of single antennas (`screens`, with their limits) to a chunk; return the chunk and new states.
 
     Dopplers and phases of wrong sign or unit are removed first. Codes of two frequencies are combined here, and
     smoothed by the carrier phase where the settings request it.
@@ -77,7 +77,7 @@ def screen_antennas(
 
 
 def screen_pairs(chunk: Chunk, screens: Sequence[tuple[Any, Any]]) -> Chunk:
-    """Return the chunk after the screens of common observations of two antennas (`screens`, with their limits)."""
+    """Apply the screens of two antennas' common observations (`screens`, with their limits) to a chunk."""
     corrected, found, rows = chunk.corrected, dict(chunk.screens), chunk.rows
     for screen, limits in screens if chunk.pair is not None else ():
         front, rear = (take_epochs(corrected, rows[name]) for name in ("front", "rear"))
@@ -96,7 +96,7 @@ def screen_positions(
     screens: Sequence[tuple[Any, Any]],
     config: Config,
 ) -> tuple[Codes, dict[str, dict[str, Screened]]]:
-    """Return the statuses (T,) after the screens that compare the positions of two antennas, and verdicts by antenna.
+    """Apply the screens that compare the positions of two antennas; return the statuses (T,), and verdicts by antenna.
 
     A rejection sets the screen's status on both antennas.
     """

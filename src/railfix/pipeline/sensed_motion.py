@@ -39,9 +39,9 @@ from railfix.track.trajectory import Trajectory
 _TICK_NS: Final = 20_000_000
 #: Averaging time of wheel accelerations and inertial means [ns].
 _MEAN_NS: Final = 200_000_000
-#: Time for which a lost or doubled pulse disturbs the acceleration [ns].
+#: Time for which a lost or doubled pulse disturbs the wheel acceleration [ns].
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
-#: Time before the last epoch whose samples the next chunk needs [ns].
+#: Length of time before the last epoch from which the next chunk needs samples.
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
 #: States whose distance is taken from the inertial unit.
 CARRIED: Final = (
@@ -50,7 +50,7 @@ CARRIED: Final = (
     MotionState.INERTIAL_SPIN,
     MotionState.INERTIAL_SLIDE,
     MotionState.ROLLING,
-)  # The state of an interval is its most informative sample state.
+)  # The state of an interval is the most informative of the states of its samples.
 _RANK: Final = np.array(
     [
         {
@@ -73,12 +73,12 @@ class SensedMotion:
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
     #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an offset of
-    #: 0.01 m/s2 causes an error of 0.001. The gradient and the next three values are NaN unless the wheel rolls without
+    #: 0.01 m/s2 causes an error of 0.001. The gradient and the next three fields are NaN unless the wheel rolls without
     #: slip and faster than `SLOWEST_MPS`; shape (T,) each.
     gradient: Floats
     curvature_1pm: Floats  #: Curvature from the yaw rate, positive to the right toward rising arc length.
-    #: Cant over the wheels' contact points, from the roll of the body, positive if the left rail is higher; NaN without
-    #: a vehicle.
+    #: Cant between the wheels' contact points, from the roll of the body; positive if the left rail is higher; NaN
+    #: without a vehicle.
     cant_m: Floats
     under_m: Floats  #: Chainage of the body's middle.
 
@@ -147,8 +147,8 @@ def sensed_motion(
     distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
-    # the speed by pulses refers to the middle of the pulse interval: without `ago`, a delay of 0.065 s, or 0.2 m after
-    # a slip of 3 s at 1 m/s2
+    # the speed by pulses refers to the middle of the pulse interval. Without the correction by `ago`, the delay would
+    # be 0.065 s, or 0.2 m after a slip of 3 s at 1 m/s2.
     ago = seconds(when - speed.time)
     found, slip = find_slips(
         MotionSamples(
@@ -215,7 +215,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Group samples by interval; `at` is the index of the first sample after each instant, 0 for the first instant.
+    """Group samples by interval; `at` has the index of the first sample after each instant (first value 0).
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """

@@ -32,16 +32,16 @@ from railfix.tracking import RangeEpochs, SensorEpochs
 
 #: Longest interval between epochs for which a distance or a mean force is computed [s].
 _LONGEST_S: Final = 5.0
-#: Minimum fraction of finite samples for the mean of an interval.
+#: Minimum fraction of an interval's samples that must be finite for a mean.
 _COMPLETE: Final = 0.9
 #: Standard deviation of the inertial speed during a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
-#: Standard deviation of the gradient over one metre of distance: pitch oscillations of the body of 1 mrad.
+#: Standard deviation of the gradient over one metre: 1 mrad, due to pitch oscillations of the body.
 _GRADIENT_NOISE: Final = 1e-3
 #: Standard deviation of the curvature over one metre, due to oscillations of the body's heading [1/m].
 _CURVATURE_NOISE_1PM: Final = 1e-4
-#: Correlation length of map errors [m], as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`. With map errors of
-#: 0.3 m, features are located to some metres at best; with map errors of 0.05 m, to half a metre.
+#: Correlation length of map errors [m], equal to `railfix.kernels.tracking.constants.MAP_CORRELATION_M`. With map
+#: errors of 0.3 m, features are located to some metres at best; with map errors of 0.05 m, to half a metre.
 _MAP_LENGTH_M: Final = 50.0
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
@@ -56,8 +56,8 @@ class LineReferences:
     balises: ListedBalises | None = None
 
 
-#: Minimum standard deviation of a two-way range [m]: the 0.19 to 0.24 m of P2 3.3, increased because of echoes and
-#: drifts of the unit's reply delay.
+#: Minimum standard deviation of a two-way range [m]: 0.19 to 0.24 m in P2 3.3, increased because of echoes and drifts
+#: of the unit's reply delay.
 _RANGE_SIGMA_M: Final = 0.5
 
 
@@ -85,8 +85,8 @@ class SensorLimits(Settings):
     radar_step_s: float = Field(default=0.1, gt=0)
     #: Standard deviation of one radar speed; the errors of the samples between two epochs are independent.
     radar_sigma_mps: float = Field(default=0.1, gt=0)
-    #: Standard deviation of a mean force between two epochs: body pitching in addition to the sensor's noise (1 mrad is
-    #: 0.01 m/s2), and errors of the map's gradient.
+    #: Standard deviation of a mean force between two epochs, due to the sensor's noise, pitching of the body (1 mrad is
+    #: 0.01 m/s2) and errors of the map's gradient.
     force_sigma_mps2: float = Field(default=0.05, gt=0)
 
 
@@ -152,7 +152,7 @@ def sensor_epochs(
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     values: dict[str, Any] = {}
-    # samples after the last epoch belong to the next chunk, independent of how the log is cut
+    # samples after the last epoch belong to the next chunk, so that results do not depend on the division into chunks
     heard = int(np.searchsorted(pulses.time, edges[-1], side="right"))
     wheel = heard > 0 and "wheel" in sources
     force = len(inertial) > 0 and bool(inertial.time[0] <= edges[-1]) and "force" in sources
@@ -242,7 +242,7 @@ def _latest_samples(samples: SensorSamples, end: np.datetime64, limits: SensorLi
 
 
 def _with_map(trajectory: Trajectory) -> tuple[float, float]:
-    """Return the noise of gradient and curvature over one metre, map errors included.
+    """Return the standard deviations of gradient and curvature over one metre, map errors included.
 
     A lateral map error sigma over a length L causes curvature errors of ``sqrt(3) sigma / L^2``, correlated over about
     L; expressed as white noise over one metre, they are larger by ``sqrt(L)``. The gradient error is ``sigma / L``.
@@ -312,7 +312,7 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return a mask of intervals, true for the last interval if a sensor's samples do not cover it to the end."""
+    """Return a mask of intervals; it is true for the last interval if a sensor's samples do not reach its end."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 

@@ -1,4 +1,4 @@
-"""Smoothed positions of a run: the filter runs again over the stored input, and its results are processed backward."""
+"""Smoothed positions of a run: the filter runs over the stored input, and a smoother runs backward over its results."""
 
 from __future__ import annotations
 

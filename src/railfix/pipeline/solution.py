@@ -24,7 +24,7 @@ from railfix.positioning.range_arrays import InterSystemBiases
 class ProtectionResult(NotebookTable):
     """Protection levels of T epochs."""
 
-    #: Levels, with channels as in the ranges; NaN without a position, or if a fault remains after RAIM.
+    #: Levels, with the channels of the ranges; NaN without a position, or if a fault remains after RAIM.
     level: ProtectionLevel
     status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
     kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
@@ -44,18 +44,18 @@ class Solution(NotebookTable):
     ties: InterSystemBiases  #: Inter-system biases known before each epoch, by `Channels.clocks`.
     raim: RaimResult  #: Result of RAIM; `outcome` is UNTESTABLE at all epochs if the screen is off.
     status: Codes  #: `reasons.Status`, shape (T,).
-    #: Ratio of the receiver's range standard deviation to the standard deviation assumed by the weights: root mean
-    #: square of the residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
+    #: Range standard deviation of the receiver divided by the value that the weights assume: root mean square of the
+    #: normalised residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
     noise_scale: Floats
-    #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
-    #: receiver's noise and the noise by the epoch's residuals, widened by Student's t where few ranges are redundant.
-    #: It is also given at epochs whose position is dropped; shape (T,).
+    #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone. It uses the larger of
+    #: the receiver's noise and the noise estimated from the epoch's residuals, and is widened by Student's t where few
+    #: ranges are redundant. Epochs with a dropped position have a value as well; shape (T,).
     epoch_sigma_m: Floats
     #: Position along the antenna's trajectory, from codes or from code and phase; shape (T,).
     arc_m: Floats
-    #: Standard deviation along the line. It combines the noise by the weights, the residuals of the window and of the
-    #: epoch; satellite and atmospheric errors; the map error; and the distance to an unresolved alternative position,
-    #: weighted by its probability; shape (T,).
+    #: Standard deviation along the line. It combines the range noise, estimated from the weights and from the residuals
+    #: of the window and the epoch; satellite and atmospheric errors; the map error; and the distance to an unresolved
+    #: alternative position, weighted by the alternative's probability; shape (T,).
     along_sigma_m: Floats
     #: Positions from code and phase if ``Config.carrier`` is "float" or "fixed"; `arc_m` then has these positions.
     phase: PhasePositions | None

@@ -28,11 +28,11 @@ from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_sat
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
-#: Range of ellipsoidal heights of receivers on land and in aircraft [m]; positions outside this range are wrong.
+#: Range of ellipsoidal heights of receivers on land and in aircraft [m]; positions outside this range count as wrong.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Height range of the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: Root mean square of raw residuals, including atmospheric delays, above which gross errors are searched for [m].
+#: Gross errors are searched for if the root mean square of raw residuals, with atmospheric delays, exceeds this [m].
 _QUIET_M: Final = 10.0
 
 
@@ -95,12 +95,12 @@ class RangesWithoutMap:
     no_position: Codes  #: `NoPosition` from the numbers of codes, records and satellites; shape (T,).
 
 
-#: Rejection reasons of codes that do not count in the number of observed satellites.
+#: Codes with one of these rejection reasons are not counted as observed.
 _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OTHER_SIGNAL_TAKEN)
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track, with an approximate position from the codes.
+    """Return corrected ranges of one antenna without a track, and approximate positions from the codes.
 
     The ranges are corrected by the delay models and by a received base station, not by SBAS.
     """
@@ -155,7 +155,7 @@ def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, M
 
 
 def _rms_m(ranges: Ranges, point: SinglePoint) -> Floats:
-    """Return the square root of the residuals' sum of squares over the redundancy (T,) [m]; 0 without redundancy."""
+    """Return the root of (sum of squared residuals / redundancy), shape (T,) [m]; 0 without redundancy."""
     freedom = ranges.space_redundancy
     square = np.where(ranges.weight > 0, point.residual_m, 0.0) ** 2
     return np.asarray(np.where(freedom >= 1, np.sqrt(square.sum(axis=1) / np.maximum(freedom, 1)), 0.0))
@@ -251,7 +251,7 @@ def _survey_part(
     book: ChannelBook,
     slip_state: CycleSlipState | None,
 ) -> tuple[SurveyRun, RunSignals, CycleSlipState | None]:
-    """Return the survey run of observations, decimated to the survey interval, and the slip state.
+    """Return the survey run of observations decimated to the survey interval, the signals, and the slip state.
 
     A range change is the carrier-phase change if the phase continues without a slip at every epoch between, otherwise
     it is computed from the mean of the Dopplers at both ends.

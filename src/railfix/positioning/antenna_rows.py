@@ -49,7 +49,7 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function with the search index, rows, and item of each list, for each antenna; return the results."""
+        """Call a function once per antenna with its search index, rows, and item of each list; return the results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
@@ -59,7 +59,7 @@ class AntennaRows:
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
-        """Call a function that returns a value and a state for each antenna; return joined values, and states."""
+        """Call a function that returns a value and a state, once per antenna; return the joined values, and states."""
         found = self.apart(function, *of_antennas)
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
@@ -83,7 +83,7 @@ class AntennaRows:
         return self.each(lambda index, rows: index.trajectory.chainage_at(arc_m[rows]))
 
     def segment_at(self, arc_m: Floats) -> Indices:
-        """Return the section of each arc length on its line, shape (T,), as `Trajectory.segment_at`."""
+        """Return the section that contains each arc length, shape (T,); see `Trajectory.segment_at`."""
         return self.each(lambda index, rows: index.trajectory.segment_at(arc_m[rows])[0])
 
     def get_axes(self, section: Indices) -> Floats:

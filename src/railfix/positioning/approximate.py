@@ -1,4 +1,4 @@
-"""Approximate antenna positions from raw ranges, at which satellite directions and delays are computed."""
+"""Approximate antenna positions from raw ranges, for the computation of satellite directions and delays."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class ApproximatePosition(NamedTuple):
 def approximate_position(
     ranges: Ranges, line: Line, *, limits: SinglePointLimits | None = None, section: SectionLimits | None = None
 ) -> ApproximatePosition:
-    """Estimate approximate positions from raw codes without gross errors, at which delays are computed (P1 2.2(2)).
+    """Estimate the positions at which delays are computed, from raw codes without gross errors (P1 2.2(2)).
 
     A 3-D position is estimated from raw ranges of equal weight. The iteration of every epoch starts from the middle of
     the line, so that epochs are independent. The position is moved to the nearest trajectory point unless it is far
-    from the line. Without a 3-D position, or with a gross error that cannot be identified, the best-fitting point of
-    the line is returned; if no point fits, the middle of the line.
+    from the line. Without a 3-D position, or with a gross error that cannot be identified, the position is the
+    best-fitting point of the line or, if no point fits, the middle of the line.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_avail
 _STEP_S: Final = 1.0  #: Time step of the numerical derivatives of satellite clocks and tropospheric delays [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _PASSES: Final = 3  #: Number of rounds of outlier rejection; each uses the noise scale of the previous fit.
-_TELLING: Final = 2.0  #: A mean square of residuals up to this many standard deviations above 1 is within the noise.
+_TELLING: Final = 2.0  #: Mean squares of residuals up to this many standard deviations above 1 count as noise.
 _FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
 
 
@@ -48,7 +48,7 @@ class DopplerSpeedLimits(Settings):
     #: rejected first.
     outlier: float = Field(default=3.5, gt=0)
     most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
-    min_satellites: int = Field(default=4, ge=3)  #: Fewest Dopplers that must remain per epoch; there are 2 unknowns.
+    min_satellites: int = Field(default=4, ge=3)  #: Fewest Dopplers per epoch for a fit with 2 unknowns.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class DopplerSpeed:
     used: Masks  #: Dopplers used in the fit, shape (T, K).
     rejected: Masks  #: Dopplers rejected as outliers, shape (T, K).
     n_used: Integers  #: Number of Dopplers used, shape (T,).
-    scale: float  #: Ratio of the receiver's Doppler noise over the whole log to the noise assumed in the limits.
+    scale: float  #: Doppler noise of the receiver, from the whole log, divided by the noise assumed in the limits.
 
 
 def dopplers_of_log(
@@ -118,7 +118,7 @@ def dopplers_of_log(
 def doppler_speed(
     dopplers: Dopplers, ecef_m: Floats, tangent: Floats, *, limits: DopplerSpeedLimits | None = None
 ) -> DopplerSpeed:
-    """Estimate speed along the track and clock drift by weighted least squares, all epochs at once.
+    """Estimate speed along the track and clock drift by weighted least squares, for all epochs at once.
 
     Outliers are removed one by one, the largest first, while enough satellites remain. The noise scale is estimated
     from the median of the normalised residuals of the whole log. `ecef_m`, shape (T, 3), are antenna positions; no
@@ -220,7 +220,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
 def _reject_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
 ) -> tuple[Masks, _SpeedFit]:
-    """Return the Dopplers that remain after repeated rejection of the largest outlier of each epoch, and their fit."""
+    """Reject the largest outlier of each epoch repeatedly; return the remaining Dopplers, and their fit."""
     used = offered.copy()
     fit = _fit(measured, slope, sigma, used)
     for _ in range(limits.most_rejected):

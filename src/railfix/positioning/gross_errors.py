@@ -1,9 +1,9 @@
-"""Detect grossly wrong codes before any fit to all codes.
+"""Detect grossly wrong codes before a least-squares fit to all codes.
 
 A least-squares position absorbs part of every error. A code error of 10 km moves the position by kilometres, to a point
-at which neither the atmospheric models nor the map are valid, and at which other satellites have the largest residuals.
-The position with the least sum of absolute residuals does not move further when an error grows, because the influence
-of an outlying range does not depend on the size of its error.
+at which neither the atmospheric models nor the map are valid. At this point, other satellites may have the largest
+residuals. The position with the least sum of absolute residuals does not move further when an error grows, because the
+influence of an outlying range does not depend on the size of its error.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from railfix.track.trajectory import Trajectory
 
 #: Errors of raw codes (without atmospheric corrections) above this are gross errors [m].
 GROSS_M: Final = 100.0
-#: The remaining codes agree with each other if the median of their absolute residuals is below this [m].
+#: Codes agree with each other if the median of their absolute residuals is below this [m].
 AGREEING_M: Final = 30.0
-#: Least number of redundant ranges after an exclusion at a 3-D position, so that the remaining ranges are tested.
+#: Least number of redundant ranges that must remain after an exclusion at a 3-D position, to test the result.
 _LEFT_IN_SPACE: Final = 3
-#: Where fewer redundant ranges remain, the fit after every other exclusion must be worse by this factor.
+#: With fewer redundant ranges, the fit after every other exclusion must be worse by this factor.
 _CLEARER: Final = 5.0
 #: A corrected code is inconsistent with the other codes if its residual exceeds this multiple of the robust scale.
 _DISAGREE: Final = 5.0
@@ -100,7 +100,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return a mask of the range without which all others agree within `AGREEING_M`, (T, M); none if ambiguous."""
+    """Return a mask (T, M) of the range without which all others agree within `AGREEING_M`; empty if ambiguous."""
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -157,7 +157,7 @@ _COARSE_M: Final = 100.0  #: Spacing of line points in the coarse scan [m].
 _FINE_M: Final = 12.5  #: Spacing in the fine scan around the best point of the coarse scan [m].
 #: Usual limit of the differences between the clocks of constellations [m]: up to 71 m in the recordings.
 _CLOCKS_APART_M: Final = 200.0
-#: A clock with one or two ranges that differs from the other clocks by more than this is not used [m].
+#: Clocks with one or two ranges that differ from the other clocks by more than this are not used [m].
 _CLOCK_AWAY_M: Final = 600.0
 #: Largest product of points, epochs and channels that are computed together.
 _BLOCK: Final = 2_000_000
@@ -172,13 +172,13 @@ class LineScan(NamedTuple):
 
     arc_m: Floats  #: Point with the least cost, shape (T,).
     gross: Masks  #: Ranges whose residuals at the point exceed `GROSS_M`, shape (T, M).
-    #: Redundancy of the ranges without gross errors; 0 where they do not agree with the point; shape (T,).
+    #: Redundancy of the ranges without gross errors; 0 where these ranges do not agree with the point; shape (T,).
     agreeing: Integers
     clear: Masks  #: Epochs at which all points that imply other gross errors have a clearly larger cost, shape (T,).
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
-    """Find the point of a line that agrees best with the raw ranges of each epoch, robustly.
+    """Find the point of a line that agrees best with the raw ranges of each epoch, by a robust cost.
 
     The median residual of each clock is subtracted from the residuals. The cost of a point is the sum of the absolute
     residuals, each limited to `GROSS_M`, so that larger errors do not increase the cost. Points `_COARSE_M` apart are
@@ -268,9 +268,9 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
     best point of the line (`scan_line`), if redundant ranges agree with it and the cost of every other exclusion is
     clearly larger. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
-    (`gross_in_space`). Where neither method identifies gross errors, the epoch is unsure. The ranges with gross errors
-    at the best point are then still returned, so that they do not move the position, if they are at most half of the
-    ranges and redundant ranges agree with the point.
+    (`gross_in_space`). Where neither method identifies gross errors, the epoch is unsure. At an unsure epoch, the
+    ranges with gross errors at the best point are still returned, so that they do not move the position. This requires
+    that they are at most half of the ranges, and that redundant ranges agree with the point.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -306,10 +306,10 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
 def gross_alone(
     weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases | None = None
 ) -> Masks:
-    """Find the ranges of clocks with few ranges that contradict the clocks of more ranges, shape (T, M).
+    """Find the ranges of clocks with few ranges where these clocks contradict the other clocks, shape (T, M).
 
     While a clock is estimated freely, no other range tests the sole range of this clock. With `ties`, the known biases
-    test the sole range to `GROSS_M`. Without `ties`, the one or two ranges of a clock are found if the clock differs
+    test the sole range to `GROSS_M`. Without `ties`, the one or two ranges of a clock are marked if the clock differs
     from the common clock by more than `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks estimated without ties. The
     common clock is the median of the clocks minus their biases, weighted by the number of satellites.
     """

@@ -28,7 +28,7 @@ class RobustFitLimits(Settings):
 
     keep: float = Field(default=1.5, gt=0)  #: Residuals up to this multiple of the scale have full weight.
     reject: float = Field(default=4.0, gt=0)  #: Residuals above this multiple of the scale have zero weight.
-    #: Number of reweightings. On the demonstration with a 20 m error on one satellite, the fifth reweighting changes no
+    #: Number of reweightings. On the demonstration with a 20 m error of one satellite, the fifth reweighting changes no
     #: decision.
     iterations: int = Field(default=5, ge=1)
 
@@ -63,8 +63,8 @@ def robust_fit(
 
     `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which the ranges are linearised.
 
-    `information`, shape (T, 3, 3) [1/m^2], is a-priori information on the position (`map_information`). The position
-    has one unknown with `information`, and three without.
+    `information`, shape (T, 3, 3) [1/m^2], is the a-priori information on the position (`map_information`). The
+    position has one unknown with `information`, and three without.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0

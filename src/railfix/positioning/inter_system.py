@@ -1,4 +1,4 @@
-"""3-D positions from several constellations, with receiver clocks tied by inter-system biases from earlier epochs.
+"""3-D positions from several constellations, with receiver clocks tied by biases estimated from earlier epochs.
 
 The biases between the constellations' clocks are stable to a metre over hours. Once a bias is known, even a single
 satellite of a constellation contributes, and every satellite is checked against all others. Biases are estimated from
@@ -28,7 +28,7 @@ from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 class ClockOffsetLimits(Settings):
     """Limits of the inter-system biases."""
 
-    #: Standard deviation of a bias about its mean; with infinity every constellation keeps a separate clock. On an
+    #: Standard deviation of a bias about its mean. With infinity, every constellation keeps a separate clock. On an
     #: urban recording the standard deviation was 1.0 m (Galileo, BeiDou).
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
     #: Epochs closer together than this count as one sample, because the errors of a train at rest are correlated over
@@ -41,7 +41,7 @@ class ClockOffsetLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetState:
-    """Inter-system biases estimated so far, by clock letter."""
+    """Inter-system biases estimated so far, by letter of the clock."""
 
     information: Mapping[str, float] = field(default_factory=dict)  #: Inverse variance of a bias [1/m^2].
     moment: Mapping[str, float] = field(default_factory=dict)  #: Information times bias [1/m].
@@ -76,11 +76,11 @@ def tie_clocks(
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
 ) -> tuple[InterSystemBiases, list[OffsetState]]:
-    """Estimate the inter-system biases at each epoch from earlier epochs (P1 3.3); also return the new states.
+    """Estimate the inter-system biases at each epoch from earlier epochs (P1 3.3); return biases and new states.
 
-    `ranges` are untied ranges that agree with each other, `clocks` the letters of their groups, and `free` the
-    positions computed from them with separate clocks. `parts` are the rows of each receiver, one item for each item of
-    `states`.
+    `ranges` are untied ranges that agree with each other, `clocks` are the letters of their clock groups, and `free`
+    are the positions from these ranges with separate clocks. `parts` are the rows of each receiver, one item for each
+    item of `states`.
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
@@ -204,7 +204,7 @@ def _tie(
 def _agreeing(
     ranges: Ranges, point: SinglePoint, start_ecef_m: Floats, limits: TieLimits
 ) -> tuple[Ranges, SinglePoint, Masks]:
-    """Return the ranges consistent with one 3-D position, the 3-D positions from them, and a mask of the others."""
+    """Return the ranges consistent with one 3-D position, the positions from these, and a mask of other ranges."""
     dropped = (ranges.weight > 0) & ~robust_fit(ranges, start_ecef_m, limits=limits.robust_fit).kept
     changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):

@@ -23,7 +23,7 @@ from railfix.positioning.section_search import Section, SectionLimits, find_sect
 
 
 class FixLimits(NamedTuple):
-    """Limits of the stages from 3-D position to position on the line."""
+    """Limits of the 3-D position, the section search and the position on the line."""
 
     min_satellites: int = 3  #: Fewest satellites for a position; with 2, sections in sharp curves are wrong (P1 3.2).
     single_point: SinglePointLimits = SinglePointLimits()

@@ -31,18 +31,18 @@ _SUMS: Final = 9  #: Number of sums per window.
 class MapOffsetLimits(Settings):
     """Limits of the test of the map against 3-D positions."""
 
-    #: Time constant of exponential forgetting. The default has six independent samples, and is short enough to detect
-    #: local map errors.
+    #: Time constant of exponential forgetting. The default contains six independent samples, and is short enough to
+    #: detect local map errors.
     window_s: float = Field(default=120.0, gt=0)
     correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
     least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision.
-    #: False-alarm probability of the note by noise alone (chi-square, two degrees of freedom).
+    #: Probability that noise alone causes the note on the map (chi-square, two degrees of freedom).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
-    #: False-alarm probability of the status by noise alone. The nominal sigmas are assumptions. On the recordings, with
-    #: a correct map and all screens, the statistic is below the threshold of 13.8
+    #: Probability that noise alone causes the status of a wrong map, if the nominal sigmas are correct. On the
+    #: recordings, with a correct map and all screens, the statistic is below the threshold of 13.8
     #: (``tests/references/results/bounds.txt``).
     risk: float = Field(default=1e-3, gt=0, lt=1)
-    #: Probability of missing an offset of the smallest detectable size.
+    #: Probability that an offset of the smallest detectable size is missed.
     missed: float = Field(default=1e-2, gt=0, lt=1)
 
     @cached_property
@@ -57,7 +57,7 @@ class MapOffsetLimits(Settings):
 
     @cached_property
     def detectable_sigmas(self) -> float:
-        """Offset that the test of the status misses with the probability `missed` (non-central chi-square) [sigmas]."""
+        """Offset that the test for the status misses with the probability `missed` (non-central chi-square) [sigma]."""
         return float(np.sqrt(scipy.special.chndtrinc(self.threshold, 2, self.missed)))
 
 
@@ -79,8 +79,8 @@ class MapOffset(NotebookTable):
 
     across_m: Floats  #: Offset to the right of the line in the direction of rising chainage, shape (T,).
     up_m: Floats  #: Offset above the line, shape (T,).
-    #: Covariance across and up for a correct map, from noise, satellite and atmospheric errors and the stated error of
-    #: the map; shape (T, 2, 2).
+    #: Covariance across and up for a correct map: noise, satellite and atmospheric errors, and the stated error of the
+    #: map; shape (T, 2, 2).
     covariance_m2: Floats
     statistic: Floats  #: Squared Mahalanobis distance of the offset from zero, shape (T,).
     #: Smallest offset across, and smallest offset up, that the test detects without an offset in the other component;
@@ -140,7 +140,7 @@ def map_offset(
     *,
     limits: MapOffsetLimits | None = None,
 ) -> tuple[MapOffset, list[MapOffsetState]]:
-    """Compute the mean offset of 3-D positions from the line over the window up to each epoch, and the new states."""
+    """Compute the mean offset of 3-D positions from the line over the window up to each epoch; also return states."""
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)

@@ -1,4 +1,4 @@
-"""Exponentially weighted sums over earlier epochs, for noise, inter-system biases, range biases and map offsets."""
+"""Exponentially weighted sums over earlier epochs, for estimates of noise, clock and range biases and map offsets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices
 
-#: Time and age [windows] of an epoch; NaT for none.
+#: Time and age [windows] of an epoch; the time is NaT if there is no epoch.
 Dated = tuple[np.datetime64, float]
 
 
@@ -18,7 +18,7 @@ class Windows(NamedTuple):
     """Ages of T epochs since the start of a log, concatenated for A antennas."""
 
     step_s: Floats  #: Time since the previous epoch; 0 at the first epoch; shape (T,).
-    growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).
+    growth: Floats  #: Exponential of the age [windows] within the epoch's span (`kernels.windows.SPAN`), shape (T,).
     decay: Floats  #: Decay factor of the running sums for spans begun since the previous epoch; 1 if none; shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).
     last: list[Dated]  #: Last epoch of each antenna.

@@ -1,9 +1,9 @@
-"""Normal equations of ranges with the receiver clocks eliminated; the constrained position and the 3-D single point.
+"""Normal equations of ranges without receiver clocks, constrained positions, and 3-D single point positions.
 
 Subtracting the weighted mean over the satellites of a constellation from their residuals and design rows is equivalent
 to solving for the clock of the constellation (the Schur complement of the clock block). Where the biases between the
-clocks are known with a sigma (`InterSystemBiases`), each mean minus the bias is an observation of a common clock, which
-is eliminated in the same way.
+clocks are known with a sigma (`InterSystemBiases`), each mean minus the bias is an observation of a common clock, and
+the common clock is eliminated likewise.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
 height errors are two unknowns with their covariance as prior, which is equivalent to an additional covariance
@@ -56,8 +56,8 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
     """Return the weighted sum of squared residuals at positions (n, 3) [m], with the clocks eliminated, shape (n,).
 
-    Same as `normal_equations(...).wsse`, without the derivatives. `epochs` is the epoch of each position; by default,
-    there is one position per epoch, in order.
+    Same as `normal_equations(...).wsse`, without the derivatives. `epochs` has the index of each position's epoch; by
+    default, there is one position per epoch, in order.
     """
     of = np.arange(len(ranges)) if epochs is None else epochs
     return kernels.ranges.misfits(ranges.arrays, kernel_array(place_ecef_m), of)
@@ -106,7 +106,7 @@ def position_on_line(
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna.
     vertex : ndarray of int, shape (T,)
-        Point to start from (`Section.vertex` of `find_section`); -1 for no position.
+        Initial point (`Section.vertex` of `find_section`); -1 where no position is computed.
     limits : ConstrainedLimits, optional
     """
     limits = limits or ConstrainedLimits()
@@ -132,10 +132,10 @@ def position_on_line(
 def _on_line(
     ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
-    """Return arc lengths (T,), and the values of `_from` with the epochs on the last axis.
+    """Return arc lengths (T,), and the results of `_from` with the epochs on the last axis.
 
-    For positions clamped to an end of a closed line, the iteration is repeated from the point at which the line
-    continues; the better fit is kept.
+    Where the position is clamped to an end of a closed line, the iteration is repeated from the point at which the line
+    continues. The better fit is kept.
     """
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
@@ -200,7 +200,7 @@ class SinglePoint(RowArrays, NotebookTable):
 
 
 def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePointLimits | None = None) -> SinglePoint:
-    """Compute 3-D positions without the map by the conventional method (P1 5), one clock per constellation unless tied.
+    """Compute 3-D positions without the map (P1 5, conventional method), with a clock per constellation unless tied.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ class RangeArrays(NamedTuple):
     weight: Floats  # (T, M)
     starts: Indices  # (G,) first channel of each group
     offset_m: Floats  # (T, G), of `InterSystemBiases`; (0, G) without ties
-    sigma_m: Floats  # likewise
+    sigma_m: Floats  # (T, G), of `InterSystemBiases`; (0, G) without ties
 
     @property
     def tied(self) -> bool:
@@ -66,7 +66,7 @@ class Ranges:
     sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; arbitrary but finite where the weight is 0; (T, M, 3).
     code_m: Floats  #: Corrected pseudorange; arbitrary but finite where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for unused ranges; shape (T, M) [1/m^2].
-    groups: tuple[slice, ...]  #: Channels that share one receiver clock are adjacent; one slice per clock.
+    groups: tuple[slice, ...]  #: Channels of each receiver clock, which are adjacent; one slice per clock.
     ties: InterSystemBiases | None = None  #: Known offsets between the clocks; None for separate clocks.
 
     def __len__(self) -> int:

@@ -27,16 +27,16 @@ class NoiseScaleLimits(Settings):
     """Limits of the estimation of a receiver's noise scale."""
 
     #: Time constant of exponential forgetting. Code errors are correlated over about 20 s (0.6 after 10 s on
-    #: recordings). Five correlation times have enough independent samples for a mean, and are short enough that the
-    #: effect of one street or station decays before the next.
+    #: recordings). Five correlation times contain enough independent samples for a mean. They are short enough that the
+    #: effect of one street or station decays before the next one.
     window_s: float = Field(default=100.0, gt=0)
     #: Weight of the prior scale, as a number of redundant ranges; the default corresponds to two or three epochs. With
-    #: infinity the scale is the prior scale.
+    #: infinity, the scale remains the prior scale.
     prior: float = Field(default=20.0, gt=0)
     least_epochs: float = Field(default=20.0, ge=1)  #: Fewest epochs in the window; gaps are not counted.
-    #: Degrees of freedom of the variation of the scale between epochs. The noise of single epochs varies more than
-    #: chi-square predicts, so the variance stated for an epoch combines the window's variance, weighted by this number,
-    #: with the squared residuals of the epoch. Student's t of code errors on recordings also has 4 degrees of freedom.
+    #: Degrees of freedom of the model of the scale's variation between epochs. The noise of single epochs varies more
+    #: than chi-square predicts, so the variance stated for an epoch combines the window's variance, weighted by this
+    #: number, with the epoch's squared residuals. Student's t of recorded code errors also has 4 degrees of freedom.
     spread: float = Field(default=4.0, gt=0)
 
 
@@ -64,7 +64,7 @@ def noise_scale(
     limits: NoiseScaleLimits,
     least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Return the ratio of the ranges' standard deviation to the assumed value, shape (T,), and the new sums, (A, 2).
+    """Return the ranges' standard deviation divided by the assumed value, shape (T,), and the new sums, (A, 2).
 
     The ratio (1 in P4) is the root mean square of the normalised residuals of earlier epochs, with exponential
     forgetting and the a-priori value `prior`, shape (T,). The ratio is at least `least`; if `limits.prior` is infinite,
@@ -83,8 +83,8 @@ def noise_scale(
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
     """Return the variance of the ranges of each epoch relative to their weights, shape (T,).
 
-    The prior of the variance is a scaled inverse chi-square distribution about the variance of the window with `spread`
-    degrees of freedom; the result is the scale of the posterior given the residuals of the epoch.
+    The prior of the variance is a scaled inverse chi-square distribution with `spread` degrees of freedom about the
+    variance of the window. The result is the scale of the posterior distribution given the residuals of the epoch.
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
     own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
@@ -110,7 +110,7 @@ _ROUNDS: Final = 10  #: Number of reweightings.
 
 @dataclass(frozen=True, kw_only=True)
 class RobustClock:
-    """Clocks of T epochs, G groups, K channels."""
+    """Robust receiver clocks of T epochs and G groups, from K channels."""
 
     clock_m: Floats  #: NaN with fewer than `least_ranges` ranges, shape (T, G).
     share: Floats  #: Weight of each channel in the clock estimate of its group; 0 for unused channels; shape (T, K).

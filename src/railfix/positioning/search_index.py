@@ -1,4 +1,4 @@
-"""Search structures of a trajectory: a k-d tree of its points, and stretches of increasing length."""
+"""Search structures of a trajectory: k-d tree of its points, and stretches at several levels of length."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.track.trajectory import Trajectory
 
 
 class SearchIndex:
-    """Search structures of a trajectory, built once: a k-d tree, and stretches of increasing length."""
+    """K-d tree and stretches of a trajectory, built once and used in many searches."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -22,8 +22,8 @@ class SearchIndex:
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
         self.tree = scipy.spatial.cKDTree(points)  #: k-d tree of the trajectory points.
-        #: Stretches of each level: index of the middle point, and radius [m] around this point that contains the
-        #: stretch.
+        #: For each level of length: indices of the middle points of the stretches, and radii [m] that contain the
+        #: stretches.
         self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1
         while True:
@@ -47,9 +47,9 @@ class SearchIndex:
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a horizontal distance from each position within which the line lies on the tangent, shape (T,) [m].
+        """Return a horizontal radius around each position within which the line lies on the tangent, shape (T,) [m].
 
-        The distance, at most `CLEAR_M`, is computed once per section, and is valid for all positions on the section.
+        The radius, at most `CLEAR_M`, is computed once per section, and is valid for all positions on the section.
         """
         line = self.trajectory
         section = line.segment_at(arc_m)[0]

@@ -1,11 +1,11 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
 P1 2.2(2) compares between-satellite single differences of ranges and distances. The weighted sum of squares ``q`` of
-these differences equals the sum for the residuals with the clock of each constellation eliminated. `find_section`
-returns the point with the least ``q`` in a time that hardly depends on the length of the line. Where a 3-D position
-exists, ``q`` increases from this position as a quadratic form, so only the points inside a ball are evaluated.
-Otherwise the search is coarse to fine. It relies on a bound: between two points, the root of ``q`` changes by at most
-the distance times the root of the summed weights. Both searches are exact.
+these differences equals the weighted sum of squared residuals after elimination of the constellations' clocks.
+`find_section` returns the point with the least ``q`` in a time that hardly depends on the length of the line. Where a
+3-D position exists, ``q`` increases from this position as a quadratic form, so only the points inside a ball are
+evaluated. Otherwise the search is coarse to fine. It relies on a bound: between two points, the root of ``q`` changes
+by at most the distance times the root of the summed weights. Both searches are exact.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Other positions are searched for up to the excess of q that noise exceeds with this probability. This excess is
+#: Alternative positions are searched for up to an excess of q that noise exceeds with this probability. This excess is
 #: larger than the limit of ambiguity, because a fault of one range can increase the excess of the true position.
 _REACH_RISK: Final = 1e-16
 
@@ -50,7 +50,7 @@ class SectionLimits(Settings):
 
     @cached_property
     def reach(self) -> float:
-        """Excess of q up to which other positions are searched for."""
+        """Excess of q up to which alternative positions are searched for."""
         return float(scipy.special.chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
 
 
@@ -60,16 +60,16 @@ class Section:
 
     vertex: Indices  #: Point with the least q; -1 where there are no more ranges than clocks; shape (T,).
     q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without a point; shape (T,).
-    #: Excess of q at the best alternative position over q at the best position, both interpolated between the points of
-    #: the trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
-    #: better, infinite without an alternative; shape (T,).
+    #: q at the best alternative position minus q at the best position, both interpolated between the points of the
+    #: trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
+    #: better; infinite without an alternative; shape (T,).
     excess: Floats
     other_vertex: Indices  #: Point of the alternative position; -1 if there is none; shape (T,).
-    evaluations: Integers  #: Points whose q was computed, shape (T,).
+    evaluations: Integers  #: Number of points at which q was computed, shape (T,).
 
 
 class SectionCandidates(NamedTuple):
-    """Evaluated points, sorted by epoch and point, with q and half its gradient; n epochs, p points."""
+    """Evaluated points of n epochs, sorted by epoch and point; p points in total."""
 
     at: Indices  #: Epochs, shape (n,).
     points: Indices  #: Number of points of each epoch, at least 1; shape (n,).
@@ -160,7 +160,7 @@ def _ball(
 def _in_ball(
     ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
-    """Return the points in the ball of each epoch; q is recomputed if its quadratic form cannot decide on the best."""
+    """Return the points in each epoch's ball; q is recomputed if the quadratic form cannot decide on the best point."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
         point.wsse[epochs], weight_norm[epochs],

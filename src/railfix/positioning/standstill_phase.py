@@ -1,4 +1,4 @@
-"""Likelihood of the carrier phases of a train at rest and a base station, given a position and its covariance.
+"""Likelihood of the carrier phases of a train at rest and of a base station, for a position and its covariance.
 
 Double differences have integer ambiguities that are constant while the train is at rest. Along a track, there are
 integers that fit the phases of all satellites only near the true position (P1 2.5). Each satellite's phase has a
@@ -17,14 +17,14 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-#: Vectors whose square exceeds the least square by more than this are omitted; their relative likelihood is below
-#: exp(-20).
+#: Vectors whose weighted square exceeds the least one by more than this are omitted; their likelihood relative to the
+#: best vector is below exp(-20).
 _WITHIN: Final = 40.0
 _ROUNDING: Final = 1e-9  #: Two unknowns are exchanged if this lowers a conditional variance by more than this fraction.
 
 
 class IntegerSearch:
-    """Search for integer vectors near real vectors of one positive definite covariance, shape (n, n) [cycle^2]."""
+    """Search for integer vectors near real vectors with a positive definite covariance, shape (n, n) [cycle^2]."""
 
     def __init__(self, covariance: Floats) -> None:
         # unit lower triangular L and variances d with covariance = L' diag(d) L
@@ -44,7 +44,7 @@ class IntegerSearch:
 
 
 def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
-    """Return the integer transformation that nearly decorrelates the unknowns, and their factors L and d."""
+    """Return the integer transformation that nearly decorrelates the unknowns, and the new factors L and d."""
     n = len(variance)
     lower, variance, transform = lower.copy(), variance.copy(), np.eye(n, dtype=np.int64)
     rounded_to = n - 2
@@ -116,7 +116,7 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Largest number of integer vectors in the sum of likelihoods.
+#: Largest number of integer vectors whose likelihoods are added.
 _VECTORS: Final = 20
 #: A vector is left out if its log likelihood, minus the log likelihood of uniform phases, is below this.
 _NEGLIGIBLE: Final = -5.0
@@ -152,7 +152,7 @@ def phase_log_likelihood(
 
     A hypothesis has the mean `expected_m` (U, 3 A) and the covariance `prior_m2`. Phases are known modulo the
     wavelength. With the probability `fault_prior`, the phases do not follow the model (slip, half cycle), and are
-    uniform over the wavelength.
+    uniformly distributed over the wavelength.
     """
     measured = np.concatenate([code.place_m for code in codes])
     of_codes = scipy.linalg.block_diag(*(code.covariance_m2 for code in codes))

@@ -33,7 +33,7 @@ _ACROSS_M: Final = 0.3
 _BETWEEN_SHARE: Final = 0.1
 #: An unmapped track nearer than this to a mapped track has no weight [m].
 _BETWEEN_M: Final = 1.2
-#: No decision is made if the position is farther than this from the most probable track, in standard deviations.
+#: No decision is made if the code position is farther from the most probable track than this [sigma].
 _LARGEST_MISFIT: Final = 4.0
 #: Length of track before and behind the code position over which the likelihood is integrated [m].
 _REACH_M: Final = 40.0
@@ -42,7 +42,7 @@ _LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are set to the
 _PHASE_SHARE: Final = 1e-6
 #: Phases are evaluated for hypotheses whose log likelihood from the codes is at most this much below the largest.
 _UNLIKELY: Final = 25.0
-#: Standard deviation of the position along the track, and of the height, in the phase search [m].
+#: Standard deviation assumed for the position along the track, and for the height, in the phase search [m].
 _ANY_PLACE_M: Final = 50.0
 #: Significance level at which the misfit of the mean codes rejects the error model.
 _MISFIT: Final = 1e-4
@@ -64,7 +64,7 @@ class StandstillErrors(Settings):
     correlation_s: float = option("Correlation time of the varying code error.", 60.0, metavar="S", gt=0)
     #: Constant carrier-phase error of a satellite at the zenith; divided by the sine of the elevation.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
-    #: Error of each antenna's position on the train, along and across: spacing, sway, lean.
+    #: Error of each antenna's position on the train, along and across: antenna spacing, sway and lean.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
     #: Map error across the track common to all tracks of a yard, including the shift of the antenna on canted track.
     map_sigma_m: float = option("Error of the map across the track, common to all its tracks.", 0.3, metavar="M", ge=0)
@@ -94,7 +94,7 @@ class StandstillErrors(Settings):
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
         """Return the standard deviation of the mean of the varying code error over a time [m].
 
-        The mean of a Gauss-Markov process has the fraction 2 tau/T (1 - tau/T (1 - exp(-T/tau))) of its variance.
+        The variance of the mean of a Gauss-Markov process is 2 tau/T (1 - tau/T (1 - exp(-T/tau))) times its variance.
         """
         ratio = self.correlation_s / max(seconds, 1e-9)
         share = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
@@ -181,17 +181,18 @@ class YardTrack:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackPosterior:
-    """Probabilities of tracks."""
+    """Posterior probability of each track, and its agreement with the codes."""
 
     names: tuple[str, ...]  #: Names of the tracks, then `NONE`.
     probability: Floats  #: Posterior probability of each of `names`, shape (tracks + 1,).
-    with_rising: Floats  #: Probability that the train is on the track and faces its direction, shape (tracks,).
+    #: Probability that the train is on the track and faces in the track's direction, shape (tracks,).
+    with_rising: Floats
     fits: bool  #: Whether the codes agree with the error model.
     #: Distance of the code position from each track, in standard deviations; shape (tracks + 1,), NaN for `NONE`.
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
-        """Return the track (or `NONE`) with a probability above one minus the risk; empty without decision or fit."""
+        """Return the track (or `NONE`) with a probability above one minus the risk; empty if no track is selected."""
         best = int(np.argmax(self.probability))
         if not self.fits or self.misfit_sigmas[best] > _LARGEST_MISFIT:
             return ""
@@ -217,7 +218,7 @@ def track_posterior(
     places = np.concatenate([fix.east_north_m for fix in fixes])
     weights = np.array([1.0 if prior is None else prior.get(track.name, 0.0) for track in tracks])
     if not weights.sum() > 0.0:
-        raise ValueError("prior gives no track a positive weight; its keys must be names of the tracks")
+        raise ValueError("prior has no positive weight for any track; its keys must be names of the tracks")
     weights = weights / weights.sum() * (1.0 - errors.unmapped_prior)
     nearest = int(np.argmin([_distance(track.points_m, fixes[0].east_north_m) for track in tracks]))
     half = _UNMAPPED_WIDTH_M / 2.0
@@ -262,7 +263,7 @@ def track_posterior(
 
 
 def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFix], errors: StandstillErrors) -> Floats:
-    """Return the log likelihood of the codes' height on each track and on none, shape (tracks + 1,).
+    """Return the log likelihood of the height from codes, for each track and for `NONE`, shape (tracks + 1,).
 
     Student's t distribution limits the effect of a height that agrees with no track. Tracks of unknown height, and
     `NONE`, get the largest likelihood of the tracks with a known height.
@@ -355,7 +356,7 @@ def _distance(points_m: Floats, place_m: Floats) -> float:
 
 
 def _distances(points_m: Floats, places_m: Floats) -> Floats:
-    """Return the distance of positions, shape (n, 2), from a polyline, shape (n,)."""
+    """Return the distances of positions (n, 2) from a polyline, shape (n,)."""
     start, step = points_m[:-1], np.diff(points_m, axis=0)
     offset = places_m[:, None] - start
     share = np.clip((offset * step).sum(axis=-1) / (step**2).sum(axis=-1), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Combination of the two codes of a satellite to one pseudorange, with an estimate of the ionospheric delay.
+"""Combination of a satellite's two codes into one pseudorange, with an estimate of the ionospheric delay.
 
 The difference of the two corrected codes of a satellite does not depend on the geometry. With ``ratio = (f1/f2)^2``,
 
@@ -27,7 +27,7 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.corrected import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
-_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples, whose noise is the noise assumed by the weights.
+_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples, which have the noise that the weights assume.
 _CLIP: Final = 2.5  #: Limit to which the mean difference of a satellite is clipped [sigma].
 _LEAST_SUSPICION_M: Final = 3.0  #: Minimum difference of the two codes at which a range is suspected [m].
 
@@ -59,7 +59,7 @@ class TwoFrequencyState:
     age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
-        """Return the state with the pairs of a chunk added, and the index in this state of each pair of the chunk."""
+        """Return the state with the pairs of a chunk added, and the index of each of these pairs in the new state."""
         if names == self.names:
             return self, np.arange(len(names))
         known = {name: i for i, name in enumerate(self.names)}
@@ -98,8 +98,8 @@ def combine_codes(
     """Return the combined codes, with the ionosphere estimated from earlier epochs, and the new state.
 
     `code_m`, shape (T, K), are corrected first codes, NaN where unusable, and `noise_m` the sigmas of their noise.
-    `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionosphere on the first frequency by its
-    offset, its two gradients and the residual of the satellite. `pairs` are the names of the pairs, length Q, and the
+    `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionosphere on the first frequency, due to
+    the offset, the two gradients and the satellite's residual. `pairs` are the names of the pairs, length Q, and the
     group of each pair; the receiver delay is common to a group.
     """
     names, groups = pairs
@@ -140,7 +140,7 @@ def combine_codes(
     prior = of_field + own_m2
     p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere - delay * rest
     noise = np.minimum(scale, 1.0)[:, None]
-    # the difference known from the means is the same in both codes
+    # the part of the ionospheric error that the means reveal is already removed from both codes
     untold = of_mean / (error + of_bias + lever**2 * of_field)
     share, total = share_of_second(
         scale[:, None] * first, scale[:, None] * other + untold * (delay + of_bias), second.ratio, untold * prior
@@ -162,7 +162,7 @@ def combine_codes(
 def ionosphere_free(
     code_m: Floats, noise_m: Floats, second: SecondCodes, delays_m: tuple[Floats, ...], found: Combined
 ) -> Combined:
-    """Return the ionosphere-free combination of two codes; the test of their difference is that of `combine_codes`.
+    """Return the ionosphere-free combination of two codes; their difference is tested as in `combine_codes`.
 
     The combination is ``P = (ratio P1 - P2) / (ratio - 1)``; its noise is not smoothed over epochs. `delays_m` are the
     group delays contained in the corrections of the first and the second code, shapes (T, K); they are added back.
@@ -177,7 +177,7 @@ def ionosphere_free(
 
 
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
-    """Return the weight of the second code in the range by least squares, and the variance of the codes' difference.
+    """Return the least-squares weight of the second code in the range, and the variance of the codes' difference.
 
     `first_m2` and `second_m2` exclude the ionosphere; a large `ionosphere_m2` gives the ionosphere-free combination.
     """
@@ -188,7 +188,7 @@ def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphe
 def _noise_scale(
     time: Datetimes, deviation: Floats, variance: Floats, known: Masks, own: TwoFrequencyState, ages: dict[str, float]
 ) -> tuple[Floats, Floats]:
-    """Return the ratio of the differences' variance to the assumed value, from earlier epochs (T,), and new sums."""
+    """Return the differences' variance divided by the assumed value, from earlier epochs (T,), and the new sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
     sample = np.stack([channel_sums(size), channel_sums(known.astype(np.float64))], axis=1)
     last_epoch = [(own.last, own.age)]

@@ -1,6 +1,6 @@
 """Build the reference positions of a run: check RTK fixes, match the fixes to the track, and bridge gaps.
 
-1. The positions of each antenna are checked one by one, against the other antenna, and against the track (`fixes`).
+1. The positions of each antenna are checked singly, against the other antenna, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at positions interpolated between fixes.
 3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
 4. All measurements are smoothed (`smoother`). The Dopplers are then solved at the smoothed positions, and all
@@ -41,7 +41,7 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Longest interval between speeds across which the distance travelled is known [s].
+#: Longest interval between two speeds across which the distance travelled counts as known [s].
 LONGEST_STEP_S: Final = 2.5
 #: Variance of the distance travelled across a longer interval [m2].
 UNKNOWN_M2: Final = 1e8
@@ -77,7 +77,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Return the mean of all sources' speeds, weighted by inverse variances, and its sigma, shapes (N,); or NaN."""
+    """Return the sources' mean speed, weighted by inverse variances, and its sigma, shapes (N,); NaN if missing."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
@@ -94,8 +94,8 @@ SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]
 
 #: Number of rounds of Doppler solution and smoothing; the first assumes a constant speed between fixes.
 _ROUNDS: Final = 3
-_MOVED: Final = 4.0  #: Distance between fixes, in standard deviations, from which they show the direction of travel.
-_TELLING: Final = 2.0  #: Closing errors below this many standard deviations are within the noise.
+_MOVED: Final = 4.0  #: Fixes at least this number of sigmas apart show the direction of travel.
+_TELLING: Final = 2.0  #: Closing errors below this many standard deviations count as noise.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,7 +280,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to each time, from the wheel or else from Dopplers, and its variance."""
+        """Return the distance travelled up to each time, and its variance, from the wheel or else from Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
@@ -291,7 +291,7 @@ class _ReferenceBuilder:
         return way, white + lasting
 
     def _hint(self, time: Datetimes, joined: Speeds, fixes: Fixes) -> Floats:
-        """Return speeds that show the direction of travel, from Dopplers or else from fixes in quick succession."""
+        """Return speeds that show the direction of travel, from Dopplers or, if none, from close successive fixes."""
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))

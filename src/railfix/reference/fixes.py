@@ -33,8 +33,8 @@ def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
 
 
 _TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance travelled that is added to `ReferenceSettings.travel_m`.
-#: Fixes that disagree with their neighbours are rejected for at most twice this time [s]; if the disagreement lasts
-#: longer, the distance travelled is assumed to be wrong.
+#: Fixes that disagree with their neighbours are rejected for at most twice this time [s]. If the disagreement lasts
+#: longer, the measured distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
 _FIX_FLOOR_M: Final = 0.01  #: Lower bound of the standard deviation of a fix along the track.
 #: Standard deviation of the train's acceleration [m/s2] in the model of R. A. Singer (1970). Trains accelerate and
@@ -49,7 +49,8 @@ class ReferenceSettings(Settings):
 
     #: Smallest accepted ratio of a fix in the ambiguity test, if the log has the ratio (RTKLIB's default is 3).
     ratio: float = _limit("Smallest ratio of the ambiguity test, where the log has it.", 3.0, "RATIO", "--ratio")
-    #: Largest deviation of the distance between the two antennas from their distance on the vehicle (P2 3.3: 5 cm).
+    #: Largest difference between the measured distance of the two antennas and their distance on the vehicle (P2 3.3: 5
+    #: cm).
     spacing_m: float = _limit(
         "Largest deviation of the distance between both antennas from its value on the vehicle.", 0.05, "M", "--spacing"
     )
@@ -59,8 +60,8 @@ class ReferenceSettings(Settings):
     lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
     #: Largest distance above or below the antenna's trajectory.
     height_m: float = _limit("Largest distance above or below the antenna's trajectory.", 2.0, "M", "--height")
-    #: Constant part of the largest difference between the distance of two fixes along the track and the distance
-    #: travelled between the fixes (P2 3.3).
+    #: Constant part of the limit of the difference between two distances: from one fix to another along the track, and
+    #: travelled between them (P2 3.3).
     travel_m: float = _positive(0.10)
     #: Largest speed of a train. Where the line passes a point several times, only the passes that the train can reach
     #: at this speed are considered.
@@ -69,7 +70,7 @@ class ReferenceSettings(Settings):
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
     #: Largest standard deviation of a bridged instant; less certain instants are left out.
     max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
-    #: Standard deviation of a fix along the track where the log has none.
+    #: Standard deviation of a fix along the track where the log has no standard deviation.
     fix_sigma_m: float = _positive(0.03)
 
     doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
@@ -91,10 +92,10 @@ class ReferenceSettings(Settings):
     acceleration_mps2: float = _positive(0.02)
 
 
-#: Largest difference between the time tags of two antennas' positions that belong to one instant [ns].
+#: Positions of two antennas belong to one instant if their time tags differ by at most this [ns].
 _PAIR_NS: Final = 5_000_000
 _LOOK_BACK: Final = 60  #: Number of preceding runs of agreeing fixes that are tried as the predecessor of a run.
-#: Number of standard deviations of a difference that are added to its limit `ReferenceSettings.travel_m`.
+#: Number of standard deviations of a distance difference that are added to the limit `ReferenceSettings.travel_m`.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
@@ -128,7 +129,7 @@ class Fixes:
     quality: Integers  #: Quality as in `PositionLog`, shape (n,).
     ratio: Floats  #: Ratio of the ambiguity test, NaN where the log has none; shape (n,).
     sigma_enu_m: Floats  #: Standard deviations east, north, up; NaN where the log has none; shape (n, 3).
-    rejection: Bits  #: `FixRejection` bits; a row rejected in one check is not checked further; shape (n,).
+    rejection: Bits  #: `FixRejection` bits; a row that fails a check is not checked further; shape (n,).
     #: Distance between the antennas minus their distance on the vehicle; NaN where not checked; shape (n,).
     spacing_m: Floats
     arc_m: Floats  #: Arc length on the trajectory; NaN where not checked; shape (n,).
@@ -156,7 +157,7 @@ class Fixes:
 
 
 def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
-    """Check each row of a log separately; the rows of a log without qualities count as fixed."""
+    """Check each row of a log separately. In a log without quality flags, every row counts as an RTK fixed solution."""
     timed = np.flatnonzero(~np.isnat(log.time))
     rows = timed[np.argsort(log.time[timed], kind="stable")]
     time, ecef = log.time[rows], log.ecef_m[rows]
@@ -183,20 +184,20 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
 
 
 def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
-    """Set a reason, in place, for those rows of a mask that have no reason yet."""
+    """Set a reason, in place, for the rows in a mask that have no reason yet."""
     rejection[mask & (rejection == 0)] |= reason
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """Check the distance of one antenna's positions from the other antenna at the same time (P2 3.3: 5 cm)."""
+    """Check the distances between simultaneous positions of the two antennas (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
     nearest = nearest_rows(there, fixes.time, within_ns=_PAIR_NS)
     paired = (nearest >= 0) & (rejection == 0)
     if len(rows):
-        # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other position is moved to the same
-        # instant.
+        # At 30 m/s, a millisecond between the two receivers' time tags is 3 cm, so the other position is moved to the
+        # same instant.
         velocity = np.gradient(place, seconds(there - there[0]), axis=0) if len(rows) > 1 else np.zeros_like(place)
         late_s = (fixes.time - there[nearest]).astype(np.int64) / 1e9
         moved = place[nearest] + late_s[:, None] * velocity[nearest]
@@ -209,11 +210,11 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
-#: Reasons for rejection of the other antenna's row with which the row is still used to check a distance.
+#: With these reasons for rejection, the other antenna's row is still used to check a distance.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
-_OUT_OF_REACH_M = 1e6  #: Cost of a pass that the train cannot reach in time; it exceeds all other costs [m].
+_OUT_OF_REACH_M = 1e6  #: Cost of a pass that the train cannot reach in time [m]; larger than all other costs.
 _JITTER_M = 2.0  #: Tolerance for the jitter of positions, added to the distance that the train can travel [m].
 
 

@@ -1,4 +1,4 @@
-"""Smooth positions between fixes, with all sensors weighted by inverse variances, and assemble the reference.
+"""Smooth positions between fixes with sensors weighted by inverse variances, and assemble the reference.
 
 The states at each instant are position, speed and acceleration, and slowly varying errors of the sensors: the error of
 the Doppler speed, the difference between wheel distance and position, the wheel's scale error, and the accelerometer's
@@ -24,9 +24,10 @@ from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_
 from railfix.track.trajectory import Trajectory
 
 _ANY_SPEED_MPS: Final = 100.0  #: Standard deviation of an unknown initial speed [m/s].
-#: Standard deviation of an unknown initial position, or difference between wheel distance and position [m].
+#: Standard deviation of an unknown initial position, and of an unknown difference between wheel distance and position
+#: [m].
 _ANY_DISTANCE_M: Final = 1e4
-#: Residual in standard deviations beyond which Doppler speeds are down-weighted (P. J. Huber, 1964).
+#: Doppler speeds with a residual above this number of standard deviations are down-weighted (P. J. Huber, 1964).
 _HUBER: Final = 2.0
 _ROUNDS: Final = 4  #: Number of rounds of smoothing and down-weighting.
 _SCALE_DRIFT: Final = 3e-6  #: Drift of the wheel's scale [1 per square root of s].
@@ -35,11 +36,11 @@ _LEAST_READING_M: Final = 1e-3  #: Smallest standard deviation of a wheel readin
 _LEAST_STEP_M: Final = 1e-4  #: Smallest standard deviation of process noise over a step [m].
 
 
-SAME_INSTANT_NS: Final = 20_000_000  #: Largest difference between time tags that belong to one instant [ns].
+SAME_INSTANT_NS: Final = 20_000_000  #: Time tags that differ by at most this belong to one instant [ns].
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
-    """Return the instants of a reference: times of the log's rows, receiver epochs, and regular steps in gaps."""
+    """Return the instants of a reference: the times of the log's rows, receiver epochs, and regular steps in gaps."""
     merged = rows
     for other in others:
         new = other[(other > rows[0]) & (other < rows[-1])]
@@ -79,7 +80,8 @@ class SmoothedReference:
 
 
 class _States:
-    """Index of each state in the state vector; -1 for a state that no measurement requires.
+    """Index of each state in the state vector; -1 for states that are not estimated, because no measurement requires
+    them.
 
     The states are position, speed and acceleration of the train; with Dopplers, the time-correlated error of the
     Doppler speed; with a wheel, the difference between wheel distance and position, and the wheel's scale error; with
@@ -254,7 +256,7 @@ class Closings:
 def closings(
     time: Datetimes, distance_m: Floats, variance_m2: Floats, fix_m: Floats, fix_sigma_m: Floats, *, window_s: float
 ) -> Closings:
-    """Return the closing errors of a sensor over windows of `window_s`, from distances measured between fixes.
+    """Return the closing errors of a sensor over windows of `window_s`.
 
     `distance_m` (measured by the sensor) and `variance_m2` are cumulative up to each fix.
     """
@@ -276,7 +278,7 @@ def closings(
 
 
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the sigma of the time-correlated Doppler speed error [m/s], from the closing errors.
+    """Return the sigma of the time-correlated error of the Doppler speed [m/s], estimated from the closing errors.
 
     With fewer than `WINDOWS` windows, the setting is returned.
     """
@@ -289,7 +291,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the wheel's random error [m per square root of m] from the closing errors, without its scale error.
+    """Return the wheel's random error [m per square root of m] from the closing errors; its scale error is excluded.
 
     With fewer than `WINDOWS` windows in motion, the setting is returned.
     """
@@ -330,7 +332,7 @@ class Built:
     #: Number of instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap`` or
     #: ``uncertain``.
     left_out: dict[str, int]
-    bridged_by: dict[str, int]  #: Number of bridged instants by the combination of sensors with measurements.
+    bridged_by: dict[str, int]  #: Number of bridged instants, by the combination of sensors that have measurements.
     facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
 
 
@@ -346,7 +348,8 @@ def assemble_reference(
 ) -> Built:
     """Return one antenna's reference trajectory: fixes, and smoothed positions between the fixes.
 
-    `excess` is the factor by which standard deviations are increased in each gap between G good fixes, shape (G - 1,).
+    `excess`, shape (G - 1,), has the factors by which standard deviations are increased in the gaps between G good
+    fixes.
     """
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
@@ -397,7 +400,7 @@ def assemble_reference(
 
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Return the number of bridged instants by the combination of sensors with a measurement at most 1.5 s away."""
+    """Return the number of bridged instants, by the combination of sensors that have a measurement within 1.5 s."""
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),

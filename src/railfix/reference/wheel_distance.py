@@ -21,7 +21,7 @@ _FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
 
 @dataclass(frozen=True, kw_only=True)
 class Wheel:
-    """Tachometer table with the distance per pulse."""
+    """Tachometer table, and distance per pulse."""
 
     pulses: Pulses
     pulse_m: float
@@ -29,20 +29,22 @@ class Wheel:
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading [m]: for a counter, of a uniform error within one pulse; otherwise 0."""
+        """Standard deviation of a reading [m]: for a counter, the value of an error distributed uniformly over a pulse;
+        otherwise 0.
+        """
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
         """Compute the cumulated distance along rising chainage at instants, shape (N,) [m].
 
-        `speed_hint_mps` are speeds from another source, of which the sign gives the direction of unsigned pulses.
-        Between hints of opposite directions, the direction changes at the longest standstill. The distance is NaN where
-        the table has no reading, and where the direction is undetermined because of a reversal without a stop.
+        `speed_hint_mps` are speeds from another source; their sign determines the direction of unsigned pulses. Between
+        hints of opposite directions, the direction changes at the longest standstill. The distance is NaN where the
+        table has no reading, and where the direction is undetermined because of a reversal without a stop.
         """
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
         if self.pulses.signed:
-            # A signed counter has the direction; the hints only determine which sign is rising chainage.
+            # A signed counter shows the direction. The hints only determine which of its signs is rising chainage.
             rising = np.sign(np.nansum(np.diff(run) * sign))
             return run if rising >= 0 else -run
         step = np.diff(run) * sign
@@ -96,7 +98,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
 def estimate_wheel(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
     """Return the wheel with the given distance per pulse, or with the median of estimates from good fixes.
 
-    MismatchError: there are too few fixes in motion, or the speed between two rows exceeds 150 m/s.
+    Raise MismatchError if there are too few fixes in motion, or if the speed between two rows exceeds 150 m/s.
     """
     source = "given"
     if pulses.kind == "distance":
@@ -124,7 +126,7 @@ def _estimate(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
     usable = (distance > _LEAST_DISTANCE_M) & np.isfinite(turned) & (turned > 0)
     if usable.sum() < _LEAST_WINDOWS:
         raise MismatchError(
-            f"{pulses.path}: too few fixes in motion to estimate the distance per pulse; give it by --pulse (wheel "
-            "circumference over pulses per turn)"
+            f"{pulses.path}: too few fixes in motion to estimate the distance per pulse; specify it with --pulse "
+            "(wheel circumference divided by pulses per turn)"
         )
     return float(np.median(distance[usable] / turned[usable]))

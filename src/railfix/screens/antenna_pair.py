@@ -1,8 +1,8 @@
 """Comparison of the pseudoranges of two antennas, given their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
 The range from the rear antenna to a satellite is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
-gradient)``, with L the antenna spacing. A different value indicates multipath at one of the two antennas, but does not
-show at which antenna.
+gradient)``, with L the antenna spacing. Any other difference indicates multipath at one of the two antennas, but does
+not show at which one.
 
 If `clocks` is "common", the receivers must share a clock: at epochs where the median difference exceeds
 `SEPARATE_CLOCKS_M`, no satellite is tested (P1 6). If `clocks` is "median", the clock difference is estimated by the
@@ -38,7 +38,7 @@ from railfix.screens.base import ObservationPicture, ScreenColumn, Screened, Ver
 from railfix.screens.medians import clock_medians
 from railfix.screens.pairs import PairedEpochs, PairScreen, on_pairs, pair_channels
 
-#: Treatment of the receiver clocks, as described in results.
+#: Descriptions of the treatment of the receiver clocks, for results.
 CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
     "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
@@ -56,20 +56,20 @@ class AntennaPairLimits(Settings):
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
     #: Error of a satellite's azimuth relative to the car body; 3.5 in P1 2.3(3).
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
-    #: Whether both receivers share a clock ("common"), or the median eliminates the clock difference ("median").
+    #: Receiver clocks: one clock for both receivers ("common"), or the median eliminates their difference ("median").
     clocks: Literal["common", "median"] = "median"
     #: Minimum number of common satellites in a constellation, with clocks "median".
     least_satellites: int = Field(default=4, ge=3)
     #: Largest difference between the time tags of two paired epochs.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
-    #: Whether the sigma of an inconsistent satellite is increased ("weigh"), or the satellite rejected ("reject"), as
-    #: in P1. Both antennas are treated alike, because the faulty antenna is unknown.
+    #: Treatment of an inconsistent satellite: its sigma is increased ("weigh"), or it is rejected ("reject"), as in P1.
+    #: Both antennas are treated alike, because the faulty antenna is unknown.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaPairScreened(Screened):
-    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured minus expected difference [m]."""
+    """Verdict on P pairs of epochs, C pairs of channels; the metric is measured minus expected difference [m]."""
 
     expected_m: Floats  #: Rear minus front pseudorange expected from the spacing [m], shape (P, C).
     #: Eliminated clock difference [m], rear minus front; 0 for a common clock; NaN if unknown; shape (P, C).
@@ -105,7 +105,7 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
         Antenna positions on their trajectories at the same instant. Only the difference of the two positions is used,
-        so that on a straight line a common error has no effect.
+        so that a common error has no effect on a straight line.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
@@ -170,7 +170,7 @@ def ambiguity_m(
 
 
 def largest_changes(elevation: Floats, azimuth: Floats, elevation_error: float, azimuth_error: float) -> Floats:
-    """Return the largest change of ``cos(elevation) cos(azimuth)`` within the angle errors [rad], shape (T, M)."""
+    """Return the largest change of ``cos(elevation) cos(azimuth)`` within the errors, (T, M); all angles in radians."""
     # the product of two cosines is extremal where both cosines are extremal
     (up, *ups), (aside, *asides) = _cosines(elevation, elevation_error), _cosines(azimuth, azimuth_error)
     return np.asarray(np.max([np.abs(a * b - up * aside) for a, b in product(ups, asides)], axis=0))
@@ -260,13 +260,13 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
     columns = (
         ScreenColumn(
             name="metric_antenna_pair_m",
-            meaning="screen `antenna_pair`: rear less front pseudorange, less the difference expected from the spacing",
+            meaning="screen `antenna_pair`: rear minus front pseudorange, minus the expected difference",
             verdict="antenna_pair",
         ),
     )
     observation_pictures = (
         ObservationPicture(
-            "antenna_pair", "pseudoranges of two antennas", "rear less front less spacing [m]", "metric_antenna_pair_m",
+            "antenna_pair", "pseudoranges of two antennas", "rear - front - expected [m]", "metric_antenna_pair_m",
             Reason.ANTENNA_PAIR, "limit_m",
         ),
     )  # fmt: skip

@@ -20,11 +20,12 @@ class AntennaSpacingLimits(Settings):
 
     #: Largest difference between the distance from one position to the other and the antenna spacing; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Number of standard deviations that a difference of filter positions or speeds must exceed to be rejected, in
+    #: A difference of filter positions or speeds is rejected only if it exceeds this number of standard deviations, in
     #: addition to the limit in m or m/s. The standard deviations grow when the filter predicts over a gap.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
     #: Largest difference of the two antennas' filter speeds. Antennas on one vehicle differ in speed by a few cm/s at
-    #: most, where the track curves or its cant changes. Smaller ones at single epochs change positions by under 1 m.
+    #: most, where the track curves or its cant changes. Differences below the limit at single epochs change positions
+    #: by under 1 m.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
     #: Time after a rejection for which neither filter position is used. A wrong speed causes a wrong position, which
     #: pseudoranges correct within about 20 s.
@@ -46,8 +47,8 @@ def antenna_spacing_screen(
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
         Chainages at the same instants along one line; a pair with NaN is not rejected.
     spacing_m : array_like, shape (P,) or scalar [m]
-        Expected distance from the rear to the front position, not negative: the antenna spacing if each chainage is the
-        chainage of the antenna, 0 if both chainages refer to one reference point.
+        Expected distance from the rear to the front position, not negative. It is the antenna spacing if the chainages
+        are the chainages of the antennas, and 0 if both refer to one reference point.
     facing : array_like of int, shape (P,) or scalar
         Direction of the vehicle's front: 1 towards rising chainage, -1 towards falling chainage, 0 if unknown. With 0
         the order of the two positions is not tested.
@@ -83,7 +84,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     columns = (
         ScreenColumn(
             name="metric_antenna_spacing_m",
-            meaning="screen `antenna_spacing`: distance between the two positions less the antenna spacing",
+            meaning="screen `antenna_spacing`: distance between the two positions minus the antenna spacing",
             verdict="antenna_spacing",
             table="positions",
         ),
@@ -117,13 +118,13 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         return Screened(metric=found.metric, reject=reject, limit=limits.limit_m)
 
     def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the picture of the differences from the spacing, and their limit."""
+        """Yield the picture that shows the differences from the spacing, and their limit."""
         spacing = tables.epochs("metric_antenna_spacing_m")
         yield (
             "antenna_spacing",
             ScreenPicture(
                 title="positions of two antennas",
-                label="distance less spacing [m]",
+                label="distance minus spacing [m]",
                 metric=spacing,
                 reject=np.abs(spacing) > limits.limit_m,
                 limit=limits.limit_m,

@@ -1,7 +1,7 @@
 """Base classes of the screens: inputs and results of a screen, and the methods that a screen may override.
 
 A screen is one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
-`railfix.screens.registry` or one entry point of an installed package (docs/screens.md shows an example).
+`railfix.screens.registry`, or one entry point of an installed package (docs/screens.md shows an example).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Verdict:
     """A screen's result on the channels of one antenna."""
 
     name: str  #: Key in `AntennaResult.screens`: name of the screen, or of one of several verdicts of the screen.
-    reason: Reason  #: Reason given to the rejected observations.
+    reason: Reason  #: Reason that rejected observations get.
     screened: Screened  #: Metric and verdict, shape (T, M).
     #: Measured error that increases the sigma of a suspected range; None to reject the range; shape (T, M).
     error_m: Floats | None = None
@@ -52,7 +52,7 @@ class OpenSkyCn0(Protocol):
         """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where unknown."""
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return one sentence if the antenna in a log's header is not the curve's, and one if the receiver is not."""
+        """Return a sentence if a log's header names another antenna than the curve, and likewise for the receiver."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class ScreenSetup:
     """Properties of a run that some screens need."""
 
     antennas: int = 1  #: Number of antennas.
-    spacing_known: bool = False  #: Whether a vehicle file places both antennas on one vehicle.
+    spacing_known: bool = False  #: Whether a vehicle file states the positions of both antennas on one vehicle.
     cn0_curve: OpenSkyCn0 | None = None  #: Mean C/N0 of the antenna and receiver as a function of elevation.
 
 
@@ -68,7 +68,7 @@ class ScreenSetup:
 class ScreenColumn:
     """Column of the result tables that a screen fills."""
 
-    name: str  #: Name with its unit: ``metric_doppler_m``.
+    name: str  #: Name, ending with the unit: ``metric_doppler_m``.
     meaning: str
     verdict: str  #: Key of the verdict in `AntennaResult.screens`.
     field: str = "metric"  #: Name of the array in `Verdict.screened` that fills the column.
@@ -152,5 +152,5 @@ class ObservationScreen(Screen[Limits]):
         ----------
         state : object
             State returned for the previous chunk; None at the start. A screen that does not use earlier epochs returns
-            it unchanged.
+            the state unchanged.
         """

@@ -31,7 +31,7 @@ from railfix.screens.base import (
 class Cn0Limits(Settings):
     """Limits of the C/N0 screen."""
 
-    #: Largest deficit of C/N0 relative to the open-sky mean at the same elevation; 10 in P1 table 6. None: no curve.
+    #: Largest deficit of C/N0 relative to the open-sky mean at the same elevation; 10 in P1 table 6. None: no test.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
     #: Minimum C/N0; with None, the default, there is no floor. P1 table 6 uses 30 for its receivers. Receivers measure
     #: C/N0 differently: 30 rejects over half of an M8T's signals in a city, where 20 to 25 is suitable.
@@ -40,7 +40,7 @@ class Cn0Limits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Screened(Screened):
-    """Verdict of the C/N0 screen; the metric is C/N0, and the limit is the higher of floor and curve [dB-Hz]."""
+    """Verdict of the C/N0 screen; the metric is C/N0, and the limit is the higher of the two limits [dB-Hz]."""
 
     floor: Screened  #: Verdict of the floor; the metric is C/N0 [dB-Hz].
     #: Verdict of the curve; the metric is the mean C/N0 at the elevation minus the measured C/N0 [dB], or NaN.
@@ -101,7 +101,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
     columns = (
         ScreenColumn(
             name="metric_cn0_deficit_dbhz",
-            meaning="screen `cn0`: mean C/N0 at the satellite's elevation less measured C/N0",
+            meaning="screen `cn0`: mean C/N0 at the satellite's elevation minus measured C/N0",
             verdict="cn0_curve",
         ),
     )
@@ -110,7 +110,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
             "cn0_floor", "signal strength, floor", "C/N0 [dB-Hz]", "cn0_dbhz", Reason.CN0_FLOOR, "floor_dbhz", "below"
         ),
         ObservationPicture(
-            "cn0_curve", "signal strength against an open sky", "mean at the elevation less C/N0 [dB]",
+            "cn0_curve", "signal strength against an open sky", "mean at the elevation minus C/N0 [dB]",
             "metric_cn0_deficit_dbhz", Reason.CN0_CURVE, "deficit_dbhz", "above",
         ),
     )  # fmt: skip
@@ -128,7 +128,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
     def judge(
         self, antenna: AntennaRanges, limits: Cn0Limits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdicts of floor and curve on a chunk, and the unchanged state (no earlier epochs are used)."""
+        """Return the verdicts of floor and curve on a chunk; the state is unchanged, as no earlier epochs are used."""
         result = cn0_screen(
             antenna.cn0_dbhz,
             antenna.elevation_deg,

@@ -1,9 +1,9 @@
 """Comparison of the pseudorange change between epochs with the Doppler (P1 2.3(2), figure 4, table 6: 1.5 m).
 
 A pseudorange has jumped if its change differs from the change computed from the Dopplers at both epochs. A constant
-multipath error is not detected. A step of the receiver clock changes all pseudoranges equally, and is removed with the
-median over a constellation. The interval is first corrected for the clock step: at a range rate of 800 m/s, a step of 4
-ms changes the range by 3.2 m.
+multipath error is not detected. A step of the receiver clock changes all pseudoranges equally, and is removed by
+subtraction of the median over a constellation. The interval is first corrected for the clock step: at a range rate of
+800 m/s, a step of 4 ms changes the range by 3.2 m.
 
 P1 uses epochs 0.1 s apart. Over longer intervals the limit grows with the uncorrelated part of the pseudorange noise,
 ``sqrt(1 - exp(-dt / correlation_s))``, and the change of acceleration, ``jerk dt^3 / 12``. The limit has three modes,
@@ -34,14 +34,14 @@ from railfix.screens.base import ObservationPicture, ObservationScreen, ScreenCo
 from railfix.screens.medians import clock_medians
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
-_FINEST_M: Final = 1e-3  #: Lower bound of the noise scale of one epoch, because its logarithm is taken [m].
+_FINEST_M: Final = 1e-3  #: Lower bound of the noise scale of one epoch, so that its logarithm is finite [m].
 _LEAST_CHANGES: Final = 5  #: Minimum number of pseudorange changes to estimate the noise scale of one epoch.
 
 
 class DopplerLimits(Settings):
     """Limits of the Doppler screen."""
 
-    #: Whether the limit is fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
+    #: How the limit is determined: fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
     #: Largest deviation of a pseudorange change from its Doppler-derived value up to `short_interval_s`; P1 table 6:
     #: 1.5.
@@ -60,12 +60,12 @@ class DopplerLimits(Settings):
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Longest interval between two epochs that are compared.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
-    #: Time for which a satellite remains suspected after a jump. With 0, only the epochs of the jump and of the jump
-    #: back are affected, as in P1.
+    #: Longest time for which a satellite remains suspected after a jump. With 0, only the epochs of the jump and of the
+    #: jump back are affected, as in P1.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
-    least_satellites: int = Field(default=3, ge=3)  #: Minimum number of satellites on a receiver clock for a test.
-    #: Whether the sigma of a suspected satellite is increased ("weigh"), or the satellite is rejected ("reject"), as in
-    #: P1. The increase follows from the size of the jump (`railfix.screens.suspicion_sigma_m`). With few satellites, a
+    least_satellites: int = Field(default=3, ge=3)  #: Fewest satellites with the same receiver clock for a test.
+    #: Treatment of a suspected satellite: its sigma is increased ("weigh"), or it is rejected ("reject"), as in P1. The
+    #: increase follows from the size of the jump (`railfix.screens.suspicion_sigma_m`). With few satellites, a
     #: rejection can weaken the geometry so much that a position error grows from a few metres to a hundred metres.
     verdict: Literal["weigh", "reject"] = "weigh"
 
@@ -107,12 +107,12 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
 def receiver_limit_m(
     interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit of mode "receiver", shape (T,) [m], with the sum and number of the logarithmic noise scales.
+    """Return the limit of mode "receiver", shape (T,) [m], and the sum and number of the logarithmic noise scales.
 
     The noise scale of an epoch is the median over the satellites of the absolute metric, scaled to `short_interval_s`.
     The logarithms of the scales are averaged over the epochs, so that an epoch with large multipath errors does not
-    dominate. With a dozen satellites, the scale is too small by a tenth to a seventh, because the median of the same
-    changes has been subtracted.
+    dominate. With a dozen satellites, the scale is too small by a tenth to a seventh, because the subtracted median was
+    computed from the same changes.
     """
     growth = _growth(interval_s, limits)
     shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
@@ -185,7 +185,7 @@ def doppler_screen(
     receiver clock (GPS and QZSS share a clock).
 
     A single difference does not show which of its two epochs is faulty. A satellite whose metric exceeds the limit is
-    suspected and rejected, and its metric is summed over the following epochs to an offset. As soon as the offset is
+    suspected and rejected, and the metric is summed over the following epochs to an offset. As soon as the offset is
     within the limit, the satellite is used again, although the jump back exceeds the limit. If the offset does not
     return within `hold_s`, the new pseudorange is accepted. A temporary reflection is therefore rejected only while it
     lasts. When a reflection that was present from the first epoch ends, good epochs are rejected for `hold_s`.
@@ -206,8 +206,8 @@ def doppler_screen(
     -------
     DopplerScreened
         The metric is NaN, and nothing is rejected, where there is no previous epoch within `longest_interval_s`, where
-        the satellite lacks pseudorange or Doppler at either epoch, or where its clock has fewer than `least_satellites`
-        satellites. A suspicion ends at such an epoch, because the offset is no longer known.
+        the satellite lacks pseudorange or Doppler at either epoch, or where fewer than `least_satellites` satellites
+        have the same receiver clock. A suspicion ends at such an epoch, because the offset is no longer known.
     DopplerState
         State for the next chunk.
 
@@ -272,7 +272,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Return pseudorange changes minus the Doppler-derived changes and the receiver clock step, shape (T, M) [m]."""
+    """Return pseudorange changes, minus the Doppler-derived changes and the receiver clock step, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
     # subtract the step of the receiver clock from the difference of the time tags
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT
@@ -303,7 +303,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     columns = (
         ScreenColumn(
             name="metric_doppler_m",
-            meaning="screen `doppler`: pseudorange change since the previous epoch less the change by Doppler",
+            meaning="screen `doppler`: pseudorange change since the previous epoch minus the change by Doppler",
             verdict="doppler",
         ),
         ScreenColumn(
@@ -315,7 +315,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     )
     observation_pictures = (
         ObservationPicture(
-            "doppler", "pseudorange against Doppler", "change of the pseudorange less Doppler [m]", "metric_doppler_m",
+            "doppler", "pseudorange against Doppler", "change of the pseudorange minus Doppler [m]", "metric_doppler_m",
             Reason.DOPPLER, "limit_doppler_m",
         ),
     )  # fmt: skip

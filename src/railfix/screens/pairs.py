@@ -21,8 +21,8 @@ from railfix.track.trajectory import Trajectory
 def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
     """Return the indices of epochs of two receivers with time tags that differ by at most `tolerance_s`.
 
-    The time tags must ascend. Two epochs are a pair if each is the nearest to the other, so that no epoch is in two
-    pairs.
+    The time tags must ascend. Two epochs are a pair if each is the nearest to the other, so that no epoch belongs to
+    two pairs.
     """
     within_ns = round(tolerance_s * 1e9)
     to_rear = nearest_rows(time_rear, time_front, within_ns=within_ns)
@@ -100,10 +100,10 @@ class PairedEpochs:
 class _OfTwoAntennas(Screen[Limits]):
     """Screen that needs two antennas of one vehicle."""
 
-    needs = "two antennas and a vehicle file, which gives their spacing"
+    needs = "two antennas, and a vehicle file with their positions"
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
-        """Return whether two antennas with a known spacing are missing."""
+        """Return whether the run lacks two antennas with a known spacing."""
         return setup.antennas < 2 or not setup.spacing_known
 
 
@@ -133,7 +133,7 @@ class FilteredMotion(NamedTuple):
 class PositionScreen(_OfTwoAntennas[Limits]):
     """Screen of the positions of two antennas of one vehicle."""
 
-    status: ClassVar[Status]  #: Status given to both antennas at epochs with rejected positions.
+    status: ClassVar[Status]  #: Status of both antennas at epochs with rejected positions.
 
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:

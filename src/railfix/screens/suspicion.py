@@ -8,7 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Masks
 
-#: Minimum assumed error of a suspected range, in sigmas. It reduces the weight of the range to a fifth or less.
+#: Minimum assumed error of a suspected range [sigma]. With this minimum, the weight falls to a fifth or less.
 LEAST_SUSPICION: Final = 2.0
 
 

@@ -1,4 +1,4 @@
-"""Ambiguities of positions along the line from code and phase (P4 with the map's constraint), and integer fixing.
+"""Phase ambiguities, estimated with positions along the line (P4, constrained to the map), and integer fixing.
 
 The unknowns of the epochs (distance and clocks) are eliminated, so that the normal matrix has one row per phase arc.
 Integers are fixed where the probability of a wrong integer is small enough. The probability follows from Bayes' rule:
@@ -32,10 +32,10 @@ class PhaseLimits(Settings):
     """Limits of the float ambiguities."""
 
     clocks: PhaseClocks = "own"  #: Receiver clock of the phases, separate or shared with the codes (P4).
-    #: [m/sqrt(s)] Random walk of an ambiguity, for changes of ionosphere, satellite orbit and clock, and for multipath
-    #: in a phase relative to the other phases. Without a random walk, phases that drift by centimetres while satellites
-    #: move by hundredths of a radian bias the position by metres. With a code noise of 1 m at 1 Hz, the value 0.01
-    #: averages over about 100 s. With the value 0, ambiguities are constant.
+    #: [m/sqrt(s)] Random walk of an ambiguity. It covers changes of ionosphere, satellite orbit and clock, and
+    #: multipath in one phase relative to the other phases. Without a random walk, phases that drift by centimetres
+    #: while satellites move by hundredths of a radian bias the position by metres. With a code noise of 1 m at 1 Hz,
+    #: the value 0.01 averages over about 100 s. With the value 0, ambiguities are constant.
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
     #: Correlation time of code errors. Epochs closer together than this add no information on the ambiguities, so the
@@ -59,7 +59,7 @@ def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
 
 
 def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Return the number of epochs per correlation time, from the interval before each epoch, at least 1, shape (T,)."""
+    """Return the number of epochs per correlation time, computed from each epoch's interval; at least 1; shape (T,)."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -126,8 +126,8 @@ def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
     With separate phase clocks, a constant common to all ambiguities is unobservable. The constant is chosen so that the
-    mean of the ambiguities for which `held`, shape (..., A), is 1 (else 0) is zero. Differences of ambiguities do not
-    depend on the choice.
+    mean of the ambiguities marked by `held` is zero; `held`, shape (..., A), is 1 or 0. Differences of ambiguities do
+    not depend on the choice.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -268,7 +268,7 @@ def _fix_pairs(
     log_density = -0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
     peak = max(float(log_density[0]), 0.0)
     weight = (1.0 - no_integer_prior) * np.exp(log_density - peak)
-    # the density of phases that are not whole cycles is one per cycle
+    # phases that are not whole cycles have a uniform density of one per cycle
     others = weight[1:].sum() + no_integer_prior * np.exp(-peak)
     step = np.zeros((len(rows), 3))
     step[:, 0] = cycles - integers[0]

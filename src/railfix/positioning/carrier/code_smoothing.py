@@ -30,7 +30,7 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 
 #: One millisecond as a distance [m]: the clock step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
-#: A larger change common to all codes is a step of the receiver clock, by which the interval is corrected [m].
+#: A larger change common to all codes counts as a step of the receiver clock, and corrects the interval [m].
 _CLOCK_STEP_M: Final = 1e4
 _COMMON: Final = 3  #: Fewest channels whose median represents the receiver clock.
 
@@ -60,10 +60,10 @@ class CycleSlipLimits(Settings):
 
     #: Longest interval without a new arc; station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Constant part of the limit of the phase change minus the change predicted from Dopplers. On real receivers at
-    #: 1 Hz the median of the metric is 0.01 to 0.04 m.
+    #: Constant part of the limit of the phase change minus the change predicted from Dopplers. On real receivers at 1
+    #: Hz the median of this difference is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
-    #: Part of the limit of the phase change in proportion to the interval.
+    #: Part of the same limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
     #: Limit of the change of code minus phase, tested where Dopplers are absent or less precise.
@@ -119,8 +119,8 @@ def find_slips(
 ) -> tuple[Slips, CycleSlipState]:
     """Return the cycle slips of every channel of a chunk.
 
-    A phase also starts a new arc if its channel had no phase at the previous epoch. With fewer than three channels a
-    clock step cannot be distinguished from a slip, and is reported as a slip.
+    The first phase of a channel after an epoch without a phase is also reported, because it starts a new arc. With
+    fewer than three channels a clock step cannot be distinguished from a slip, and is reported as a slip.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Compute the clock step of the codes [m], the part of it that the phases lack [ms], and the metrics of both tests.
+    """Compute the clock step of the codes [m], the part of the step that the phases lack [ms], and both tests' metrics.
 
     `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
     that epoch, and `range_mps` is the range rate from the Dopplers.
@@ -293,7 +293,7 @@ def smooth_codes(
     code_m, phase_m : ndarray, shape (T, M) [m]
         Raw codes, and `Slips.phase_m`; NaN where absent.
     slip : ndarray of bool, shape (T, M)
-        Where arcs begin.
+        True where an arc begins.
     state : SmoothingState, optional
     limits : SmoothingLimits, optional
 
@@ -303,7 +303,7 @@ def smooth_codes(
         Smoothed codes; the raw code where there is no phase, and at the first epoch of an arc. Where the code is
         missing, the smoothed code continues with the arc of the phase, and is NaN without an arc.
     SmoothingState
-        Division into chunks does not change the result beyond rounding (1e-9 m).
+        State for the next chunk. The division into chunks changes the result only by rounding (1e-9 m).
     """
     limits, state = limits or SmoothingLimits(), state or SmoothingState()
     channels = channel_keys(satellite, signal)

@@ -1,7 +1,7 @@
 """Detection of phase jumps from the phase changes between two epochs on a known line, and numbering of phase arcs.
 
-Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every additional
-satellite is a test with centimetre precision. Where the satellites are inconsistent, the channels with the largest
+Between two epochs the unknowns are the distance moved along a known line and the change of the clock. Every additional
+satellite tests the phases to a centimetre. Where the satellites are inconsistent, the channels with the largest
 residuals are rejected one by one until the remaining channels agree. The number of an arc is unique in a run, and
 contains the letters of the channel and a count of arcs.
 """
@@ -21,7 +21,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-#: Number of low bits of an arc number that are the count; the higher bits are the channel's letters.
+#: Number of low bits of an arc number, which hold the count of arcs; the higher bits hold the channel's letters.
 COUNT_BITS: Final = 23
 NO_ARC: Final = -1  #: Arc number where there is no phase.
 
@@ -88,7 +88,7 @@ def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> In
 
 
 def decode_channel(arc_id: Integers) -> Integers:
-    """Return the channel code of each arc."""
+    """Return the channel code contained in each arc number."""
     return np.asarray(arc_id >> COUNT_BITS)
 
 
@@ -96,7 +96,7 @@ class ContinuityLimits(Settings):
     """Limits of the test of phase changes."""
 
     phase_m: float = Field(default=0.012, gt=0)  #: Constant part of the standard deviation of a phase change.
-    #: Part of the standard deviation of a phase change in proportion to the interval (satellite clocks, delays).
+    #: Part of the standard deviation of a phase change that is proportional to the interval (satellite clocks, delays).
     drift_mps: float = Field(default=0.008, gt=0)
     #: Standard deviation of the motion across and up due to errors of map points, for any distance moved.
     aside_m: float = Field(default=0.02, gt=0)
@@ -107,7 +107,7 @@ class ContinuityLimits(Settings):
     #: by 0.0025 rad on a vertical curve of 2000 m.
     up_share: float = Field(default=0.003, gt=0)
     sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
-    #: Largest number of channels rejected; if more would have to be rejected, all tested channels start new arcs.
+    #: Largest number of channels rejected per epoch; if more disagree, all tested channels start new arcs.
     max_rejected: int = Field(default=8, ge=0)
     max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
 
@@ -153,7 +153,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Return the phases whose change is inconsistent with the other phases and the line, and the distance moved.
+    """Find phases that contradict the other phases and the line; compute the distance moved since the last epoch.
 
     Parameters
     ----------
@@ -218,10 +218,10 @@ def track_jumps(
 def _reject_jumps(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Reject channels with the largest residuals one by one until the others agree; without redundancy keep all.
+    """Reject channels with the largest residuals one by one until the others agree; keep all without redundancy.
 
-    Returns a mask of kept channels, residuals of all channels, step along the line, its variance, and a mask of epochs
-    whose kept channels agree.
+    Returns a mask of the kept channels, the residuals of all channels, the step along the line, the variance of the
+    step, and a mask of the epochs whose kept channels agree.
     """
     design = np.where(judged[..., None], design, 0.0)
     change = np.where(judged, change, 0.0)
@@ -245,7 +245,7 @@ def _reject_jumps(
 
 @dataclass(frozen=True)
 class _ContinuityFit:
-    """Residuals of all channels in metres, and in sigmas (of the residual or, if rejected, of the prediction)."""
+    """Fit of each epoch: residuals [m], their sizes [sigma], step along the line [m], and variance of the step."""
 
     residual: Floats
     size: Floats
@@ -271,7 +271,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Return the channels that remain after repeated rejection of the largest residual, and epochs where they agree."""
+    """Reject the largest residual repeatedly; return the kept channels, and the epochs whose kept channels agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

@@ -45,7 +45,7 @@ SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together, which limits 
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """Information on A active arcs from the epochs so far."""
+    """Information on A active arcs, summed over the epochs so far."""
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -60,7 +60,7 @@ class Memory:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseState:
-    """One memory per linearisation pass; empty before the first epoch."""
+    """One `Memory` per linearisation pass; empty before the first epoch."""
 
     memories: tuple[Memory, ...] = ()
 
@@ -75,7 +75,7 @@ def phase_positions(
     *,
     limits: PhaseLimits | None = None,
 ) -> tuple[PhasePositions, PhaseState]:
-    """Return the positions of a chunk of epochs, from the observations up to each epoch.
+    """Compute the position of each epoch of a chunk from the observations up to this epoch.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def phase_positions(
     -------
     PhasePositions
     PhaseState
-        Division into chunks changes the result by less than 1e-9 m.
+        State for the next chunk. The division into chunks changes the positions by less than 1e-9 m.
     """
     limits = limits or PhaseLimits()
     memories = state.memories if state and state.memories else (Memory(),) * limits.passes
@@ -123,7 +123,7 @@ def phase_positions(
 
 
 def _cuts(hop: Integers) -> list[Indices]:
-    """Divide epochs into segments within one time step of the random walk, of at most `SEGMENT_EPOCHS` epochs."""
+    """Divide epochs into segments of at most `SEGMENT_EPOCHS` epochs, each within one time step of the random walk."""
     blocks = np.arange(0, len(hop), SEGMENT_EPOCHS)
     starts = np.union1d(np.flatnonzero(np.diff(hop)) + 1, blocks)
     return np.split(np.arange(len(hop)), starts[1:])
@@ -192,7 +192,7 @@ def _ambiguities(
     # An extra row and column collects channels without a phase.
     index = np.where(arc_id == NO_ARC, count, np.searchsorted(memory.arc_id, arc_id))
     if (np.append(memory.arc_id, NO_ARC)[index] != arc_id).any():
-        raise ValueError("an arc has phases after a newer arc of its channel; number arcs with number_arcs")
+        raise ValueError("an arc has phases after the start of a newer arc of its channel; assign arcs by number_arcs")
     own = np.zeros((len(arc_id), count + 1, count + 4))
     own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
     own[row, index, count + 1 :] = right
@@ -216,7 +216,7 @@ def _ambiguities(
 def _fix_epochs(
     floats: tuple[Floats, Floats, Floats], phases: Phases, trajectory: Trajectory, limits: PhaseLimits
 ) -> tuple[Integers, Floats]:
-    """Fix ambiguities in place, epoch by epoch; return the number of fixed differences and the risk, shape (T,).
+    """Fix ambiguities in place, epoch by epoch; return the numbers of fixed differences and the risks, shape (T,) each.
 
     `floats` are the first values of each channel's ambiguity (T, M), the corrections to these values with their
     responses to the map (T, M, 3), and the covariances (T, M, M).
@@ -265,7 +265,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at the time step of `time`, with absent arcs eliminated and process noise on the others."""
+    """Return the memory at the time step of `time`: absent arcs are eliminated, and the others get process noise."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)

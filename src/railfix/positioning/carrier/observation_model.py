@@ -46,10 +46,10 @@ class Phases:
 
     #: Carrier phase [m], corrected like the code (`corrected_phase_m`); arbitrary where the weight is 0; shape (T, M).
     phase_m: Floats
-    #: 1/sigma^2, 0 for unused phases; `Ranges.sat_ecef_m` must be valid where the weight is positive; shape (T, M)
-    #: [1/m^2].
+    #: 1/sigma^2 [1/m^2]; 0 for unused phases; shape (T, M). `Ranges.sat_ecef_m` must be valid where the weight is
+    #: positive.
     weight: Floats
-    #: Number of the arc, constant while the phase of one channel is unbroken, and unique in a run; shape (T, M).
+    #: Number of the arc of each phase, unique in a run; constant while a channel's phase is unbroken; shape (T, M).
     arc_id: Integers
     integers: IntegerChannels | None = None  #: Channels with integer ambiguities; None if all are real-valued.
 
@@ -76,7 +76,7 @@ def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """Linearised epochs, with P own unknowns ``x = [along, across, up, clocks]``."""
+    """Linearised equations of T epochs; each epoch has P unknowns ``x = [along, across, up, clocks]`` of its own."""
 
     code_design: Floats  #: Design rows of the codes, shape (T, M, P).
     phase_design: Floats  #: Design rows of the phases, shape (T, M, P).
@@ -89,7 +89,7 @@ class Linearised:
     phase_clock_m: Floats  #: Approximate clock of the epoch, subtracted from the phases; shape (T,).
     known: Floats  #: Prior information on map errors and inter-system biases, shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of each epoch's own unknowns, shape (T, P, P).
-    #: Right-hand side of each epoch's own unknowns; before `shift_phases` from the codes alone; shape (T, P).
+    #: Right-hand side of each epoch's own unknowns; codes alone until `shift_phases` adds the phases; shape (T, P).
     right: Floats
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
     prior: Floats  #: Prior information on the map errors across and in height, shape (2,) [1/m^2].
@@ -147,7 +147,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the values minus the weighted mean of their epoch (0 where the weight is 0), and the mean, shape (T,)."""
+    """Return the values minus each epoch's weighted mean (0 where the weight is 0), and the means, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -168,10 +168,10 @@ def own_clock(lin: Linearised) -> bool:
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Subtract first values of the ambiguities (T, M) from the phases, and a first value of a separate phase clock.
+    """Subtract first values of the ambiguities (T, M), and of a separate phase clock, from the phases.
 
-    The phases are added to the right-hand side only afterwards, because values of 1e7 m would cause rounding errors of
-    millimetres.
+    The phases are added to the right-hand side of the equations only after this subtraction, because values of 1e7 m
+    would cause rounding errors of millimetres.
     """
     phase = np.where(lin.phase_weight > 0, lin.phase_m - first_m, 0.0)
     clock = np.zeros(len(phase))
@@ -182,15 +182,15 @@ def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
 
 
 def reduce(lin: Linearised) -> tuple[Floats, Floats]:
-    """Compute the information of each epoch on its channels' ambiguities (Schur complement of its own unknowns).
+    """Compute each epoch's information on the ambiguities, with the epoch's own unknowns eliminated (Schur complement).
 
     Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m] of the observations, and of map
     errors of 1 m across and in height. A map error changes code and phase equally, by a column of the design; with the
     prior of the map error, the right-hand side is ``prior_k C^T L^-1 e_k``.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
-    # The sum of squares of the residuals of an epoch's own unknowns is never negative, and errors of the inverse
-    # are squared in it; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
+    # A sum of squared residuals is never negative, and squares the errors of the inverse. In contrast, diag(v) - C^T
+    # L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
         (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),
@@ -224,8 +224,8 @@ def own_unknowns(
 
     `ambiguity_m`, shape (T, M, 3), are each channel's ambiguity and its responses to map errors of 1 m across and in
     height. A map error that is constant over a run does not average out, so the sigma contains the larger of two
-    responses: of the epoch alone, and including the ambiguities. `repeats`, shape (T,), are the numbers of epochs with
-    the same code errors, by which the ambiguities' variance is multiplied.
+    responses: the response of the epoch alone, and the response with the ambiguities. `repeats`, shape (T,), are the
+    numbers of epochs with the same code errors; they multiply the ambiguities' variance.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)
