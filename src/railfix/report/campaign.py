@@ -23,12 +23,14 @@ from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 
-#: Maximum number of listed epochs, time interval from which at most one epoch of a run is listed [s], and number of
-#: pieces of the line in which each run is drawn.
+#: Maximum number of listed epochs.
 _WORST: Final = 10
+#: At most one epoch of a run is listed in each interval of this length [s].
 _EVENT_S: Final = 60
+#: Number of pieces into which the line of each run is divided for the charts.
 _PIECES: Final = 400
-#: Maximum number of runs in the charts by run, which show the runs with the largest values; the table has all runs.
+#: Maximum number of runs in a chart with one bar per run. The runs with the largest values are drawn; the table has all
+#: runs.
 _BARS: Final = 40
 #: Quantities by which the worst epochs are selected, in order of preference.
 _QUANTITIES: Final = ("error_m", "protection_level_m", "along_sigma_m")
@@ -50,7 +52,8 @@ _FIGURES: Final[Sequence[Column]] = (
 class CampaignReport:
     """Content of the page on a campaign."""
 
-    sentences: tuple[str, ...]  #: At most five sentences on the number of runs, failures, accuracy and the worst run.
+    #: At most five sentences on the number of runs, failed runs, accuracy and the worst run.
+    sentences: tuple[str, ...]
     #: Tables of all runs, of failed runs if there are any, and of the worst epochs if there are positions.
     tables: tuple[Table, ...]
     charts: tuple[Chart, ...]
@@ -99,7 +102,7 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
 def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Path:
     """Write the report on a campaign as one HTML page that opens without a network connection; return its path."""
     runs, *rest = report.tables
-    # failed runs come first
+    # the table of failed runs comes first
     blocks: list[Block] = [*rest, runs, *([Notes("Notes", report.notes)] if report.notes else [])]
     lead = [Sentence(f"{sentence[0].upper()}{sentence[1:]}.") for sentence in report.sentences]
     write_whole(path, charts_page(title, report.charts, blocks, lead=lead), what="page")
@@ -107,9 +110,9 @@ def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Pa
 
 
 def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Return the positions of the filter, or of single epochs if it was off, with errors if there is a reference.
+    """Return the positions of the filter, or of single epochs if the filter was off, with errors if known.
 
-    The second value has a note if the reference cannot be used.
+    Errors are known if there is a reference. The second value contains a note if the reference cannot be used.
     """
     name = next((table for table in list_position_tables(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)
     table = read_table(folder, name, columns=cs.by_name("protection_level_m", require_all=False))[1]
@@ -139,7 +142,10 @@ def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
 
 
 def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the worst epoch of each antenna in each piece of the line, by the first of `_QUANTITIES` with values."""
+    """Return, for each antenna, the epoch with the largest value in each piece of the line.
+
+    The value is the magnitude of the first of `_QUANTITIES` that the table contains.
+    """
     quantity = next(name for name in _QUANTITIES if name in table.columns and table[name].is_not_null().any())
     placed = table.filter(pl.col("chainage_m").is_not_null(), pl.col(quantity).is_not_null())
     length = float(np.ptp(placed["chainage_m"].to_numpy())) if len(placed) else 0.0
@@ -222,5 +228,5 @@ def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[s
             f"{over:,} errors exceed their protection level" if over else "no error exceeds its protection level"
         )
     elif quantity:
-        lines.append("no reference was given; with `reference` in the campaign file, errors are computed too")
+        lines.append("no reference was given; errors are computed if the campaign file has the key `reference`")
     return lines

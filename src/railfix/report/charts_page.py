@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from railfix.track.network_read import NetworkQuality
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-#: Unsigned 16-bit number that encodes an unknown C/N0.
+#: Unsigned 16-bit number that represents an unknown C/N0.
 _UNKNOWN: Final = 65535
 _OF_CHART: Final = (
     "title", "x_label", "y_label", "x_scale", "y_scale", "y_linear", "x_range", "y_range", "equal",
@@ -55,7 +55,7 @@ def script_json(value: Any) -> str:
 
 
 def pack_array(values: NDArray[Any], kind: str = "f") -> str:
-    """Return the letter of a type, followed by an array of this type in base 64, little endian.
+    """Return an array as text: the letter of its type, followed by the values in base 64, little endian.
 
     The types are 32-bit float (f) and unsigned integers of 16 (h) and 32 (i) bits.
     """
@@ -64,7 +64,7 @@ def pack_array(values: NDArray[Any], kind: str = "f") -> str:
 
 
 def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
-    """Return a chart as plain values for JSON; `epochs_from` is the origin of the times `Points.epoch_s`."""
+    """Return a chart as plain values for JSON; the times `Points.epoch_s` are counted from `epochs_from`."""
     values: dict[str, Any] = {name: getattr(chart, name) for name in _OF_CHART}
     values |= {"axis": chart.common_axis, "layers": [_layer(layer) for layer in chart.layers]}
     if chart.start is not None:
@@ -92,7 +92,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 
 def _cells(layer: Cells) -> dict[str, Any]:
-    """Return the ends of the grid, and index and count of each occupied cell; the cells must have equal sizes."""
+    """Return the limits of the grid, and the index and count of each occupied cell; the cells must have equal sizes."""
     column, row = np.nonzero(layer.counts)
     return {
         "x0": float(layer.x_edges[0]),
@@ -109,7 +109,7 @@ def _cells(layer: Cells) -> dict[str, Any]:
 
 
 def sky_values(sky: SkyEpochs) -> dict[str, Any]:
-    """Return satellites in view as plain values, with angles in 0.01 deg and C/N0 in 0.01 dB-Hz."""
+    """Return the satellites in view as plain values, with angles in units of 0.01 deg and C/N0 of 0.01 dB-Hz."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
         "epoch": pack_array(sky.epoch_s),
@@ -136,7 +136,7 @@ _IGNORED: Final = ("Point", "MultiPoint")
 
 
 def read_background(path: Path) -> tuple[Floats, ...]:
-    """Read the lines and outlines of a GeoJSON file, each as longitude and latitude of shape (P, 2) [deg].
+    """Read the lines and outlines of a GeoJSON file, each as longitudes and latitudes, shape (P, 2) [deg].
 
     Raise InputFileError if the file is not GeoJSON, or has neither lines nor polygons.
     """
@@ -185,7 +185,7 @@ _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'uns
 
 @dataclass(frozen=True)
 class Text:
-    """Paragraph of a page; `kind` is "sentence", "absent" (the reason for a missing part) or "command"."""
+    """Paragraph of a page; `kind` is "sentence", "absent" (reason why a part is missing) or "command"."""
 
     kind: str
     text: str
@@ -207,7 +207,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Folded:
-    """Part of a page that is folded under its title."""
+    """Part of a page that is hidden until the reader opens it by its title."""
 
     kind: ClassVar[str] = "folded"
     title: str
@@ -221,13 +221,13 @@ Block = Table | Text | Notes | Folded
 class Figure:
     """Chart or sky plot in a page."""
 
-    number: int  #: Number of the figure in the page, from 0.
+    number: int  #: Number of the figure in the page, beginning with 0.
     chart: Chart | SkyEpochs
     json: Markup  #: Values of the chart for the script of the page.
     width: str  #: Style class of the width: "wide" or "half".
-    sky: str  #: Element id of the sky plot in which a click shows its epoch; "" if there is no sky plot.
-    zoomed_with: str  #: Figures with the same text share the range of their x axis; "" for a range of its own.
-    linked: str  #: Figures with the same text show the same epochs; "" for a figure that is not linked.
+    sky: str  #: Element id of the sky plot that shows the epoch of a clicked point; "" if there is no sky plot.
+    zoomed_with: str  #: Figures with the same text share the range of the x axis; "" if the range is not shared.
+    linked: str  #: Figures with the same text show the same epochs after a zoom; "" for a figure that is not linked.
 
     @property
     def is_sky(self) -> bool:
@@ -237,7 +237,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class PagePart:
-    """Figures under a heading; `absent` has one sentence for each missing figure, with the reason."""
+    """Figures under a heading; `absent` has one sentence with the reason for each missing figure."""
 
     title: str
     figures: Sequence[Figure]
@@ -289,7 +289,10 @@ def _resource(name: str) -> Markup:
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Charts under a heading; `absent` has reasons for missing charts, `start` is the origin of `Points.epoch_s`."""
+    """Charts under a heading.
+
+    `absent` has reasons for missing charts. The times `Points.epoch_s` are counted from `start`.
+    """
 
     title: str
     charts: tuple[Chart | SkyEpochs, ...]
@@ -309,9 +312,9 @@ def figure(
 ) -> Figure:
     """Return the figure of a chart with its values for the script of the page.
 
-    `numbers` yields the number of the figure. `group` has the origin of the times of the points; a click on a point
-    with a time shows the satellites in the sky plot `sky`. `anchor` is a prefix for the name of a shared x axis.
-    `linked` is as for `Figure`.
+    `numbers` yields the number of the figure. The times of the points are counted from the start of `group`; a click on
+    a point with a time shows the satellites in the sky plot `sky`. `anchor` is a prefix for the name of a shared x
+    axis. `linked` is as for `Figure`.
     """
     values: dict[str, Any]
     if isinstance(chart, SkyEpochs):
@@ -336,7 +339,7 @@ _LISTED: Final = 5_000
 def write_network_page(
     network: Network, quality: NetworkQuality, out: Path, *, run: tuple[PlanLog, Matched] | None = None
 ) -> None:
-    """Write the HTML page of a network with the findings of its check, and the matched positions of a run if given.
+    """Write the HTML page of a network with the findings of the map check, and the matched positions of a run if given.
 
     The positions must be in the reference frame of the network. Raise OutputError if the file cannot be written.
     """
@@ -376,7 +379,7 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
         blocks.append(
             Table(
                 name="findings",
-                # a click on the link moves the plan to the finding
+                # a click on the link centres the plan on the finding
                 links=[f"#plan:{east:.1f},{north:.1f}" for east, north in plane],
                 head=("kind", "latitude deg", "longitude deg", "finding"),
                 rows=[(f.kind, f"{f.latitude_deg:.6f}", f"{f.longitude_deg:.6f}", f.sentence) for f in listed],

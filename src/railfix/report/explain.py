@@ -31,15 +31,15 @@ from railfix.track import Trajectory
 SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
-    "off_map": "beyond an end of the map, or too far from the position without the map",
+    "off_map": "the position is beyond an end of the map, or too far from the position without the map",
     "map_end": "moved to an end of the map; the ranges place it slightly beyond that end",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
     "no_observation": "no position: the antenna has no observation",
-    "inconsistent": "the ranges are inconsistent, and no exclusion resolves it",
-    "antennas_disagree": "its distance from the other antenna's position disagrees with the antenna spacing",
-    "uncertain": "its standard deviation exceeds the limit",
+    "inconsistent": "the ranges are inconsistent, and no exclusion resolves the inconsistency",
+    "antennas_disagree": "the distance between the two antennas' positions disagrees with the antenna spacing",
+    "uncertain": "the standard deviation of the position exceeds the limit",
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
     "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
@@ -56,11 +56,12 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "off_map": "no position: the positions from satellites have been off the line for some time",
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
-    "antennas_disagree": "its distance from the other antenna's position disagrees with the antenna spacing",
+    "antennas_disagree": "the distance between the two antennas' positions disagrees with the antenna spacing",
     "doubtful": "measurements contradict the position or its bound: the error is not bounded",
     "spoofing_suspected": "the signals may come from a spoofer: the error is not bounded",
 }
-#: Columns of `Explanation.satellites` with the effect of omitting the satellite.
+#: Columns of `Explanation.satellites` with the effect of omitting the satellite: shift and resulting sigma of the
+#: position.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")
 _COLUMNS: Final = (
     "satellite", "signal", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "residual_m", "reason_text",
@@ -68,8 +69,9 @@ _COLUMNS: Final = (
 )  # fmt: skip
 
 
-#: Number of epochs shown before and after the explained epoch, and their columns in ``positions`` and ``train``.
+#: Number of epochs that are shown before, and also after, the explained epoch.
 _AROUND: Final = 5
+#: Columns of these epochs in ``positions`` and ``train``.
 _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "status")
 
 
@@ -80,7 +82,7 @@ class Explanation:
     run: Path  #: Results folder.
     antenna: str
     time: np.datetime64  #: GPS time of the epoch.
-    asked: str  #: Requested time as given.
+    asked: str  #: Requested time, as the user gave it.
     #: Rows of the epoch in ``positions`` and ``train``; `track` is empty if the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
@@ -96,9 +98,9 @@ class Explanation:
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
     """Explain the epoch of one antenna that is nearest to the GPS time `at`: ``hh:mm:ss``, optionally after a date.
 
-    The default antenna is the first. A time without a date may be on any day of the run. Raise InputFileError if the
-    run wrote no observations. Raise SettingsError if the antenna or the time is invalid. Raise MismatchError if no
-    epoch is within a minute.
+    The default antenna is the first antenna of the run. A time without a date may be on any day of the run. Raise
+    InputFileError if the run wrote no observations. Raise SettingsError if the antenna or the time is invalid. Raise
+    MismatchError if no epoch is within a minute.
     """
     folder = read_run(run)
     if not (run / "observations.parquet").is_file():
@@ -172,7 +174,7 @@ def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
 def _without_each(
     satellites: pl.DataFrame, single: Mapping[str, Any], axes: Floats, map_sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Return the shift and the sigma of the position along the line [m] if a satellite is omitted, shape (rows,) each.
+    """Return the shift and the sigma of the position along the line [m] without each satellite, shape (rows,) each.
 
     The values are NaN for unused satellites, and where the other satellites do not determine the position.
     """
@@ -277,7 +279,7 @@ def _level_of_single(single: Mapping[str, Any]) -> str:
         for name in ("fault_free", "one_fault", "two_faults")
         if single[f"protection_{name}_m"] is not None
     )
-    return f"{level:.1f} m, set by {cause.replace('_', ' ')} (each part alone: {parts})"
+    return f"{level:.1f} m, set by {cause.replace('_', ' ')} (the level for each part alone: {parts})"
 
 
 def write_explanation(explanation: Explanation, path: Path) -> Path:

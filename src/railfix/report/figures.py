@@ -1,4 +1,4 @@
-"""Charts of a run in the order of the page, reasons for missing charts, and tables of the protection levels."""
+"""Charts of a run in the order of the page, reasons for missing charts, and tables on the protection levels."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Return the distinct values of priors by constellation as text, with the constellations of each value."""
+    """Return priors by constellation as text: each distinct value, followed by the constellations that have it."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}
@@ -132,7 +132,7 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
                 ]
 
 
-#: Number of epochs with the largest errors, of each kind of position, that the sky plot includes.
+#: For each kind of position, the number of epochs with the largest errors that the sky plot includes.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
     "No reference was given (--reference), so there are no errors, figures of merit and Stanford diagrams; intervals "
@@ -146,9 +146,10 @@ NO_TIMES: Final = "run.json has no processing times, so there is no chart of pro
 
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
-    """Return the plan of the line, and a chart over chainage, for one antenna.
+    """Return the plan of the line and a chart over chainage for one antenna.
 
-    The chart shows errors, or protection levels if there is no reference, or intervals if there are no levels either.
+    The chart over chainage shows errors. Without a reference it shows protection levels or, if there are none,
+    intervals.
     """
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     if errors is not None:
@@ -161,7 +162,7 @@ def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) 
 
 
 def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart:
-    """Return the plan with positions coloured by error, else by protection level, else by status."""
+    """Return the plan with positions coloured by error or, if there are none, by protection level or by status."""
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     level = floats(positions, "protection_level_m")
     return plan(
@@ -239,7 +240,7 @@ def _screens(
 
 
 def run_group(run: ReportedRun) -> Group:
-    """Return the chart of processing time, which all antennas of a run have in common."""
+    """Return the chart of processing time, which refers to all antennas of a run together."""
     chunks = run.record.get("chunks") or {}
     start = find_start(run.folder.positions)
     if not all(chunks.get(name) for name in ("first_epoch_gpst", "epochs", "positioning_s")):
@@ -277,7 +278,7 @@ def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
 
 
 def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
-    """Return the epochs with the largest errors on the map and of conventional positions, None without errors."""
+    """Return the epochs with the largest errors of constrained and of conventional positions; None without errors."""
     if errors is None:
         return None
     times = errors["time_gpst"].to_numpy()

@@ -23,9 +23,9 @@ class KeyFigure:
     """Key figure of a run."""
 
     name: str
-    value: str  #: Value of single epochs.
-    filtered: str = ""  #: Value of the filter along the track; "" without it.
-    beside: str = ""  #: Value of conventional positions, or a remark.
+    value: str  #: Value for single-epoch positions.
+    filtered: str = ""  #: Value for the filter along the track; "" if the filter was off.
+    beside: str = ""  #: Value for conventional positions, or a remark.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class Headline:
 
 
 def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> Headline:
-    """Return the headline of one antenna of a run; the figures are errors if the run has a reference."""
+    """Return the headline of one antenna of a run; the key figures include errors if the run has a reference."""
     if evaluation is not None:
         passed = get_figures(evaluation, run, antenna, "constrained_ok")
         filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
@@ -108,7 +108,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
 
 
 def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
-    """Return an antenna's key figures in the verdict on the run, by name; empty if the record lacks the antenna."""
+    """Return an antenna's key figures from the verdict on the run, by name; empty if ``run.json`` lacks the antenna."""
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None:
         return {}

@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Kind of position and table of positions whose errors are shown in the table of all runs, by name in its header.
+#: Errors in the table of all runs: kind of position and table of positions, by the name in the header.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -89,7 +89,7 @@ def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
 
 
 def provenance(run: ReportedRun) -> list[Block]:
-    """Return tables and texts on the origin of a run: command, versions, line, inputs with hashes, and notes."""
+    """Return tables and texts on the origin of a run: command, versions, line, hashes of the inputs, and notes."""
     record = run.record
     written = datetime.fromtimestamp((run.folder.path / "run.json").stat().st_mtime, tz=UTC)
     versions: Mapping[str, Any] = record.get("versions") or {}
@@ -187,7 +187,7 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)
 
 
-#: Minimum number of epochs to which the sky plot of an antenna is reduced in a page with many antennas.
+#: Smallest number of epochs in the sky plot of an antenna, however many antennas the page has.
 _LEAST_SKY: Final = 200
 
 

@@ -31,13 +31,15 @@ from railfix.track import Track
 
 _OBSERVATIONS: Final = "observations.parquet"
 _NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
-#: Columns that the report reads: additional columns of the positions, and columns of the filter and of the errors.
+#: Columns of the positions that the report reads in addition to the usual columns.
 _POSITIONS: Final = cs.contains("protection_level", "protection_status", "protection_cause", "_fault") | cs.by_name(
     "kilometrage_m", "n_rejected", "raim_statistic", "raim_threshold", "raim_level_m", "protection_kind",
     *(column.name for screen in SCREENS for column in screen.columns if column.table == "positions"),
     require_all=False,
 )  # fmt: skip
+#: Columns of the filter that the report reads.
 _TRAIN: Final = ("time_gpst", "antenna", "x_m", "y_m", "z_m", "along_sigma_m")
+#: Columns of the errors that the report reads.
 _ERRORS: Final = (
     "time_gpst", "antenna", "status", "observed", "in_reference", "reference_good", "chainage_m", "environment",
     "n_used", "positioned", "conventional_positioned", "error_m", "conventional_error_m", "along_sigma_m",
@@ -59,7 +61,7 @@ class ReportedRun:
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
     train: pl.DataFrame | None  #: Times, positions and sigmas of the filter along the track; None if it was off.
-    reference: str  #: Path of the reference; "" without a reference.
+    reference: str  #: Path of the reference; "" if there is none.
     conventional: Path | None  #: Run whose conventional positions are shown; None for the run itself.
     track: Track | None  #: Track of the run; None if its files cannot be read.
     curve: Cn0Curve | None  #: C/N0 curve that the run used; None if it used none, or if it cannot be read.
@@ -110,10 +112,10 @@ def read_runs(
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
     """Read runs, and evaluate them if there are references; without references the evaluation is None.
 
-    `references` has no reference, one for all runs, or one for each run in order. `conventional` may have, for each run
-    in order, another run on the same log, whose conventional positions are shown; a run with only the elevation and
-    C/N0 screens gives the unscreened positions of P1. The evaluation is returned with an empty table of epochs, because
-    the returned runs have the columns of the report.
+    `references` is empty, has one reference for all runs, or one for each run in order. `conventional` is empty, or
+    names for each run, in order, another run on the same log whose conventional positions are shown. A run with only
+    the elevation and C/N0 screens provides the unscreened positions of P1. The table of epochs in the evaluation is
+    empty; the report takes the values of the epochs from the returned runs instead.
 
     Raise InputFileError or MismatchError if a file is missing or malformed, or a reference does not match the run.
     Raise SettingsError if there is no run, the number of references or conventional runs is wrong, or a run is given

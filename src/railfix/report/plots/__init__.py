@@ -1,7 +1,7 @@
 """Charts of tables and arrays, drawn with matplotlib or shown in the HTML pages of `railfix.report`.
 
-Each chart has two functions: `error_over_time`, for example, returns a `Chart`, and `plot_error_over_time` draws this
-chart with matplotlib into the axes `ax`, or into a new figure, and returns the axes.
+There are two functions for each chart. For example, `error_over_time` returns a `Chart`. `plot_error_over_time` draws
+this chart with matplotlib into the axes `ax`, or into a new figure, and returns the axes.
 
 matplotlib is imported when a chart is drawn, not when this package is imported.
 """

@@ -32,7 +32,7 @@ from railfix.report.plots.line import ECEF, ERROR_CLASSES, LEVEL_CLASSES, LocalF
 if TYPE_CHECKING:
     import polars as pl
 
-#: Name, limits of the classes [m] and colour of the bars of each quantity, by column name.
+#: Name of each quantity, limits of its classes [m], and colour of its bars, by column name.
 _QUANTITIES = {
     "error_m": ("error", ERROR_CLASSES, CONSTRAINED),
     "protection_level_m": ("level", LEVEL_CLASSES, FILTERED),
@@ -43,7 +43,7 @@ _QUANTITIES = {
 def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
     """Return a plan of the positions (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by classes of a quantity.
 
-    `quantity` is a column of ``_QUANTITIES``; larger values are drawn over smaller values.
+    `quantity` is a key of ``_QUANTITIES``; points with larger values are drawn over points with smaller values.
     """
     named, edges, _ = _QUANTITIES[quantity]
     placed = points(places, *ECEF)
@@ -78,7 +78,7 @@ def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Float
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
-    """Return a chart of the mean processing time per epoch in each chunk of a run; `chunks` is from ``run.json``."""
+    """Return a chart of the mean processing time per epoch in each chunk of a run; `chunks` is read from ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)
@@ -105,7 +105,7 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
 
 
 def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
-    """Return charts of used satellites, 3-D offsets from the line, fractions of epochs, and levels over chainage.
+    """Return charts over chainage: used satellites, 3-D offsets from the line, fractions of epochs, protection levels.
 
     `service` is the table of `compute_service`, `limit_m` the alarm limit [m].
     """

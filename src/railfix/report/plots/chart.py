@@ -1,4 +1,4 @@
-"""Charts as axes with layers of numbers, independent of the library that draws them.
+"""Charts described by axes and layers of numbers, independently of the library that draws them.
 
 Functions of `railfix.report.plots` return charts of tables and arrays; long series are thinned without changing their
 appearance. `railfix.report.plots.draw_chart` draws a chart with matplotlib, and `railfix.report` includes it in a page,
@@ -40,7 +40,7 @@ Scale = Literal["linear", "symlog", "log"]
 
 @dataclass(frozen=True, kw_only=True)
 class _Layer:
-    """Values that are drawn in one colour; `label` is the name in the legend, "" if it has no name there."""
+    """Values that are drawn in one colour; `label` is the entry in the legend, "" for no entry."""
 
     label: str
     colour: str
@@ -58,8 +58,8 @@ class Points(_Layer):
 
     kind: ClassVar[str] = "points"
     shape: Shape = "dot"
-    size: float = 3.0  #: Width in pixels of a page.
-    #: Shape (P,); points with NaN are not drawn.
+    size: float = 3.0  #: Width of a point in pixels of a page.
+    #: Coordinates, shape (P,); points with NaN are not drawn.
     x: Floats
     y: Floats
 
@@ -103,10 +103,10 @@ class Cells(_Layer):
     """Numbers of points in the A x B cells of a grid; darker cells have more points."""
 
     kind: ClassVar[str] = "cells"
-    #: Shapes (A + 1,) and (B + 1,).
+    #: Edges of the cells, shapes (A + 1,) and (B + 1,).
     x_edges: Floats
     y_edges: Floats
-    counts: Integers  #: Shape (A, B).
+    counts: Integers  #: Number of points in each cell, shape (A, B).
 
     def __post_init__(self) -> None:
         if self.counts.shape != (len(self.x_edges) - 1, len(self.y_edges) - 1):
@@ -119,7 +119,7 @@ class RangeBars(_Layer):
 
     kind: ClassVar[str] = "ranges"
     names: tuple[str, ...]
-    #: Shape (N,); bars with NaN are not drawn.
+    #: Ends and mark of each bar, shape (N,); bars with NaN are not drawn.
     low: Floats
     mid: Floats
     high: Floats
@@ -130,11 +130,11 @@ class Marks(_Layer):
     """Texts at P points."""
 
     kind: ClassVar[str] = "marks"
-    #: Shape (P,).
+    #: Coordinates of the texts, shape (P,).
     x: Floats
     y: Floats
-    words: tuple[str, ...]  #: Text at each point; lines are separated by line feeds.
-    #: Position of the text: beside a cross at the point, or centred on the point without a cross.
+    words: tuple[str, ...]  #: Text at each point; the lines of a text are separated by line feeds.
+    #: Position of the text: "beside" a cross at the point, or centred "on" the point without a cross.
     place: Literal["beside", "on"] = "beside"
 
 
@@ -147,7 +147,7 @@ class Chart:
 
     name: str  #: Short name for files and page elements, such as ``error-time``.
     title: str
-    caption: str  #: Explanation, with the number of omitted points.
+    caption: str  #: Explanation of the chart, with the number of omitted points.
 
     x_label: str
     y_label: str
@@ -155,11 +155,11 @@ class Chart:
     start: np.datetime64 | None = None  #: GPS time at which `x` is 0; None if the x axis is not time.
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
-    y_linear: float = 1.0  #: Absolute value up to which a symlog axis is linear.
-    #: Ranges of the axes; None for the range of the data.
+    y_linear: float = 1.0  #: Absolute value up to which a symlog y axis is linear.
+    #: Range of each axis; None for the range of the data.
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
-    equal: bool = False  #: Whether the axes are east and north with equal scales; an arrow to the north is drawn.
+    equal: bool = False  #: Whether the axes are east and north with equal scales; an arrow to the north is then drawn.
     width: Literal["wide", "half"] = "wide"  #: Width in a page.
 
     @property
@@ -184,7 +184,7 @@ class SkyEpochs:
     caption: str
     start: np.datetime64  #: GPS time from which `epoch_s` counts.
     epoch_s: Floats  #: Times of the epochs in ascending order [s], shape (K,).
-    first: Integers  #: Index of the first row of each epoch, followed by R; shape (K + 1,).
+    first: Integers  #: Index of the first row of each epoch, and R as the last value; shape (K + 1,).
     #: Satellite and signal of each row, shape (R,).
     satellite: Strings
     signal: Strings
@@ -241,7 +241,7 @@ def nice_step(rough: float) -> float:
     return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
 
 
-#: Maximum number of points in a layer: more than two per pixel of a wide chart in a page, which has 1150 pixels.
+#: Maximum number of points in a layer: more than two per pixel of the widest chart of a page (1150 pixels).
 POINTS: Final = 3000
 _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
@@ -249,7 +249,7 @@ _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     """Return the ascending indices of the smallest and largest `y` in each of `points` / 2 equal pieces of the x range.
 
-    Points with NaN are omitted; if there are at most `points` other points, all of these are returned.
+    Points with NaN are omitted. If at most `points` points are left, the indices of all of them are returned.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
@@ -271,13 +271,13 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
     """Return the indices of at most `points` points, of which no two are in the same square cell.
 
-    The width of the cells is increased from `cell` until at most `points` points are left; if there are no more points
-    at first, all are returned. Points with NaN are omitted.
+    The width of the cells is increased from `cell` until at most `points` points are left. Points with NaN are omitted.
+    If there are at most `points` other points, all are returned.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
     while len(rows) > points:
-        # row and column of a cell are combined to one number
+        # the row and the column of a cell are combined into one number
         across, up = ((v[rows] / cell).astype(np.int64) for v in (x - left, y - low))
         _, first = np.unique(across * (int(up.max()) + 1) + up, return_index=True)
         rows = rows[np.sort(first)]
@@ -288,7 +288,8 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     """Return the indices of at most `points` points that represent a series.
 
-    A fifth of these are `extremes`; a golden-ratio sequence selects the others evenly. Points with NaN are omitted.
+    A fifth of the points are `extremes`; a golden-ratio sequence selects the other points evenly. Points with NaN are
+    omitted. If there are at most `points` points, all are returned.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
@@ -301,7 +302,7 @@ def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def thin_points(series: Iterable[Points]) -> tuple[list[Layer], str]:
-    """Return layers with the points of each series that `spread` selects, and a sentence on the thinning."""
+    """Return layers with the points that `spread` selects from each series, and a sentence on their number."""
     layers: list[Layer] = []
     shown = total = 0
     for whole in series:

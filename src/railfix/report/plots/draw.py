@@ -42,9 +42,11 @@ _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
 
 
 def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
-    """Return a function that draws the chart returned by `chart_of`, with its parameters and the parameter `ax`.
+    """Return a function that draws the chart returned by `chart_of`.
 
-    Raise SettingsError if a table is not a polars table, or lacks a column.
+    The function has the parameters of `chart_of` and the parameter `ax`.
+
+    It raises SettingsError if a table is not a polars table, or lacks a column.
     """
     own = signature(chart_of)
     of_table = next(iter(own.parameters.values())).annotation == "pl.DataFrame"

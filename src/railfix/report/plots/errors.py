@@ -48,7 +48,7 @@ from railfix.report.plots.chart import (
 
 _ERROR_LABEL: Final = "error along the line [m]"
 _SIGN: Final = "Positive errors are toward the end of the line."
-#: Number of pieces of the x axis; the largest sigma and protection level of each piece is drawn.
+#: Number of pieces of the x axis; the largest sigma and the largest protection level of each piece are drawn.
 _PIECES: Final = 600
 _SERIES: Final = (
     ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
@@ -59,7 +59,8 @@ _SERIES: Final = (
 def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
     """Return a chart of errors on the map and of conventional positions, with sigma and level (P1 figures 7 and 10).
 
-    Both tables are of the same antenna, in order of time. `filtered` has the errors of the filter along the track.
+    Both tables refer to the same antenna, and are in order of time. `filtered` has the errors of the filter along the
+    track.
     """
     return _errors(errors, filtered, find_start(errors))
 
@@ -132,13 +133,13 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
 
 
 def good_errors(errors: pl.DataFrame, column: str) -> Floats:
-    """Return the errors in a column [m]; NaN where ``reference_good``, if there is such a column, is false."""
+    """Return the errors in a column [m]; NaN where ``reference_good`` is false, if the table has this column."""
     values = floats(errors, column)
     return np.where(errors["reference_good"].to_numpy(), values, np.nan) if "reference_good" in errors else values
 
 
 def error_scale(error_m: Floats) -> dict[str, Any]:
-    """Return the fields of `Chart` for the scale of an error axis, which is symlog if a few errors are outliers."""
+    """Return the fields of `Chart` for the scale of an error axis; the scale is symlog if a few errors are outliers."""
     size = np.abs(error_m[np.isfinite(error_m)])
     if not len(size):
         return {"y_scale": "linear"}
@@ -168,7 +169,10 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
-    """Return a chart of minimum, mean and maximum error, on the map and conventional, by run name (P1 figure 11)."""
+    """Return a chart of the minimum, mean and maximum errors of constrained and conventional positions (P1 figure 11).
+
+    `runs` has the errors of each run, by name.
+    """
     names: list[str] = []
     values: list[Floats] = []
     for run, errors in runs.items():
@@ -231,7 +235,7 @@ _PARTS: Final = (
 )
 
 
-#: Region, text, x and y of each label, with x and y equal to 1 at the alarm limit and 2 at the end of the axis.
+#: Region, text, x and y of each label; x and y are 1 at the alarm limit, and 2 at the end of the axis.
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),
@@ -242,10 +246,9 @@ _REGIONS: Final = (
 
 
 def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
-    """Return a chart of the protection level over the absolute error, as numbers of epochs in cells.
+    """Return a chart of the protection level over the absolute error; each cell shows its number of epochs.
 
-    The number of epochs of each region is written into the region. Values beyond the axes are counted in the last
-    cells.
+    Each region is labelled with its number of epochs. Values beyond the axes are counted in the last cells.
     """
     width = diagram.edges_m[1] - diagram.edges_m[0]
     edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
@@ -301,7 +304,7 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
 
 
 def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
-    """Return a chart of the protection level of one antenna and its parts over time.
+    """Return a chart of the protection level of one antenna, and of the parts of this level, over time.
 
     `positions` is the table of positions. The chart is empty if the run has no protection levels.
     """
@@ -351,7 +354,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
 
 
 def _count(positions: pl.DataFrame) -> str:
-    """Return sentences with the numbers of epochs by status of the level and by its largest contribution."""
+    """Return sentences with the numbers of epochs by status of the level, and by largest contribution to the level."""
     sentences = []
     for column, what in (("protection_status", "Epochs"), ("protection_cause", "Largest contribution to the level")):
         if column in positions.columns:

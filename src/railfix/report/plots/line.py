@@ -40,8 +40,9 @@ from railfix.report.plots.chart import (
 from railfix.track import Track
 
 ECEF: Final = ("x_m", "y_m", "z_m")
-#: Limits between classes of the absolute error, and of the protection level [m].
+#: Limits between the classes of the absolute error [m].
 ERROR_CLASSES: Final = (1.0, 2.0, 5.0, 10.0)
+#: Limits between the classes of the protection level [m].
 LEVEL_CLASSES: Final = (5.0, 10.0, 20.0, 40.0)
 #: Distance by which the line is drawn beyond the first and the last position [m].
 _BEYOND_M: Final = 30.0
@@ -62,10 +63,11 @@ def plan(
 ) -> Chart:
     """Return a plan of the line and the positions of one antenna, with marks of the kilometrage (P1 figure 6).
 
-    Positions are coloured by `error_m`, else by `level_m`, both of shape (rows,), else by status. With `filtered`, the
-    positions of the filter are drawn at epochs without a single-epoch position. Without `track`, the line is drawn
-    through the positions. `tunnels_m` has the first and last chainage of each tunnel. `background` has lines that are
-    drawn below, each as longitude and latitude of shape (P, 2) [deg]. The chart is empty if there is no position.
+    Positions are coloured by `error_m` if given, otherwise by `level_m` if given, both of shape (rows,), and otherwise
+    by status. With `filtered`, the positions of the filter are drawn at epochs without a single-epoch position. Without
+    `track`, the line is drawn through the positions. `tunnels_m` has the first and last chainage of each tunnel.
+    `background` has lines that are drawn below, each as longitude and latitude of shape (P, 2) [deg]. The chart is
+    empty if there is no position.
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
@@ -157,13 +159,13 @@ class LocalFrame:
 
 
 def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
-    """Yield the part of the background lines within a box, whose corners are `low` and `high`, as one layer."""
+    """Yield the part of the background lines inside a box as one layer; `low` and `high` are corners of the box."""
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
     for line in lines:
         plane = frame.to_plane(line[:, 1], line[:, 0])
         inside = np.asarray(((plane > low) & (plane < high)).all(axis=1))
-        # the points next to inside points are kept, so that lines reach the edge of the box
+        # points next to a point inside the box are kept, so that lines reach the edge of the box
         kept = inside | np.append(inside[1:], False) | np.append(False, inside[:-1])
         if inside.any():
             parts += [np.where(kept[:, None], plane, np.nan), gap]
@@ -175,7 +177,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
 def _line(
     track: Track | None, frame: LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
 ) -> Iterator[Curve]:
-    """Yield the line, from `_BEYOND_M` before the first to `_BEYOND_M` after the last position, and its tunnels."""
+    """Yield the line from `_BEYOND_M` before the first to `_BEYOND_M` after the last position, and its tunnels."""
     if track is None:
         yield _line_of_positions(here, chainage_m)
         return
@@ -208,7 +210,7 @@ def _classes(
 
 
 def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
-    """Return label, colour and mask of the NaN values, then of each class of values between `edges` [m]."""
+    """Return label, colour and mask of the class of NaN values, and of each class of values between `edges` [m]."""
     classes = [(unknown, BLACK, np.isnan(size))]
     for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):
         label = f"{quantity} {low:g} to {high:g} m" if np.isfinite(high) else f"{quantity} {low:g} m and more"
@@ -248,8 +250,9 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
     """Return the chainage of positions and the distance from the previous position [m].
 
-    `prefix` is the beginning of the names of the columns. Distances are taken from the column of intervals, and
-    positions at standstill are left out; without this column, distances are differences of chainage, at standstill too.
+    `prefix` is the beginning of the column names. Distances are taken from the column of intervals, and positions at
+    standstill are left out. Without this column, distances are differences of chainage, and include positions at
+    standstill.
     """
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")

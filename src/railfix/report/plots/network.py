@@ -1,4 +1,4 @@
-"""Charts of networks of tracks, map quality, surveyed lines, and probabilities of the track of a train at rest."""
+"""Charts of networks of tracks, map quality, surveyed lines, and track probabilities of a train at rest."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from railfix.track.network_match import Matched, PlanLog
     from railfix.track.network_read import NetworkQuality
 
-#: Maximum number of drawn points of tracks; of larger networks, every n-th point and the ends are drawn.
+#: Maximum number of track points that are drawn; in larger networks, every n-th point and the ends of tracks are drawn.
 _DRAWN: Final = 200_000
 #: Maximum number of tracks that are named in the plan.
 _NAMED: Final = 400
-#: Margin of the view around a run as a fraction of its larger extent, minimum margin [m], and distance of a name from
-#: its track as a fraction of the extent of the view.
+#: Margin of the view around a run, as a fraction of the larger extent of the run; minimum margin [m]; and distance of a
+#: track name from the track, as a fraction of the extent of the view.
 _MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
-#: Smallest track probability and colour of each class of positions.
+#: Classes of positions: smallest track probability, and colour.
 _CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
 
 
@@ -41,7 +41,7 @@ def plot_network(
     quality: NetworkQuality | None = None,
     run: tuple[PlanLog, Matched] | None = None,
 ) -> None:
-    """Write `network_plan` as a PNG or SVG file; raise OutputError if it cannot be written."""
+    """Write `network_plan` as a PNG or SVG file; raise OutputError if the file cannot be written."""
     save_figure(draw_figure(network_plan(network, quality, run)), path)
 
 
@@ -119,14 +119,14 @@ def _names_beside(
     points, ahead, _ = network.course_on(track, matched.chainage_m[rows])
     (x, y), (dx, dy) = frame.plane(points).T, (ahead @ frame.axes[:2].T).T
     span = max(high - low for low, high in view)
-    # texts are wider than high, and are therefore placed farther from a track that runs north
+    # a text is wider than high, and is therefore placed farther from a track that runs north
     away = np.where(np.arange(len(rows)) % 2, -1.0, 1.0) * span * (_BESIDE * np.abs(dx) + 2.0 * _BESIDE * np.abs(dy))
     words = tuple(network.names[t] for t in track)
     return Marks(label="names", colour=BLACK, x=x + away * dy, y=y - away * dx, words=words, place="on")
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
-    """Return indices of every n-th and the last point of each track, and the start of each further track in them."""
+    """Return the indices of every n-th and the last point of each track, and where in them a further track begins."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
     place = np.arange(len(track)) - first[track]
@@ -156,7 +156,7 @@ def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]
 
 _COLOURS: Final = {"error": "#c1272d", "warning": "#e08e0b"}
 _LINE: Final = "#1f4e79"
-#: Panel in which each kind of finding is marked; other kinds are marked in the plan only.
+#: Panel in which each kind of finding is marked; other kinds are marked only in the plan.
 _PANELS: Final = {
     "mid-chord": "mid-chord",
     "duplicate": "spacing",
@@ -173,7 +173,9 @@ _PANELS: Final = {
 
 
 def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None:
-    """Write a picture of the plan, and of mid-chord deviation, point spacing, turns, gradient and cant over chainage.
+    """Write a picture of the plan of a track, and of the quantities of its quality check over chainage.
+
+    The quantities are mid-chord deviation, point spacing, turns, gradient and cant.
 
     The findings of the map check are marked. The file is PNG or SVG; raise OutputError if it cannot be written.
     """
@@ -241,7 +243,7 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
 
 
 def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
-    """Write a picture of a survey: positions and map in plan, and height and standard deviations over chainage.
+    """Write a picture of a survey: a plan of positions and map, and the height and standard deviations over chainage.
 
     Raise OutputError if the file cannot be written.
     """
@@ -288,7 +290,7 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
 
 
 def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, risk: float) -> None:
-    """Write a picture of the probabilities of the tracks, and of another track, over time, with the allowed risk."""
+    """Write a picture of the probability of each track, and of another track, over time, with the allowed risk."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)

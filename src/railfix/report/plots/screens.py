@@ -39,7 +39,7 @@ from railfix.screens import SCREENS, Cn0Limits, ScreenPicture
 
 _KEPT: Final = "#2f86b8"
 _COLUMNS: Final = 4
-#: Number of rows of a chart that are processed together.
+#: Number of rows of a picture that are processed together.
 _BLOCK: Final = 100_000
 #: Maximum number of points of the curve of a limit.
 _LINE_POINTS: Final = 1500
@@ -66,8 +66,8 @@ def draw_screen(
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
     """Return a chart of a metric with its limit over time.
 
-    `time` has the time of each of T rows of the picture. With `epoch`, shape (T,), `time` has the times of E epochs,
-    and `epoch` is the index of the epoch of each row.
+    The picture has T rows. Without `epoch`, `time` has the time of each row, shape (T,). With `epoch`, `time` has the
+    times of E epochs, and `epoch` is the index of the epoch of each row, shape (T,).
     """
     start = time.min() if len(time) else np.datetime64(0, "ns")
     return _screen(picture, seconds(time - start), epoch, start)
@@ -193,7 +193,7 @@ def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Sampl
 
 @dataclass(frozen=True, kw_only=True)
 class _ScreenRows:
-    """Positions and observations of one antenna; a column of the observations is read when it is drawn."""
+    """Positions and observations of one antenna; each column of the observations is read only when it is drawn."""
 
     positions: pl.DataFrame
     observations: pl.LazyFrame
@@ -217,8 +217,9 @@ class _ScreenRows:
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
     """Write one picture per screen and antenna, such as ``front_doppler.png``, into the folder `out`; return the paths.
 
-    Screens that tested nothing have no picture. Raise InputFileError if `run` is not a results folder, or the run wrote
-    no observations (``railfix run --observations``). Raise OutputError if the folder or a file cannot be written.
+    No picture is written for a screen that tested no value. Raise InputFileError if `run` is not a results folder, or
+    the run wrote no observations (``railfix run --observations``). Raise OutputError if the folder or a file cannot be
+    written.
     """
     (reported,), _ = read_runs([run])
     if reported.observations is None:
@@ -240,7 +241,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
 
 
 def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
-    """Return the columns of the screens that the tables lack, as tables written by an earlier version do, sorted."""
+    """Return the sorted names of the screens' columns that the tables lack, as tables of an earlier version may."""
     columns = [column for screen in SCREENS for column in screen.columns]
     missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
     missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())
@@ -270,7 +271,10 @@ class RunScreen:
 
 
 def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
-    """Yield the screens that tested anything, and the protection level, by antenna; `config` has the run's settings."""
+    """Yield, for each antenna, the screens that tested any value, and the protection level.
+
+    `config` has the settings of the run.
+    """
     antennas = positions["antenna"].unique(maintain_order=True).to_list()
     for antenna in antennas:
         mine = positions.filter(pl.col("antenna") == antenna) if len(antennas) > 1 else positions
@@ -293,7 +297,7 @@ def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyF
 
 
 def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
-    """Yield the name and the picture of each active screen, and of the protection level if it is on."""
+    """Yield the name and the picture of each active screen, and of the protection level if the run has levels."""
     for screen in SCREENS:
         if screen.name in config.screens:
             for name, picture in screen.pictures(rows, getattr(config, screen.name)):

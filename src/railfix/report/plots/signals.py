@@ -53,7 +53,7 @@ def cn0_over_elevation(
     """Return a chart of C/N0 over elevation for each constellation and signal (P1 figure 3).
 
     The chart has the mean, the thresholds of the screen `limits`, and the elevation mask. The mean is taken from
-    `curve` if the curve has the signal, and is computed from the observations otherwise.
+    `curve` if `curve` has the signal; otherwise it is computed from the observations.
     """
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
@@ -103,7 +103,10 @@ def _cn0_chart(
 
 
 def _cell(column: str, edges: Floats) -> pl.Expr:
-    """Return the index of the cell of a value between equidistant edges; the last edge belongs to the last cell."""
+    """Return the index of the cell that contains each value of a column.
+
+    The edges are equidistant. The last edge belongs to the last cell.
+    """
     width, last = float(edges[1] - edges[0]), float(edges[-1])
     number = ((pl.col(column) - float(edges[0])) / width).floor().cast(pl.Int64)
     return pl.when(pl.col(column) == last).then(len(edges) - 2).otherwise(number)
@@ -161,7 +164,7 @@ def sky_epochs(
     """Return the satellites in view of one antenna at some epochs, for sky plots.
 
     At most `epochs` epochs are returned: up to half of them are `wanted` epochs, and the others are evenly spaced. Each
-    satellite has one row per epoch, with its selected signal.
+    satellite has one row per epoch, with the signal that was selected for positioning.
     """
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
     times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]
