@@ -143,7 +143,7 @@ def read_background(path: Path) -> tuple[Floats, ...]:
     node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
     if not lines:
-        raise InputFileError(path, "has no lines or polygons; expected GeoJSON with streets, buildings or the like")
+        raise InputFileError(path, "has no lines or polygons; expected GeoJSON with streets, buildings or similar")
     return lines
 
 

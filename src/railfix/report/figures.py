@@ -135,8 +135,8 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
 #: For each kind of position, the number of epochs with the largest errors that the sky plot includes.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
-    "No reference was given (--reference), so there are no errors, figures of merit and Stanford diagrams; intervals "
-    "are computed between positions."
+    "No reference was given (--reference), so there are no errors, figures of merit or Stanford diagrams. "
+    "Intervals are computed between consecutive positions."
 )
 NO_OBSERVATIONS: Final = (
     "The run wrote no observations (railfix run --observations), so there are no charts of the sky, of C/N0 and of "

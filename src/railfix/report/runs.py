@@ -122,7 +122,7 @@ def read_runs(
     twice.
     """
     if not paths:
-        raise SettingsError("no run to report on; name the folders that railfix run wrote")
+        raise SettingsError("no run to report on; give the folders written by railfix run")
     if len(references) not in (0, 1, len(paths)):
         raise SettingsError(
             f"{len(references)} references for {len(paths)} runs; give one for all runs, or one for each in order"

@@ -78,7 +78,7 @@ def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Float
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
-    """Return a chart of the mean processing time per epoch in each chunk of a run; `chunks` is read from ``run.json``."""
+    """Return a chart of the mean processing time per epoch in each chunk of a run; `chunks` is from ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)

@@ -130,7 +130,7 @@ def draw_sky(sky: SkyEpochs, time: np.datetime64, *, ax: Axes | None = None) -> 
         raise ValueError("there are no satellites to draw")
     polar: Any = new_axes((6.0, 6.0), projection="polar") if ax is None else ax
     if polar.name != "polar":
-        raise ValueError("the sky needs polar axes; make them with subplot_kw={'projection': 'polar'}")
+        raise ValueError("the sky plot requires polar axes; create them with subplot_kw={'projection': 'polar'}")
     k = int(np.argmin(np.abs(sky.start + timedelta(sky.epoch_s) - time)))
     rows = slice(int(sky.first[k]), int(sky.first[k + 1]))
     polar.set_theta_zero_location("N")

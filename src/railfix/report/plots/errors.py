@@ -82,7 +82,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
     at, sigma = _greatest(x, floats(errors, "along_sigma_m"))
     if len(at):
         layers.append(Band(label="± stated sigma", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
-        caption.append("The band is the stated standard deviation, the largest value in each short piece of the axis.")
+        caption.append("The band is the largest stated standard deviation in each short piece of the axis.")
     levels = []
     drawn_levels = [name for name in level_columns(errors) if np.isfinite(floats(errors, name)).any()]
     for column, colour in zip(drawn_levels, (PURPLE, GREEN, BLACK, GREY), strict=False):
@@ -338,8 +338,8 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     caption[1] += f"; not drawn: {plural(infinite, 'infinite level')}." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
-            "Each part is computed with its own share of the risk; the level uses the whole risk and can be smaller "
-            "than a part."
+            "Each part is computed with a fraction of the risk; the level uses the whole risk, and can be smaller than "
+            "a part."
         )
     return Chart(
         name="levels-chainage" if start is None else "levels",

@@ -74,7 +74,7 @@ def cn0_over_elevation(
         counts = np.zeros((len(_ELEVATION_EDGES) - 1, len(_CN0_EDGES) - 1), dtype=np.int64)
         drawn = mine.filter(pl.col("up").is_between(0, counts.shape[1] - 1), pl.col("across") < len(counts))
         np.add.at(counts, (drawn["across"].to_numpy(), drawn["up"].to_numpy()), drawn["count"].to_numpy())
-        caption = f"{size:,} observations; darker cells have more."
+        caption = f"{size:,} observations; darker cells have more observations."
         charts.append(_cn0_chart(kind, signal, counts, lines, title="C/N0 over elevation: ", caption=caption))
     return charts
 
