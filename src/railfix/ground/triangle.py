@@ -91,7 +91,7 @@ def limits_for_false_stops(
         Standard deviation of a fix per axis.
     own_sigma_m : float [m]
         Standard deviation per axis of the part of the error that is not common to all receivers. The error of a side is
-        the difference of these parts of its two receivers.
+        the difference between these parts of two receivers.
     stops_per_year : float
         Accepted number of false stops per year.
     independent_s : float [s]

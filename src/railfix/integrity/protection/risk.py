@@ -224,9 +224,9 @@ def allocate(
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
     The hypotheses are the following classes: single satellites, alone and with a wrong map; pairs of satellites, where
-    pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and every class
-    that is more probable than the risk for unchecked faults. `out`, shape (T,), is the number of excluded satellites;
-    `sides`, shape (T, S, M), are the sets of satellites that may be faulty together.
+    pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and the most
+    probable other classes, until the rest is within the risk for unchecked faults. `out`, shape (T,), is the number of
+    excluded satellites; `sides`, shape (T, S, M), are the sets of satellites that may be faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
