@@ -282,11 +282,12 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return the likely cause for each antenna that has no position on the line; "" if no cause was found."""
+    """Return the likely cause for each antenna with at least 90 % of its positions off the line; "" if not found."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
-        if antenna.observed and antenna.status["off_map"] + antenna.status["inconsistent"] == antenna.positioned:
+        off = sum(antenna.status[status] for status in ("off_map", "inconsistent", "map_offset"))
+        if antenna.observed and off >= 0.9 * antenna.positioned:
             from railfix.run.locate import likely_cause
 
             again = replace(logs[name], problems=[], skipped=Counter())
