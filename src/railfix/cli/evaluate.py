@@ -28,6 +28,7 @@ from railfix.cli.options import (
     overwriting,
 )
 from railfix.core.errors import SettingsError
+from railfix.core.notebook import plural
 from railfix.core.settings import validate
 from railfix.core.tables import plain_table
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
@@ -65,7 +66,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
         for antenna, method in run.method.items():
             by = "differences of chainage" if method == "chainage" else "along the trajectory"
             console.print(
-                f"  {antenna}: against {run.reference}, {by}; {run.outside[antenna]:,} epochs outside the reference"
+                f"  {antenna}: against {run.reference}, {by}; {plural(run.outside[antenna], "epoch")} outside the reference"
             )
         show_notes(console, run.notes)
     for table in error_tables(evaluation):

@@ -107,12 +107,12 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
     """Write another program's positions as the folder of a run; `run` is the folder of railfix's run on the same log.
 
-    Raise MismatchError if the run has no epochs of the antenna, or the log has no position at these epochs.
+    Raise MismatchError if the run has fewer than two epochs of the antenna, or the log has no position at these epochs.
     """
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
-        raise MismatchError(f"{log.path}: has positions of the {antenna} antenna, but the run has no epochs of it")
+        raise MismatchError(f"{log.path}: has positions of the {antenna} antenna, but the run has fewer than two epochs of it")
     places = np.stack([floats(epochs, name) for name in ("x_m", "y_m", "z_m")], axis=1)
     trajectory, _, _ = find_trajectory(own, antenna, floats(epochs, "chainage_m"), places, TrackFiles())
     table = table_of_positions(log, epochs, trajectory)

@@ -43,8 +43,7 @@ class TrackingLimits(Settings):
     #: (`kernels.tracking.model.narrow_speed_range`).
     service_acceleration_mps2: float = Field(default=1.5, gt=0)
     trusted_satellites: int = Field(default=7, ge=0)
-    #: Degrees of freedom of the Student t distribution of measurement errors. 4 is the smallest integer with a finite
-    #: kurtosis bound of the score, and fits urban code errors.
+    #: Degrees of freedom of the Student t distribution of measurement errors; 4 fits urban code errors.
     degrees_of_freedom: float = Field(default=4.0, gt=2)
     #: Degrees of freedom for codes longer than expected. Reflections arrive late, and with one degree of freedom
     #: (Cauchy) their mean delay is unbounded. The value was chosen from 0.4, 1 and 4 (symmetric) on logs from Hong Kong
