@@ -42,7 +42,7 @@ CARRIER_FREQUENCY: Final[dict[str, dict[str, float]]] = {
 #: Spacing of the GLONASS FDMA channels [Hz] by band digit (GLONASS ICD 5.1, 3.3.1.1).
 GLONASS_STEP: Final[dict[str, float]] = {"1": 0.5625e6, "2": 0.4375e6}
 
-#: Clock group by constellation letter. One group, such as GPS and QZSS, has one receiver clock (IS-QZSS-PNT, 3.2.1).
+#: Clock group by constellation letter. The constellations of a group share a receiver clock (IS-QZSS-PNT, 3.2.1).
 CLOCK_GROUP: Final[dict[str, str]] = {"G": "G", "J": "G", "E": "E", "C": "C", "R": "R", "S": "G", "I": "I"}
 
 # Constants that kernels and their callers share.

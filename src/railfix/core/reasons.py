@@ -30,7 +30,7 @@ class Reason(IntFlag):
     UNHEALTHY = 1 << 6
     #: The satellite is below the elevation mask.
     ELEVATION_MASK = 1 << 7
-    #: The satellite is the only usable one of its clock group, so that the range only determines that group's clock.
+    #: The satellite is the only usable one of its clock group, so that its range determines only the group's clock.
     ALONE_ON_ITS_CLOCK = 1 << 8
     #: No group delay of the signal is broadcast, or the satellite is at the horizon.
     NO_CORRECTION = 1 << 9

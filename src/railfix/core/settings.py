@@ -52,7 +52,7 @@ class Checked(BaseModel):
             )
 
         def __delattr__(self, name: str) -> None:
-            raise SettingsError(f"{type(self).__name__} cannot be changed; Config().replaced() keeps all settings")
+            raise SettingsError(f"{type(self).__name__} cannot be changed; replaced() returns a copy with other values")
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Yield the settings that differ from their defaults; some defaults are computed from earlier settings."""

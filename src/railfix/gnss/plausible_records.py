@@ -1,7 +1,7 @@
 """Reject navigation records with an orbit that is implausible for their constellation.
 
 A record with another satellite's orbit, with exchanged coordinates or with unrelated reference times causes range
-errors of hundreds of metres to thousands of kilometres, although it is marked healthy.
+errors of hundreds of metres to thousands of kilometres, although the record is marked healthy.
 """
 
 from __future__ import annotations

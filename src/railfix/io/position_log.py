@@ -98,7 +98,7 @@ def skip_broken(
             if broken_lines == "stop" and error.line != cut:
                 raise InputFileError(path, f"{error.message}; {LENIENT}", line=error.line) from None
             if len(notes) == _MOST_BROKEN:
-                raise InputFileError(path, f"over {_MOST_BROKEN} lines cannot be read; last error: {error}") from None
+                raise InputFileError(path, f"more than {_MOST_BROKEN} lines cannot be read; last: {error}") from None
             notes.append(f"{error}; the line was skipped")
             lines[error.line - 1] = ""
 
@@ -126,7 +126,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     if not geodetic and not cartesian:
         raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)} (to read other columns, give columns, --column latitude_deg=NAME)"
+            f"{', '.join(table.cells)} (for other column names, give columns, --column latitude_deg=NAME)"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
@@ -236,7 +236,9 @@ def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
     for row, cell in enumerate(cells):
         if cell.endswith("Z") or "+" in cell:
             expected = "UTC" if name == "time_utc" else "GPS time without one"
-            hint = "" if name == "time_utc" else f"; for UTC name the column time_utc, or give --column time_utc={name}"
+            hint = (
+                "" if name == "time_utc" else f"; for UTC, name the column time_utc, or give --column time_utc={name}"
+            )
             raise table.error(row, f"{name} '{cell}' has a time zone; {expected} was expected{hint}")
     try:
         return _times([cell or "NaT" for cell in cells])

@@ -97,8 +97,8 @@ class TrainMessage(Message):
     length_cm: Unsigned = 0  #: Train length.
     complete: bool = False  #: Whether the train's integrity is confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
-    #: Number of the newest movement authority that the train has accepted; it acknowledges this authority to the
-    #: ground.
+    #: Number of the newest movement authority that the train has accepted; the message thereby acknowledges the
+    #: authority.
     authority: Unsigned | None = None
     authority_end_cm: Signed | None = None  #: End of the train's movement authority, rounded away from the train.
     interference: SuspectedInterference | None = None  #: Suspected interference; None from trains without this check.

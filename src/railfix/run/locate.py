@@ -208,7 +208,7 @@ def _cause_in_height(above_m: float, of_line_m: float, geoid_m: float) -> str:
     return f"{apart}; check the datum and the unit of the map's heights" if abs(above_m) > _HEIGHT_M else ""
 
 
-#: Advice for a map whose heights were read in the other datum.
+#: Advice for a map whose heights were read in the wrong datum.
 _AS_ORTHOMETRIC: Final = (
     "the heights of the map seem to be above the geoid, not the ellipsoid: give --height-datum orthometric --geoid "
     "egm96, or in a CSV file name their column elevation_m and give --geoid egm96"
@@ -312,7 +312,7 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
 #: Minimum change of gradient or curvature at a feature, in standard deviations.
 _SIGMAS: Final = 5.0
-#: Minimum number of values of which a mean is computed.
+#: Minimum number of values for a mean.
 _LEAST_VALUES: Final = 3
 #: Number of iterations by which `centre_features` centres a window on a change.
 _CENTRED: Final = 5

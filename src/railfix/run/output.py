@@ -142,7 +142,7 @@ def _try_lock(file: IO[str]) -> bool:
 
 #: Rows per row group of a Parquet file; a group is assembled in memory.
 _GROUP: Final = 30_000
-#: Interval at which a waiting caller checks the writer for a failure [s].
+#: Interval at which a waiting caller checks whether the writer has failed [s].
 _LOOK_S: Final = 0.1
 
 

@@ -37,7 +37,7 @@ from railfix.track.network_route import find_route, left_out_note
 _INTERVAL_S: Final = 1.0
 #: Distance along the route within which a track of the route counts as near a position on the route [m].
 _REACH_M: Final = 50.0
-#: Bound of the relative difference between lengths in plan and lengths along the line; `_REACH_M` is increased by this
+#: Bound on the relative difference between lengths in plan and lengths along the line; `_REACH_M` is increased by this
 #: fraction of the length of the route.
 _LENGTHS_DIFFER: Final = 1e-3
 #: Minimum probability at which a track outside the route is written to the table.

@@ -225,7 +225,7 @@ _LAG_S: Final = 0.3
 _OTHER_TEETH: Final = 0.1
 #: Largest time between the satellite positions before and after a range that is compared with them [s].
 _BETWEEN_S: Final = 3.0
-#: Minimum distance between these two satellite positions [m].
+#: Minimum distance between the satellite positions before and after a range [m].
 _MOVED_M: Final = 1.0
 #: Largest distance of a ground unit whose ranges are compared with satellite positions [m].
 _FAR_M: Final = 500.0

@@ -125,7 +125,7 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
 
 #: Distance from the train within which a track is a hypothesis [m].
 _NEAR_M: Final = 60.0
-#: Distance from the train within which the points of such a track are used [m].
+#: Distance from the train within which the points of a hypothesis are used [m].
 _POINTS_M: Final = 400.0
 #: Maximum number of tracks that are hypotheses.
 _MOST_TRACKS: Final = 64

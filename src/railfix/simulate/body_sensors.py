@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _STEP_S: Final = 0.01  #: Spacing of the instants between which the wheel's acceleration is constant [s].
 _LOOK_S: Final = 0.1  #: Time step of the search for phases of acceleration and braking [s].
-_HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in these phases [m/s^2].
+_HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in a phase [m/s^2].
 #: Streams of random numbers: phase and jitter, slips, teeth, lost and doubled pulses.
 _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
@@ -56,7 +56,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # These numbers are drawn for every phase, so that the slips of a phase do not depend on the slips of other
+        # The numbers are drawn for every phase, so that the slips of a phase do not depend on the slips of other
         # phases.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):

@@ -1,4 +1,5 @@
-"""Satellite and atmospheric errors, which are common to all nearby receivers, and the random processes of errors.
+"""Satellite and atmospheric errors, which are common to all nearby receivers, and the random processes that model
+errors.
 
 A Gauss-Markov process is drawn exactly at nodes and interpolated by cubics through four nodes (Catmull and Rom 1974).
 The loss of variance by interpolation (less than 1 %) is compensated on average. The values do not depend on the chunks

@@ -132,7 +132,7 @@ def _length_m(given: dict[str, Any]) -> float:
 
 
 class LineSettings(ScenarioSettings):
-    """Line and spacing of the points of its map."""
+    """Line, and spacing of the points of the track map."""
 
     name: str = "simulated test line"
     #: Source of the line: the pattern of P1's test line, `elements` with `gradients`, `generated`, or `file`.
@@ -200,7 +200,7 @@ class Knots:
 def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
     """Return the knots of a line of given elements and gradients.
 
-    Raise SettingsError if elements that follow each other, or gradients, do not fit together.
+    Raise SettingsError if consecutive elements, or the gradients, do not fit together.
     """
     for k, (element, following) in enumerate(pairwise(elements)):
         both = {element.kind, following.kind}
@@ -392,7 +392,7 @@ def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Fl
 
 
 def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: Floats) -> Knots:
-    """Return the knots of a line from a file: curvature from its radii, else from the spline; cant from the file."""
+    """Return the knots of a line from a file. Curvature is from the file's radii, or else from the spline."""
     bend = (
         np.interp(arc, point, _fill_gaps(point, 1.0 / track.radius_m))
         if (~np.isnan(track.radius_m)).any()

@@ -296,7 +296,7 @@ def antenna_truth(
     return AntennaTruth(ecef_m=place, chainage_m=abeam, forward=forward)
 
 
-FULL_SPEED_MPS: Final = 20.0  #: Speed from which the random motions of the body have their full amplitude [m/s].
+FULL_SPEED_MPS: Final = 20.0  #: Speed above which the random motions of the body have full amplitude [m/s].
 _STEP_S: Final = 0.01  #: Time step for the pitch response to accelerations [s].
 _DAMPING: Final = 0.3  #: Damping ratio of the suspension.
 _MARGIN_S: Final = 2.0  #: Margin before the start and after the end of the run for which pitch is computed [s].

@@ -33,7 +33,7 @@ class CarriedNoise:
     def code(self, white: Floats) -> Floats:
         """Return code noise of standard deviation 1, shape (T, M).
 
-        `white` is the white noise of which the uncorrelated part is formed, shape (T, M).
+        `white` is the white noise from which the uncorrelated part is computed, shape (T, M).
         """
         share = self._settings.code_correlated_share
         if share == 0.0:
@@ -176,7 +176,7 @@ def list_signals(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
 
 
 class Receiver:
-    """M channels of a receiver, each a satellite and signal in alphabetical order, and their state between chunks."""
+    """M channels of a receiver (satellite and signal, in alphabetical order), with the state carried between chunks."""
 
     def __init__(
         self,

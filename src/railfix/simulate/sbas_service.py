@@ -75,13 +75,13 @@ def fast(
 
 
 def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0, 0)) -> Bytes:
-    """Return a type 6 message, integrity, with the UDREI of the first slots; the others are not monitored."""
+    """Return a type 6 message, integrity, with the UDREI of the first slots; the remaining slots are not monitored."""
     grades = list(udrei) + [NOT_MONITORED] * (51 - len(udrei))
     return message(6, second, *((i, 2) for i in iodf), *((g, 4) for g in grades))
 
 
 def factors(second: int, indicator: Sequence[int], *, latency: int = 0) -> Bytes:
-    """Return a type 7 message with the fast-correction degradation indicators of the first slots; 0 for the others."""
+    """Return a type 7 message with the fast-correction degradation indicators of the first slots, then 0."""
     values = list(indicator) + [0] * (51 - len(indicator))
     return message(7, second, (latency, 4), (0, 4), *((v, 4) for v in values))
 
@@ -143,7 +143,7 @@ def grid_delay(
 
 #: Numbers per message: slots in types 2 to 5, satellites in type 25, and grid points in type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-#: Number of slots in message type 24, which replaces the last fast message if at most this many slots remain.
+#: Number of slots in message type 24. This type replaces the last fast message if at most this many slots remain.
 _MIXED: Final = 6
 #: Largest fast correction, orbit correction and grid delay that the fields can represent [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75

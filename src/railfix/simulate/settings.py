@@ -408,5 +408,5 @@ class SbasSettings(ScenarioSettings):
     alert_m: Positive = 10.0  #: Range error of a faulty satellite above which the satellite is set to "do not use".
     alert_s: NotNegative = 6.0  #: Time from the fault to its "do not use" alert.
     lost_chance: Share = 0.0  #: Probability that a message is not received.
-    #: Time by which the messages begin before the run, so that all corrections are available at its start.
+    #: Time by which the messages begin before the run, so that all corrections are available when the run starts.
     lead_s: NotNegative = 300.0

@@ -47,7 +47,7 @@ class Lookup:
     #: shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: The same with the start of use, which is half-way between the previous record's and its own reference time; (n,).
+    #: The same with the start of use, half-way between the reference times of the previous and this record; (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -57,7 +57,7 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return the record for each satellite and time, whether it is valid, and whether it is future; shapes (M, T).
+        """Return, for each satellite and time, a record, its validity, and whether it was sent later; shapes (M, T).
 
         The record is a row of the record table; -1 for a satellite without records. The record is valid if its toe
         differs from the epoch by at most `limit`, which has one value per row of the table.

@@ -56,7 +56,7 @@ class Unfinished:
 
     #: Fields of the latest subframe by satellite and subframe number.
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
-    #: Issue of the last record by satellite and message, which identifies repetitions.
+    #: Issue of the last record by satellite and message; a record with the same issue is a repetition.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     #: For each GLONASS satellite with all four strings, the first epoch after the last string; NaT if not yet received.
     #: The strings may be from different frames.
@@ -316,9 +316,9 @@ class _EphemerisBuilder:
             return None
         if self.needs_date(satellite, time):
             return None
-        # All strings are of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1
-        # may have come before the receiver's first epoch, so that its time of reception is unknown; where epochs are
-        # lost or rare, the first epoch after all strings shows that no later frame can have begun.
+        # All strings belong to one frame, which begins at the time t_k in string 1; one string is sent every 2 s.
+        # String 1 may have come before the receiver's first epoch, so that its time of reception is unknown; where
+        # epochs are lost or rare, the first epoch after all strings shows that no later frame can have begun.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")

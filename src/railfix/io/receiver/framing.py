@@ -26,7 +26,7 @@ _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 #: valid.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
-#: Value of each byte as a hexadecimal digit, 255 for others.
+#: Value of each byte as a hexadecimal digit; 255 for bytes that are no such digit.
 _HEX: Final = np.full(256, 255)
 _HEX[np.frombuffer(b"0123456789ABCDEFabcdef", np.uint8)] = [*range(16), *range(10, 16)]
 

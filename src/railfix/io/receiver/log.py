@@ -49,7 +49,7 @@ _BLOCK: Final = 24  #: Bytes of each MON-RF block of u-blox, after a header of f
 _BANDS, _FRONT_ENDS = 12, 24  #: Offsets of Septentrio's first band block and first front-end block in the payload.
 _NO_GAIN: Final = -128
 _EVENT: Final = 8  #: Bytes of each event in u-blox SEC-SIGLOG.
-_TRIGGERED_S: Final = 10  #: Time for which a SEC-SIGLOG event of a single trigger sets the alarm [s].
+_TRIGGERED_S: Final = 10  #: Time for which a single-trigger event of SEC-SIGLOG sets the alarm [s].
 _SIMULATED: Final = 0  #: SEC-SIGLOG detection type of simulated signals, the only type that sets an alarm.
 
 

@@ -48,7 +48,7 @@ _LAYOUT: Final = {
     7: (20, 2.0**-29, 24, 2.0**-31, 10, 10, 0.0625, True),
 }
 MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
-#: Name of the count of messages whose week cannot be resolved.
+#: Name under which messages whose week cannot be resolved are counted.
 UNDATED: Final = "RTCM 3 observations without a date"
 IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
 _BEIDOU_LATE_S: Final = 14  #: GPS time minus BeiDou time [s].

@@ -51,8 +51,8 @@ BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
-#: Constellation of each block with navigation pages, and UBX signal number by SBF signal number. None in place of the
-#: signal numbers means 0 for all signals.
+#: Constellation of each block with navigation pages, and UBX signal number by SBF signal number. If None replaces the
+#: signal numbers, the UBX number of all signals is 0.
 _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GPS_RAW_CA: ("G", None),
     QZS_RAW_L1CA: ("J", None),

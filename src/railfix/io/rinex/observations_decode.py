@@ -2,8 +2,8 @@
 
 A field of sixteen characters is held in two 64-bit words. Eight digits in one word are converted to their value by
 three multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
-doi:10.1145/360933.360994). The exact integer of thousandths divided by 1000 is the same as ``float(text)``. Fields of
-other forms are read singly with `float`.
+doi:10.1145/360933.360994). The exact integer of thousandths divided by 1000 equals ``float(text)``. Fields of other
+forms are read one by one with `float`.
 """
 
 from __future__ import annotations

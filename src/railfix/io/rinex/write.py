@@ -73,7 +73,7 @@ def _hatanaka(path: FilePath, sink: IO[bytes]) -> Iterator[IO[bytes]]:
             yield stream
             stream.close()
         except BrokenPipeError:
-            pass  # the program ended early: its exit code and messages are checked below
+            pass  # the program has ended early; the exit code and the messages are checked below
         except BaseException:
             process.kill()
             raise

@@ -102,7 +102,7 @@ def _triangle(x: Singles) -> Singles:
 
 
 def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spacing: float) -> Singles:
-    """Return the zero of the discriminator in chips from the main path, whose amplitude is 1 and delay `late` 0."""
+    """Return the zero of the discriminator [chips] relative to the main path, with amplitude 1 and a `late` of 0."""
     half = 0.5 * spacing
     error = np.zeros(real.shape[1], dtype=np.float32)
     own = (1.0 - follow) * (real**2 + imaginary**2)

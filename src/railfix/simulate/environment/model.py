@@ -60,8 +60,8 @@ class Conductor:
     ray_p: Floats  #: Component p of the unit vector to the satellite, shape (N,).
     ray_q: Floats  #: Component q of the unit vector to the satellite, shape (N,).
     ray_axis: Floats  #: Component of the unit vector to the satellite along the conductor, shape (N,).
-    low_m: Floats | float  #: Lower end of the conductor along its axis, from the antenna.
-    high_m: Floats | float  #: Upper end of the conductor along its axis, from the antenna.
+    low_m: Floats | float  #: Coordinate of the lower end along the axis of the conductor.
+    high_m: Floats | float  #: Coordinate of the upper end along the axis of the conductor.
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:

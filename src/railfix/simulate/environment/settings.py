@@ -47,7 +47,7 @@ class ElectrificationSettings(ScenarioSettings):
     """Masts, beams across the tracks, and wires above the track."""
 
     spacing_m: Positive = 50.0  #: Spacing of the masts.
-    first_m: Finite = 10.0  #: Chainage of one mast; the other masts are at multiples of the spacing from it.
+    first_m: Finite = 10.0  #: Chainage of one mast; the other masts are at multiples of the spacing from this mast.
 
     sides: Sides = "both"  #: Sides of the line with masts.
     lateral_m: Positive = 3.0  #: Distance of the axis of a mast from the track axis.
