@@ -1,6 +1,7 @@
 """Coordinate reference systems of maps, their relation to the ITRF, and PROJ operations between them.
 
-Definitions are from the EPSG dataset (https://epsg.org). Motions relative to a plate are used only in notes.
+Definitions are from the EPSG dataset (https://epsg.org). The motions of countries relative to their plates appear only
+in notes to the user.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class HeldFrame:
     plate: str  #: Plate of the ITRF2020 plate motion model on which most of the country lies.
     #: Smallest and largest motion of the country relative to the plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: Clause for the note to the user, on other motions that are neglected.
+    but: str = ""  #: Clause on further neglected motions, for the note to the user.
     #: Second plate of the country, and two points (latitude, longitude) on the border between both plates. Seen from
     #: the first point to the second, the second plate is on the right.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
@@ -73,14 +74,14 @@ class HeldFrame:
         return other if cross < 0.0 else self.plate
 
     def describe_rest(self, years: float) -> str:
-        """Return a clause with the motion relative to the plate that is neglected over a number of years."""
+        """Return a clause that states the neglected motion relative to the plate over a number of years."""
         low, high = (abs(years) * rate / 1000.0 for rate in self.rest_mm)
         but = f", {self.but}" if self.but else ""
         return f"its motion relative to the plate, {low:.2f} to {high:.2f} m, is left out{but}"
 
 
 _ANDES: Final = "as are earthquakes, metres in Chile since 2010"
-#: National frames that are a realisation of the ITRF fixed at an epoch, and whose motion PROJ does not model.
+#: National frames that are ITRF realisations fixed at an epoch. PROJ does not model the motion since that epoch.
 HELD: Final = {
     "JGD2011": HeldFrame(
         "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "as is the epoch 1997.0 of western Japan (--map-epoch 1997)"
@@ -136,7 +137,7 @@ HELD: Final = {
     "Mexico ITRF2008": HeldFrame("ITRF2008", 2010.0, "NOAM", (0.0, 50.0)),
     "RGSPM06": HeldFrame("ITRF2000", 2006.0, "NOAM"),
 }
-#: Frames that are treated as another frame, with the EPSG code of the other frame and a clause on the agreement.
+#: Frames that are treated as another frame: EPSG code of this other frame, and clause on how well both frames agree.
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
@@ -153,8 +154,8 @@ SAME: Final = {
 TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later realisations.
 #: Frame in which positions are computed: the three-dimensional geographic CRS of ITRF2020.
 WORKING_FRAME: Final = "EPSG:9989"
-#: EPSG codes of the three-dimensional CRS of frames in which the maps of a region usually are. If the areas of several
-#: frames contain a point, the first of these frames is the most likely one.
+#: Frames in which the maps of their region usually are, with the EPSG code of the three-dimensional CRS. Where the
+#: areas of several frames overlap, the frame that is listed first is the most likely one.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
@@ -169,7 +170,7 @@ MODERN_M: Final = 0.5
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
 #: Worst accuracy of an operation that is used [m]; 999 in the EPSG dataset means unknown.
 WORST_M: Final = 100.0
-#: Parts of a PROJ operation's name that do not change the datum.
+#: Beginnings of the names of those steps of a PROJ operation that do not change the datum.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
 Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
@@ -215,8 +216,9 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
     """Return the CRS of a file, from the user (`given`) or from the file (`named`); None if neither states a CRS.
 
-    If both state the same CRS, and the user's is a compound CRS, that one is returned, because it has a height datum.
-    Raise SettingsError if the two CRS contradict each other, or a CRS is unknown.
+    If both state the same horizontal CRS, the CRS of the file is returned. If the user's CRS is a compound CRS, it is
+    returned instead, because it also has a height datum. Raise SettingsError if the two CRS contradict each other, or a
+    CRS is unknown.
     """
     if given is None or named is None:
         used = given or named
@@ -286,7 +288,9 @@ class Operations:
     lacking: tuple[Any, ...] = ()  #: Operations whose grids are not installed.
 
     def describe_lacking(self, crs: str | None = None) -> str:
-        """Return a clause on the best operation whose grid is not installed, and how to get the grid; "" if none.
+        """Return a clause that names the best operation whose grid is not installed, and states how to get the grid.
+
+        The clause is empty if there is no such operation.
 
         An operation whose grids can be downloaded by projsync is preferred. Among equal operations, the most accurate
         is the best.
@@ -312,7 +316,7 @@ def _is_served(operation: Any) -> bool:
 
 
 def name_operation(description: str, crs: str | None = None) -> str:
-    """Return the name of a PROJ operation from a CRS, without the steps that do not change the datum."""
+    """Return the name of a PROJ operation without the steps that do not change the datum; `crs` is the source CRS."""
     system = None if crs is None else find_crs(crs).to_2d()
     conversion = None if system is None else system.coordinate_operation
     left_out = (*_NO_DATUM_CHANGE, *([f"Inverse of {conversion.name}"] if conversion is not None else []))
@@ -331,7 +335,8 @@ def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operati
         warnings.simplefilter("ignore", UserWarning)  # the result lists missing grids
         try:
             group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
-        except (ProjError, IndexError):  # IndexError: pyproj cannot construct an operation known at a single epoch
+        # pyproj raises IndexError for an operation that PROJ knows only at a single epoch
+        except (ProjError, IndexError):
             return Operations(usable=())
     if box is None:
         return Operations(usable=tuple(group.transformers), lacking=tuple(group.unavailable_operations))

@@ -20,14 +20,15 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest difference between the middle ordinate of a chord from the map's radius and the middle ordinate from
-#: neighbouring points [m]. With a larger difference, the radius is not used: it belongs to another point, or has the
-#: wrong sign.
+#: Largest difference between two values of a chord's middle ordinate, one from the map's radius and one from
+#: neighbouring points [m]. If the difference is larger, the radius is not used, because it belongs to another point or
+#: has the wrong sign.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Change of direction above which a point is a corner, which the curve does not round [rad].
-#: Minimum distance of a ramp's end from either point, as a fraction of the distance between both points.
+#: Minimum distance of a ramp's end from the points before and after it, as a fraction of the distance between these
+#: points.
 _BREAK_SHARE: Final = 1e-3
-#: Minimum difference between the lines before and after a ramp's end, over the distance between both points.
+#: Minimum change of slope at a ramp's end, times the distance between the points before and after it.
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `curved_line` [m].
 
@@ -113,7 +114,9 @@ def _to_ends(inner: Floats) -> Floats:
 
 
 def _with_radii(track: Track, of_points: Floats) -> Floats:
-    """Return the curvature at each point, from the map where it agrees with the points, otherwise from the points."""
+    """Return the curvature at each point: from the map's radius where it agrees with the points, otherwise from the
+    points.
+    """
     with np.errstate(divide="ignore"):
         of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
     around = np.stack([np.roll(of_points, 1), of_points, np.roll(of_points, -1)])
@@ -143,7 +146,7 @@ def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Return a piecewise linear function with additional points at those ends of ramps that lie between points.
 
     A ramp ends between two points if the line through the two points before the end and the line through the two points
-    after it intersect there. Chainages `place_m` and `values` have shape (V,).
+    after the end intersect at this end. Chainages `place_m` and `values` have shape (V,).
     """
     if len(place_m) < 4:
         return place_m, values

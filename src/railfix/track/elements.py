@@ -25,8 +25,8 @@ from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 from railfix.track.transitions import OrdinateElement
 
-#: For each law, the fraction of the change of curvature or cant that is reached at the fraction t of the length, and
-#: the integral of this function from 0 to t (IFC 4.3.2).
+#: Laws by which curvature or cant changes along an element (IFC 4.3.2), two functions each. The first is the fraction
+#: of the change that is reached at the fraction t of the length. The second is the integral of the first from 0 to t.
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     "linear": (lambda t: t, lambda t: t**2 / 2.0),
     "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
@@ -57,7 +57,7 @@ _JOINT_M: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class PlanElement:
-    """Element in plan with a curvature that follows a law over the length of the element."""
+    """Element of the horizontal alignment; `law` states how the curvature changes along the element."""
 
     x_m: float  #: Easting of the first point.
     y_m: float  #: Northing of the first point.
@@ -100,7 +100,7 @@ class PlanElement:
         return np.stack([(half * _WEIGHTS * part(direction)).sum(axis=1) for part in (np.cos, np.sin)], axis=-1)
 
 
-#: Element in plan, defined by a law of the curvature, or by ordinates over the tangent.
+#: Element in plan, defined by a law of the curvature or by offsets from the tangent.
 Plan = PlanElement | OrdinateElement
 
 
@@ -108,8 +108,8 @@ Plan = PlanElement | OrdinateElement
 class Stations:
     """Stations (kilometrage) of an alignment, which may jump at station equations."""
 
-    #: A row for the start and for each jump, in rising order [m]: distance in plan from the start of the alignment,
-    #: station just before this point, and station just after it.
+    #: One row for the start and one for each jump, in order of distance [m]. A row has the distance in plan from the
+    #: start of the alignment, the station just before the jump, and the station just after the jump.
     rows: tuple[tuple[float, float, float], ...]
     last_sign: float = 1.0  #: 1 if the stations rise after the last row, -1 if they fall.
     jump_m: float = 0.05  #: Half length of the interval within which the kilometrage jumps.
@@ -186,7 +186,7 @@ class ProfileElement:
 
 @dataclass(frozen=True, kw_only=True)
 class CantElement:
-    """Element of the cant; the heights of both rails follow a law over the length of the element."""
+    """Element of the cant; `law` states how the heights of both rails change along the element."""
 
     start_m: float  #: Distance in plan from the start of the alignment to the start of the element.
     length_m: float  #: Length of the element in plan.
@@ -222,8 +222,8 @@ def alignment_at(
 ) -> AlignmentPoints:
     """Compute the points of an alignment at distances in plan, shape (n,) [m].
 
-    Each position is computed from the first point of the element, so that the errors of joints that do not meet do not
-    add up.
+    Each position is computed from the first point of the element, so that gaps between successive elements do not add
+    up.
     """
     starts = plan_starts(plan)
     xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
@@ -268,7 +268,7 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Compute points of an alignment, and a note on joints that do not meet.
+    """Compute points of an alignment, and a note on successive elements that do not meet.
 
     The chords between the points are within 1 cm of the alignment.
 
@@ -290,11 +290,15 @@ def alignment_points(
         for before, after in pairwise(plan)
     ]
     wide = [gap for gap in gaps if gap > _JOINT_M]
-    notes = (f"{len(wide)} of {len(gaps)} joints in plan do not meet, the widest by {max(wide):.3f} m",) if wide else ()
+    notes = (
+        (f"{len(wide)} of {len(gaps)} successive pairs of elements do not meet, widest gap {max(wide):.3f} m",)
+        if wide
+        else ()
+    )
     return alignment_at(place, plan, profile, cant), notes
 
 
-#: Largest length of an alignment beyond the ends of its profile, where the gradient is continued [m].
+#: Largest accepted length of an alignment beyond the ends of its profile [m]. There, the gradient is continued.
 _PROFILE_BEYOND_M: Final = 50.0
 
 
@@ -328,7 +332,7 @@ def segment_of_design(
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
     crs = reading.crs
     if crs is None:
-        raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give crs (--crs)")
+        raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; specify crs (--crs)")
     points, joints = alignment_points(plan, profile, design.cant, at_m=() if stations is None else stations.places_m)
     xy, up, scale = points.xy_m, 0.0, 1.0
     unit = unit_of_grid(crs, path=path)
@@ -342,7 +346,7 @@ def segment_of_design(
     xy /= unit
     curvature = points.curvature
     if grid is None and is_within(crs, xy[:, ::-1]) and not is_within(crs, xy):
-        # to exchange easting and northing mirrors the plane, so that left curves become right curves
+        # exchanging easting and northing mirrors the plane, so that left curves become right curves
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
     source, heights = f"{path} ({name})", None
@@ -404,7 +408,7 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
     """Return the sign of the curvature at each point or, on straight track, of the nearest curve, shape (n,).
 
-    A cant ramp can begin on straight track. Without any curve, the sign is 1.
+    The nearest curve is used because a cant ramp can begin on straight track. Without any curve, the sign is 1.
     """
     if not bent.any():
         return np.ones(len(curvature))

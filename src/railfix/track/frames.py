@@ -1,9 +1,8 @@
 """Reference frames of track maps, and transformation of maps to the frame of the satellites.
 
 Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation within centimetres. Maps are in a plate-fixed
-frame, or in an ITRF realisation at the epoch of the survey. PROJ transforms coordinates given at an epoch. Where PROJ
-has no transformation, the ITRF2020 plate motion model (Altamimi et al. 2023, doi:10.1029/2023GL106373) is used, with a
-note.
+frame, or in an ITRF realisation at the epoch of the survey. Maps are transformed with PROJ. Where PROJ has no
+transformation, the ITRF2020 plate motion model (Altamimi et al. 2023, doi:10.1029/2023GL106373) is used, with a note.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class FrameShift:
     """Description of the transformation of a map to the frame of the satellites."""
 
     frame: str  #: Name of the map's frame.
-    used: str  #: Frame and epoch of the transformed map, and of the positions computed with it.
+    used: str  #: Frame and epoch of the transformed map, and of positions computed with this map.
     method: str  #: Description of the transformation.
     #: Shift at the middle point of the line.
     east_m: float = 0.0
@@ -53,7 +52,7 @@ class FrameShift:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Notes to the user on the transformation, with the shift in plan if it is not zero."""
+        """Notes to the user on the transformation, including the shift in plan if the shift is not zero."""
         size = float(np.hypot(self.east_m, self.north_m))
         moved = (
             f"map: {self.frame} moved by {size:.2f} m (east {self.east_m:+.2f}, north {self.north_m:+.2f}) to "
@@ -184,7 +183,10 @@ def in_map_frame(
 def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return ITRF coordinates transformed to ITRF2020 at the epoch of the log, with a description and notes."""
+    """Transform ITRF coordinates to ITRF2020 at the epoch of the log.
+
+    Return the coordinates, a description of the transformation, and notes.
+    """
     name = get_geodetic_frame(crs).name
     moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
@@ -207,8 +209,10 @@ def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
 def _from_held(
     ecef_m: Floats, name: str, held: HeldFrame, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Return coordinates of a frame fixed at an ITRF epoch, moved to `year` with the plate on which the middle point
-    lies.
+    """Move coordinates of a frame fixed at an ITRF epoch to `year`.
+
+    By default, they move with the plate on which the middle point lies. Return the coordinates, a description, and
+    notes.
     """
     since = epoch or held.epoch
     latitude, longitude, _ = geodetic_from_ecef(ecef_m[len(ecef_m) // 2])
@@ -264,14 +268,16 @@ def _by_parameters(
 
 
 def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
-    """Return coordinates moved with a plate by a number of years (ITRF2020 plate motion model)."""
+    """Move coordinates with a plate over a number of years (ITRF2020 plate motion model)."""
     motion = Transformer.from_pipeline(f"+proj=pipeline +step +init=ITRF2020:{plate} +t_epoch=0")
     x, y, z, _ = motion.transform(ecef_m[:, 0], ecef_m[:, 1], ecef_m[:, 2], np.full(len(ecef_m), years))
     return np.stack([x, y, z], axis=-1)
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """Return a note on the error at a point if a map without a named reference frame is not in WGS 84."""
+    """Return a note that WGS 84 is assumed, with the displacement of a point if the map is in a frame of its region
+    instead.
+    """
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():

@@ -10,8 +10,8 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.geodesy import enu_axes
 from railfix.track.track import Track
 
-#: Length over which the curvature from the points and the curvature from the map's radius are averaged for comparison
-#: [m].
+#: Length over which the curvature from the points and the curvature from the map's radius are averaged before they are
+#: compared [m].
 _BEND_WINDOW_M = 40.0
 
 
@@ -81,7 +81,7 @@ def _scatter(values: Floats, places: Integers, size: int) -> Floats:
 
 
 def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
-    """Compute the steps between points east and north, shape (n, 2), and their height differences, shape (n,) [m]."""
+    """Compute the steps east and north between points, shape (n, 2), and the height differences, shape (n,) [m]."""
     latitude, longitude = track.latitude_deg[kept], track.longitude_deg[kept]
     half_step = ((np.diff(longitude) + 180.0) % 360.0 - 180.0) / 2.0  # also across the date line
     axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, longitude[:-1] + half_step)
@@ -90,7 +90,7 @@ def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
 
 
 def _turns(plan: Floats) -> tuple[Floats, Floats]:
-    """Compute the turns to the right between successive steps [rad], and the mean lengths [m], shape (n - 1,) each."""
+    """Compute turns to the right between successive steps [rad], and mean lengths of both [m], shape (n - 1,) each."""
     cross = plan[:-1, 1] * plan[1:, 0] - plan[:-1, 0] * plan[1:, 1]
     dot = np.einsum("ni,ni->n", plan[:-1], plan[1:])
     length = np.hypot(plan[:, 0], plan[:, 1])

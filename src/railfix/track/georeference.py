@@ -1,4 +1,4 @@
-"""Transformation of map coordinates to latitude and longitude in a modern frame, with the accuracy.
+"""Transformation of map coordinates to latitude and longitude in a modern frame, and accuracy of the transformation.
 
 An operation of PROJ (https://proj.org) is used only if its area of use contains the map and its grids are installed.
 Ballpark operations, which do not change the datum, are not used.
@@ -52,7 +52,7 @@ _BETTER: Final = 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Georeference:
-    """Coordinates of n points of a map in a modern frame, and their transformation."""
+    """Coordinates of n points of a map in a modern frame, and the transformation to this frame."""
 
     latitude_deg: Floats  #: Latitude, shape (n,).
     longitude_deg: Floats  #: Longitude, shape (n,).
@@ -69,7 +69,7 @@ class Georeference:
 
 @dataclass(frozen=True, kw_only=True)
 class EllipsoidalHeights:
-    """Ellipsoidal heights of n points of a map, and their transformation."""
+    """Ellipsoidal heights of n points of a map, and the conversion that was applied to the heights of the file."""
 
     height_m: Floats  #: Ellipsoidal height, shape (n,).
     datum: str  #: Height datum of the file, "ellipsoidal" or "orthometric".
@@ -231,8 +231,8 @@ def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
     """Return the accuracy of the first operation [m], as stated by PROJ or implied by the other operations.
 
     If the results of the first operation and of another operation differ by more than the accuracy of the other
-    operation, the first operation may be wrong by the excess. The result is NaN if PROJ states no accuracy of the first
-    operation.
+    operation, the first operation may be wrong by the excess. The result is NaN if PROJ states no accuracy for the
+    first operation.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -286,7 +286,7 @@ def _bounds(crs: str) -> Box:
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
     """Raise InputFileError if lengths in the grid and on the ground differ.
 
-    The coordinates are then coordinates of another grid.
+    A difference shows that the coordinates belong to another grid.
     """
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
@@ -306,7 +306,7 @@ def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, p
 
 @lru_cache(maxsize=32)
 def _to_datum(crs: str) -> tuple[Transformer, float, float]:
-    """Return the conversion of a CRS to coordinates on its datum, and the angular unit and prime meridian of these
+    """Return the conversion of a CRS to latitude and longitude on its datum, with their angular unit and prime meridian
     [deg].
     """
     system, datum = find_crs(crs), CRS.from_user_input(_find_frame(crs)).to_2d()

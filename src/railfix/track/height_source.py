@@ -25,7 +25,8 @@ from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 from railfix.track.trajectory import NearestOnPolyline
 
-#: File name endings of rasters, which GDAL reads: GeoTIFF, ESRI ASCII grid with a .prj file, SRTM, DTED and others.
+#: File name endings of rasters, which are read with GDAL: GeoTIFF, ESRI ASCII grid with a .prj file, SRTM, DTED and
+#: others.
 RASTERS: Final = (
     ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
 )  # fmt: skip
@@ -46,7 +47,10 @@ _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError that names all missing options for a raster, or InputFileError for another file."""
+    """Raise SettingsError if options for a raster are missing; the message names all of them.
+
+    Raise InputFileError if the raster cannot be read or has no CRS.
+    """
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []
@@ -70,8 +74,8 @@ def with_heights(
 ) -> Track:
     """Return the track with heights from a source, and with their standard deviation.
 
-    The source is a raster (`RASTERS`), which requires `height_datum` and `sigma_m`, a CSV table by chainage or
-    kilometrage, or a position log. Points are added so that heights are at most 50 m apart. Raise InputFileError if the
+    The source is a raster (`RASTERS`), a CSV table by chainage or kilometrage, or a position log. A raster requires
+    `height_datum` and `sigma_m`. Points are added so that heights are at most 50 m apart. Raise InputFileError if the
     source lacks heights for a part of the line.
     """
     track = _dense(track)
@@ -88,7 +92,7 @@ def with_heights(
 
 
 def _dense(track: Track) -> Track:
-    """Return the track with points at most `_SPACING_M` apart, so that distant points get heights in between."""
+    """Return the track with points at most `_SPACING_M` apart, to have heights also between distant points."""
     pieces = np.ceil(np.diff(track.chainage_m) / _SPACING_M).astype(np.intp)
     if not (pieces > 1).any():
         return track
@@ -254,7 +258,7 @@ def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, rea
 
 
 def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
-    """Return heights at the chainages `target` from locally weighted straight lines; NaN without positions there."""
+    """Return heights at chainages `target` from locally weighted straight lines; NaN where there are no positions."""
     fitted = np.full(len(target), np.nan)
     bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
     for k, (low, high) in enumerate(bounds.tolist()):

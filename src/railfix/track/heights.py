@@ -21,7 +21,8 @@ from railfix.track.crs import find_operations, get_vertical_datum, known_accurac
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
 from railfix.track.route import MapReading
 
-#: Names of the geoid models of the GSI of Japan: GSIGEO2011 for heights levelled before April 2025, JPGEO2024 since.
+#: Geoid models of Japan (GSI) by the names that users give: GSIGEO2011 for heights levelled before April 2025,
+#: JPGEO2024 for later heights.
 JAPAN_MODELS: Final = {
     "japan": "JPGEO2024",
     "jpgeo2024": "JPGEO2024",
@@ -33,7 +34,7 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
-#: Standard deviation of the Japanese models [m], stated by the GSI from GNSS and levelling.
+#: Standard deviation of the Japanese models [m], which the GSI states from a comparison of GNSS with levelling.
 _JAPAN_M: Final = 0.02
 GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Accepted geoids.
 #: End of messages on orthometric heights without a geoid.
@@ -140,7 +141,7 @@ def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
     if not operations.usable:
         why = operations.describe_lacking() or "there is no operation of PROJ"
         raise SettingsError(
-            f"the heights are {vertical.name}, for which PROJ has no installed operation there: {why}; "
+            f"the heights are {vertical.name}, for which PROJ has no installed operation at this location: {why}; "
             "or give the grid file itself (--geoid)"
         )
     best = operations.usable[0]
@@ -258,7 +259,7 @@ def ellipsoidal_heights(
         return EllipsoidalHeights(
             height_m=heights_m,
             datum=datum,
-            notes=("map: its heights are taken as heights above the ellipsoid of WGS 84",) if place.operation else (),
+            notes=("map: the heights are taken as heights above the ellipsoid of WGS 84",) if place.operation else (),
         )
     if geoid_m is not None:
         if geoid is not None:

@@ -244,8 +244,9 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return the references of the placements from an object up to the project; raise InputFileError if one is not
-    local.
+    """Return the references of the placements from an object up to the project.
+
+    Raise InputFileError if a placement is not local.
     """
     found: list[Any] = []
     while reference is not None and reference not in found:
@@ -260,10 +261,10 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 
 
 def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
-    """Return the elements, with cubic parabolas converted to ordinates over the tangent.
+    """Return the elements, with cubic parabolas converted to offsets from the tangent.
 
-    By default a parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``). The form with the projected length, or the
-    form with the Japanese correction, is used if its end is nearer to the start of the next element.
+    By default a parabola has the form of IFC 4.3 (``y = x^3 / (6 R L)``). The form with the length on the tangent, or
+    the form with the Japanese correction, is used if the parabola then ends nearer to the start of the next element.
     """
     result: list[Plan] = []
     for element, after in zip(plan, [*plan[1:], None], strict=True):
@@ -335,7 +336,7 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
 
 
 def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
-    """Return the elements in plan, with `lean_m` of each Viennese bend from the change of cant over the bend.
+    """Return the elements in plan, with `lean_m` of each Viennese bend computed from the change of cant over the bend.
 
     `leans` has, for each element, the height of the centre of gravity divided by the gauge.
     """

@@ -32,13 +32,13 @@ _UNITS: Final = {
     "inch": 0.0254,
     "mile": 1609.344,
 }
-#: Transitions given by ordinates over the tangent (`railfix.track.transitions`). All cubic types, with and without the
-#: Japanese correction, are treated equally, because the End of a spiral determines the ordinate.
+#: Transition curves defined by their offsets from the tangent (`railfix.track.transitions`). All cubic types, with and
+#: without the Japanese correction, are treated equally, because the `End` point of a spiral determines the offset.
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
-#: Laws of curvature of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve; the
-#: curvature consists of two parabolas.
+#: Laws of curvature of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve, the
+#: curvature of which consists of two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
     "bloss": "bloss",
@@ -175,8 +175,8 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             orders = ("northing first", "easting first")
             raise InputFileError(
                 path,
-                f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the opposite side "
-                f"of the attribute rot; with {orders[1 - chosen]} it is the other way round; correct their order",
+                f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the side opposite "
+                f"to their attribute rot; with {orders[1 - chosen]} it is the other way round; correct the order",
             )
     else:
         chosen = int(broken[1] < broken[0])
@@ -241,7 +241,9 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
 def _read_ordinates(
     path: str, shape: Shape, points: tuple[Floats, Floats, Floats], curvature: tuple[float, float]
 ) -> OrdinateElement:
-    """Create a transition, defined by ordinates, from start to end; the tangent at the straight end points to the PI.
+    """Create a transition that is defined by offsets from the tangent.
+
+    `points` are the start, the PI and the end; the tangent at the straight end points to the PI.
 
     Raise InputFileError unless exactly one end is straight and the curvature matches the stated radius.
     """

@@ -22,19 +22,21 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
 #: Note in every map made from positions.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
-_TURN: Final = -0.5  #: Cosine of the change of direction beyond which the path reverses (120 degrees).
+_TURN: Final = -0.5  #: Cosine of the change of direction beyond which the path counts as reversed (120 degrees).
 #: First limit of the distance between a position and the straight line between its neighbours [m]. An outlier exceeds
 #: this limit and the two following limits.
 _BESIDE_M: Final = 5.0
 _BESIDE_MEDIANS: Final = 6.0  #: Second limit, as a multiple of the median distance.
-_LEAST_RADIUS_M: Final = 150.0  #: Radius of a curve, whose ordinate between the neighbours is the third limit [m].
+#: Radius [m]; the third limit is the middle ordinate of a curve with this radius between the neighbours.
+_LEAST_RADIUS_M: Final = 150.0
 _ROUNDS: Final = 20  #: Largest number of searches for outliers; each search leaves out the outliers found before.
 _ENOUGH: Final = 10  #: Minimum number of positions for a search.
-_ACCELERATION_MPS2: Final = 2.0  #: Acceleration of the train that is tolerated in the deviation along the line.
+#: Largest acceleration of the train; the deviation along the line that it explains is subtracted.
+_ACCELERATION_MPS2: Final = 2.0
 #: The path between the neighbours of a position counts as straight if both neighbours are within this time [s].
 _NEAR_S: Final = 2.5
 #: The path also counts as straight if its directions before and after the position are parallel to the line between the
-#: neighbours; this is the smallest cosine of the angles.
+#: neighbours. The value is the smallest cosine of the angles between these directions and the line.
 _STRAIGHT: Final = 0.87
 #: Half length of the window over which the displacement is computed to detect standstill [s].
 _STANDING_WINDOW_S: Final = 3.0
@@ -171,7 +173,7 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
     """Return a mask of the positions off the straight line between their neighbours, shape (n,).
 
-    The farthest positions are removed first, because the lines of their neighbours pass through them.
+    The farthest positions are removed first, because they displace the straight lines at the adjacent positions.
     """
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
@@ -204,8 +206,9 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 def _goes_on(points: Floats, direction: Floats) -> Masks:
     """Return a mask of the inner points at which the path is straight, given the `direction` between both neighbours.
 
-    Before a point, the path from one or from two points earlier to the previous neighbour must have this direction, and
-    likewise after the point. One of the two may differ, because a position may be an outlier.
+    Before a point, the step to the previous neighbour must have this direction, either from the point before this
+    neighbour or from the point before that. After the point, the same applies to the steps from the next neighbour. One
+    of the two steps may differ, because a position may be an outlier.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -219,7 +222,9 @@ def _goes_on(points: Floats, direction: Floats) -> Masks:
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Return the mask of stationary rows, extended by movements between standstills that remain within the spacing."""
+    """Return the mask of stationary rows, extended by the movements between standstills that are shorter than the
+    spacing.
+    """
     if not stands.any():
         return stands
     edges = np.flatnonzero(np.diff(stands)) + 1
@@ -343,7 +348,7 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     """Return a mask of the rows of a log within the limits of quality and standard deviation.
 
     By default RTK fixed positions (quality 1) are used, or all positions of a log without a quality column. Raise
-    InputFileError if the log lacks the column of a limit, NoPositionError if no position has the quality.
+    InputFileError if the log lacks the column of a limit, and NoPositionError if no position has an accepted quality.
     """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
@@ -400,7 +405,7 @@ def from_position_log(
     limits: ThinningLimits | None = None,
     name: str | None = None,
 ) -> tuple[Track, Thinned]:
-    """Create a track from the accurate positions of a log; return also the selection of rows.
+    """Create a track from the accurate positions of a log; return the track and the selection of rows.
 
     Raise NoPositionError if fewer than two points are left. Raise InputFileError if times decrease, the log lacks the
     column of a limit, or a gap is too long.

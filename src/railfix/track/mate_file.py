@@ -2,8 +2,8 @@
 
 The tables are described at https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the
 arc length from its northernmost point. A clothoid is given by its point of zero curvature, the azimuth at this point
-and the arc length from this point. The tables define neither the sign of curves nor the constant of a clothoid. Of all
-interpretations, the one is therefore used in which the segments of an edge meet each other.
+and the arc length from this point. The tables define neither the sign of curves nor the constant of a clothoid.
+Therefore, the interpretation is used in which the segments of an edge meet each other.
 """
 
 from __future__ import annotations

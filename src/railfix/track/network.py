@@ -28,12 +28,11 @@ if TYPE_CHECKING:
 
 UNMAPPED_PRIOR: Final = 0.05  #: Prior probability that the train is on an unmapped track.
 CLEARANCE_M: Final = 3.0  #: Minimum distance between the centrelines of two tracks [m].
-#: Assumed height of an antenna above the rails, and its standard deviation [m]; some antennas are on bogies, others on
-#: roofs.
-ANTENNA_UP_M: Final = 2.5
+ANTENNA_UP_M: Final = 2.5  #: Assumed height of an antenna above the rails [m].
+#: Standard deviation of the assumed antenna height [m]; some antennas are on bogies, others on roofs.
 ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].
-#: Length up to which routes are searched first; the whole network is searched only if this is not enough [m].
+#: Length up to which routes are searched first; the whole network is searched only if no route is found [m].
 _NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0  #: Largest spacing of the samples in the spatial index [m].
 #: Number of nearest samples that are examined first for each position; more samples are examined if these are not
@@ -136,7 +135,7 @@ class Network(NotebookTable):
 
     @cached_property
     def joints(self) -> Integers:
-        """Number of the joint at each end of each track, shape (tracks, 2); connected ends have the same number."""
+        """Joint number at each end of each track, shape (tracks, 2); connected ends have the same number."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -164,8 +163,8 @@ class Network(NotebookTable):
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats]:
-        """Positions of all points, and of the starts of tracks, on one axis on which the tracks follow each other 1 m
-        apart [m].
+        """Distances of all points, and of the starts of tracks, along one axis on which the tracks follow each other 1
+        m apart [m].
         """
         before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
         return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
@@ -230,8 +229,8 @@ class Network(NotebookTable):
     def _samples_near(self, points_m: Floats, within_m: float, least: int) -> tuple[Floats, Indices]:
         """Return the distances and indices of all samples near each point, as arrays with at least `least` columns.
 
-        A sample is near if the piece of track that it represents can be within `within_m`. The distance is infinite in
-        unused columns.
+        A sample is near if the piece of track that the sample represents can be within `within_m` of the point. The
+        distance is infinite in unused columns.
         """
         tree, _, _, reach = self._index
         count, short = max(_SAMPLES, least), np.arange(len(points_m))
@@ -327,9 +326,9 @@ class Network(NotebookTable):
     ) -> dict[int, tuple[float, list[int]]]:
         """Extend routes to the two entries of the track `stop`, and return the shortest route to each entry.
 
-        `routes` are the routes so far, by their last node, which is an exit. A route consists of its length [m] and its
-        nodes of `graph`, the start node and the nodes at which tracks are entered. An entry that no route reaches is
-        left out.
+        `routes` has the routes so far by their last node, an exit of a track. A route consists of a length [m] and of
+        nodes of `graph`: the start node, and the nodes at which tracks are entered. An entry that no route reaches is
+        left out of the result.
         """
         import networkx as nx
 

@@ -1,4 +1,4 @@
-"""Probability of each track at each position of a log, with a common error of all positions.
+"""Probability of each track at each position of a log, with an error that is common to all positions.
 
 The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). The state of the model is a track
 near the position, or an unmapped track, together with the common error of the positions. The common error is a
@@ -46,20 +46,23 @@ _ENTER_BESIDE_COST: Final = 7.0  #: From a parallel unmapped track to a mapped t
 _OPEN_COST: Final = 2.0
 #: Distance beyond an open end at which a position is off the map, in standard deviations.
 _BEYOND_SIGMAS: Final = 5.0
-_BEYOND_M: Final = (CLEARANCE_M, 10.0)  #: Smallest and largest value of this distance [m].
+#: Smallest and largest distance beyond an open end at which a position is off the map [m].
+_BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
 #: Constant part of the largest excess of the path length over the straight distance between two positions [m]; the path
 #: is longer in a bend, for example.
 _SLACK_M: Final = 30.0
-_SLACK_SHARE: Final = 0.2  #: Part of the largest excess that is proportional to the straight distance, as a fraction.
+#: Largest excess of the path length, in addition to `_SLACK_M`, as a fraction of the straight distance.
+_SLACK_SHARE: Final = 0.2
 #: Difference between path length and straight distance at which the probability of a transition over joints is halved
 #: [m].
 _PASSING_M: Final = 5.0
-#: Cost of a change of track in the returned sequence, as a number of expected pairs of positions on the right tracks.
+#: Cost of a change of track in the returned sequence, in expected pairs of successive positions on correct tracks.
 _CHANGE: Final = 0.5
-#: Cost of a change at a joint. It is smaller, because a short track of a switch has only one or two positions.
+#: Cost of a change of track at a joint. This cost is smaller, because a short track of a switch has only one or two
+#: positions.
 _CHANGE_AT_JOINT: Final = 0.05
-_AT_JOINT: Final = 0.01  #: Transition probability from which a change counts as a change at a joint.
+_AT_JOINT: Final = 0.01  #: Transition probability above which a change of track counts as a change at a joint.
 COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
 #: Number of balls of the urn of a horizontal axis; the variance in squared steps is a quarter of the number.
 _BALLS: Final = 12
@@ -77,9 +80,9 @@ class Residuals:
     above_m: Floats  #: Height of the position above the expected antenna height, shape (n, m); NaN without a height.
     #: Whether an unmapped track at each of `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
     clear: Masks
-    #: Distance by which the nearest track is to the right of the nearest track of the previous position, (n,).
+    #: Distance by which the nearest track is to the right of the nearest track of the previous position, shape (n,).
     moved_m: Floats
-    #: Whether the nearest tracks of this position and of the previous position have opposite directions, (n,).
+    #: Whether the nearest tracks of this position and of the previous position have opposite directions, shape (n,).
     turned: Masks
     sigma_m: Floats  #: Standard deviation of a position per horizontal axis, shape (n,).
     sigma_up_m: Floats  #: Standard deviation of the height, shape (n,).
@@ -116,7 +119,7 @@ class Transitions:
         self._left = (self._same & opens[1:, None, :]).any(axis=2)
         #: Whether the train enters the track over an open end, because the previous position is beyond that end.
         self._entered = (self._same & opens[:-1, :, None]).any(axis=1)
-        # a single position beyond the end is not explained by an error, as errors do not change by metres in one step
+        # an error does not explain a single position beyond the end, because errors do not change by metres in one step
         stays = np.where(opens, np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2)), 1.0)
         #: Likelihoods of staying on a track if only the previous position, or only the next position, is beyond an open
         #: end of the track.
@@ -158,8 +161,8 @@ class Transitions:
         return share
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Return the path length over ends of tracks from candidate i of position k to candidate j of position k + 1
-        [m].
+        """Return the length of the path from candidate i of position k to candidate j of position k + 1 through track
+        ends [m].
 
         The length is infinite beyond the search limit.
         """
@@ -240,7 +243,7 @@ class _CommonError:
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
         """Return values multiplied by the transition matrix of each axis in turn.
 
-        A product with one large matrix would wait for threads.
+        The product with one large matrix would be slower, because it would wait for threads.
         """
         axis, heights = len(plan), len(up)
         east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
@@ -290,9 +293,10 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     Returns
     -------
     tuple
-        Column of each position's candidate in the sequence that maximises the expected number of successive pairs on
-        the right tracks, m for no track, shape (n,); and the probabilities of the candidates and of no track given the
-        whole log, shape (n, m + 1).
+        Column of each position's candidate in the best sequence, shape (n,); m for no track. The best sequence
+        maximises the expected number of successive pairs on correct tracks.
+
+        Probabilities of the candidates and of no track given the whole log, shape (n, m + 1).
     """
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
@@ -331,7 +335,7 @@ class _At:
 
     share: Floats  #: Probabilities of the states given the positions up to this position, shape (m + S + 1, C, U).
     likelihood: Floats  #: Likelihood of the position given each state, shape (m + S + 1, C, U).
-    move: Floats  #: Transition probabilities to the position, shape (m + S + 1, m + S + 1).
+    move: Floats  #: Transition probabilities from the previous position, shape (m + S + 1, m + S + 1).
 
 
 def _forward(
@@ -361,7 +365,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """Return the sequence with the largest expected number of right successive pairs minus the cost of changes."""
+    """Return the sequence with the largest expected number of correct successive pairs minus the cost of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

@@ -21,26 +21,27 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, Ca
 from railfix.track.network_decode import SHIFTS_M, Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
-#: Standard deviation of the distance of positions from their track, if the log does not state it and it cannot be
-#: estimated [m].
+#: Standard deviation of the distance of positions from their track [m], if the log states none and none can be
+#: estimated.
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimated standard deviation of the distance [m].
-#: A position is used in the estimate if the second track is at least this much farther away than the first [m].
+#: A position is used in the estimate if the second nearest track is farther away than the nearest by more than this
+#: [m].
 _ALONE_M: Final = 15.0
-#: Median distance of positions from their track beyond which the positions are not on that track [m].
+#: Median distance of positions from their track beyond which the positions count as off the track [m].
 _LARGEST_LEVEL_M: Final = 5.0
-_BESIDE: Final = 3.0  #: The same limit as a multiple of the noise of positions; the larger limit applies.
+_BESIDE: Final = 3.0  #: This limit as a multiple of the position noise; the larger of both limits applies.
 _ENOUGH: Final = 30  #: Minimum number of positions to estimate the standard deviation.
 #: Upper bound of the standard deviation of the common error of all positions (satellites, atmosphere, map) [m].
 _COMMON_M: Final = 2.0
-#: Ratio of the standard deviation of the common error to the stated standard deviation, up to `_COMMON_M`.
+#: Ratio of the standard deviation of the common error to the stated standard deviation, within the bound `_COMMON_M`.
 _COMMON_SHARE: Final = 0.7
 _BEST: Final = 0.1  #: Quantile of the stated standard deviations from which the common error is computed.
 _WITHIN_M: Final = 30.0  #: Minimum search distance for tracks [m].
 _WITHIN_SIGMAS: Final = 5.0  #: Search distance for tracks in standard deviations.
 _FARTHEST_M: Final = 100.0  #: Maximum search distance for tracks [m].
 _FAR: Final = 6.0  #: A position is far from all tracks beyond this multiple of the search distance.
-#: Positions far from all tracks are wrong if the train is near a track again within this time [s].
+#: Positions far from all tracks count as wrong if the train is near a track before and after them within this time [s].
 _WRONG_S: Final = 60.0
 _MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position far from all tracks.
 #: Values in `Candidates` where there is no further track.
@@ -69,7 +70,8 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions transformed from the frame of the satellites to the frame of the map, and a description.
+        """Return the positions transformed from the frame of the satellites to the frame of the map, and a description
+        of the shift.
 
         Raise MismatchError if the log is far from the network, or if the transformation depends on time and the log has
         no times.
@@ -78,8 +80,8 @@ class PlanLog(RowArrays):
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
             raise MismatchError(
-                f"{self.path}: has no times, which the shift to the frame of the map needs; give positions in the "
-                "frame of the map (--same-frame)"
+                f"{self.path}: has no times, but the shift to the frame of the map depends on the time; provide "
+                "positions in the frame of the map (--same-frame)"
             )
         time = np.sort(times)[len(times) // 2] if len(times) else np.datetime64("now", "ns")
         known = np.zeros(len(self.latitude_deg)) if self.height_m is None else self.height_m
@@ -273,10 +275,10 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 
 
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
-    """Return a mask of the positions far from all tracks that are wrong, shape (n,).
+    """Return a mask of the positions that are rejected as wrong because they are far from all tracks, shape (n,).
 
-    Such a position is wrong if the last earlier position near a track, and the next later position near a track, are at
-    most `_WRONG_S` apart.
+    A position far from all tracks is rejected if the last earlier position near a track, and the next later position
+    near a track, are at most `_WRONG_S` apart.
     """
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):

@@ -205,15 +205,17 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
     )
 
 
-_GAP_M: Final = 5.0  #: Distance of two unconnected ends below which the distance is reported as a gap in one track [m].
-_JOINT_M: Final = 0.5  #: Distance between connected ends above which the distance is reported [m].
+#: Distance between two unconnected ends below which the ends are reported as a gap in one track [m].
+_GAP_M: Final = 5.0
+#: Distance between connected ends above which the ends are reported as a joint that does not meet [m].
+_JOINT_M: Final = 0.5
 #: Largest change of direction over a navigable connection [deg]; a 1:4.5 switch turns by 12.5 deg over its length.
 _KINK_DEG: Final = 15.0
-#: Smallest possible spacing of parallel tracks, at which vehicles pass each other [m].
+#: Smallest spacing of parallel tracks at which vehicles can pass each other [m].
 _LEAST_SPACING_M: Final = 2.5
 #: Distance from the end of a track within which the spacing is not checked, because tracks join in a switch [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Length from which too small a spacing is reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Length over which tracks must be too near each other to be reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +241,7 @@ class NetworkQuality:
     findings: tuple[NetworkFinding, ...]  #: Faults of the network, beginning with the kinds in `FAULTS`.
 
 
-#: Kinds of findings that are errors of the network; they are listed first.
+#: Kinds of findings that are errors of the network; these findings are listed first.
 FAULTS: Final = ("gap", "joint", "kink")
 
 

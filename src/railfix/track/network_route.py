@@ -22,7 +22,7 @@ Rows = Literal["gaps", "off-map"]
 #: Largest distance of a track from a position off the map, and largest difference between the length of a route and the
 #: distance travelled according to these positions [m].
 _DRIFT_M = 500.0
-_STEPS = 15  #: Number of steps of which the median is taken, to suppress jumps of positions.
+_STEPS = 15  #: Number of steps between positions of which the median is taken, to suppress jumps.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,10 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
 def _fill_before(
     network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
 ) -> None:
-    """Fill rows before the first or after the last known position as far as the log has positions, in place."""
+    """Fill rows before the first or after the last known position, in place.
+
+    `rows` begins at the known position. It is filled up to the first row without a position.
+    """
     rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
     if len(rows) < 2:
         return
@@ -113,10 +116,10 @@ def _distance_m(log: PlanLog) -> Floats:
 def _put_on(
     filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
 ) -> None:
-    """Place rows on a route in proportion to the values `at`, in place.
+    """Set the positions of rows on a route, in proportion to the values `at`, in `filled`.
 
-    The first value of `at` belongs to the start of the route, the last value to the end. With `ends_known`, the
-    position at the end is known, as at the start.
+    The first value of `at` belongs to the start of the route, the last value to the end. `ends_known` states that the
+    train's position is known at both ends of the route; otherwise the bound is infinite.
     """
     numbers, enter, leave = legs
     share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
@@ -197,8 +200,9 @@ def _beside(network: Network, matched: Matched) -> str:
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:
-    """Return the longest parts of a route that pass no joint twice, except that a part may end at a joint that it
-    passed.
+    """Return the longest parts of a route that pass no joint twice.
+
+    A part may, however, end at a joint that the part has already passed.
     """
     joints = _joints(network, route)
     parts: list[list[int]] = []

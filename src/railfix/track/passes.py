@@ -22,7 +22,7 @@ class Passes(NamedTuple):
     foot_m: Floats  #: Distance from the start of the segment to the point of the segment nearest to the position.
     offset_m: Floats  #: Vector from the nearest point to the position, shape (P, 3).
     lowest: Masks  #: True if no adjacent segment in the list is nearer to the position.
-    again: Masks  #: True if the previous segment is equally near, because the nearest point is shared.
+    again: Masks  #: True if the previous segment is equally near, because both share the nearest point.
 
 
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
@@ -53,6 +53,6 @@ def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats |
 def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
     """Return differences of arc length in the shorter direction of a closed line.
 
-    `turn_m` is the length of the closed line; with infinity, for an open line, the differences are unchanged.
+    `turn_m` is the length of the closed line. For an open line, `turn_m` is infinite, and differences are unchanged.
     """
     return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m

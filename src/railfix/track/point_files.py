@@ -42,7 +42,7 @@ _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_heigh
 
 
 def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_GeojsonLine]:
-    """Yield every LineString in a GeoJSON object, with the members that it inherits from its parents.
+    """Yield every LineString in a GeoJSON object, with the properties and members of the objects that contain it.
 
     Raise InputFileError if an object has no lines or no geometry.
     """
@@ -94,7 +94,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name or else the id of a feature, as property "name"; an empty dictionary without both."""
+    """Return the name or else the id of a feature, as property "name"; an empty dictionary if there is neither."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -167,8 +167,9 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
 
 
 def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
-    """Return the positions of coordinates in the order easting, northing (or longitude, latitude), shape (n, 2) or
-    more.
+    """Georeference coordinates in the order easting, northing (or longitude, latitude).
+
+    `values` has one row per point; columns after the first two are ignored.
 
     Raise InputFileError if the CRS is geographic and the coordinates are not degrees of longitude and latitude.
     """

@@ -27,18 +27,18 @@ _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are probably 
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
 _ADVERSE_M: Final = 0.005  #: Cant below which the sign of the cant is not checked [m].
 _CENTIMETRE_M: Final = 0.01  #: Largest distance between chord and arc for `needed_spacing_m` [m].
-#: A change of direction at a point above this is a kink, if it is also sharper than `least_radius_m`.
+#: Change of direction at a point above which the point is a kink, if the implied radius is also below `least_radius_m`.
 _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: Change of direction up to which a kink is a warning; a sharper kink is an error.
 #: Largest deviation of the height of a point from the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
-#: Largest difference between the mean gradient of the map and the gradient of the heights, over `_GRADIENT_WINDOW_M`.
+#: Largest difference between the mean gradients from the map and from the heights, over `_GRADIENT_WINDOW_M`.
 _GRADIENT_DIFFERENCE_PERMILLE: Final = 5.0
 _GRADIENT_WINDOW_M: Final = 100.0
 
 
 class MapLimits(Settings):
-    """Limits of a track map; a value on the limit passes."""
+    """Limits of a track map; a value equal to its limit passes."""
 
     #: Largest distance between chord and arc in mid-segment (P1 4.1(3)).
     mid_chord_m: float = Field(default=0.30, gt=0)
@@ -56,7 +56,7 @@ class Finding:
     """Fault of the map in a range of consecutive points or segments."""
 
     severity: Severity
-    kind: str  #: Kind of the fault, a key of `_FAULTS` without "small".
+    kind: str  #: Kind of the fault: a key of `_FAULTS`, without the prefix "small ".
     first: int  #: Index of the first point of the range.
     last: int  #: Index of the last point of the range.
     chainage_m: float  #: Chainage of the first point.
@@ -118,7 +118,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),
     "rounded": (
         "warning",
-        "latitude and longitude have at most five decimals: points are off by 0.6 m or more; seven were expected",
+        "latitude and longitude have at most five decimals: points may be off by 0.6 m or more; seven were expected",
     ),
     "gap": (
         "error",
@@ -146,7 +146,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
         "warning",
         "gradient_permille differs from the heights by {value:.1f} per mille (limit {limit:g}); rising is positive",
     ),
-    "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres"),
+    "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); check whether the column is in millimetres"),
     "small cant": (
         "error",
         "cant of {value:.2g} m is the largest; check whether it is in metres, where millimetres are expected",

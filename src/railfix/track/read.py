@@ -125,9 +125,10 @@ def check_heights(
     height_datum: str | None,
     sigma_height_m: float | None,
 ) -> None:
-    """Check that either the segments or `heights` give the heights.
+    """Check that the heights come from either the segments or `heights`.
 
-    Raise InputFileError, which names all missing options, or SettingsError if both give heights.
+    Raise InputFileError if neither has heights. Raise SettingsError if both have heights, or if options for a raster
+    are missing.
     """
     flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
     if flat and heights is None:
@@ -186,7 +187,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with a given accuracy in plan, which is taken to include the transformation from the map's
+    """Return a segment with a given accuracy in plan, which is assumed to include the transformation from the map's
     datum.
     """
     note = f"map: {given_m:g} m in plan (--plan-sigma) is better than the accuracy of the map's transformation"

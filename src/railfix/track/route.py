@@ -1,4 +1,4 @@
-"""Segments of track that are read from files, and their joining to a route (P1 4.2(1))."""
+"""Segments of track, which are read from files and joined to a route (P1 4.2(1))."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights.
 #: Names of the optional attributes of map points.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
-#: Column names, in lower case, of ERA RINF files without track geometry, and the message on such files.
+#: Column names, in lower case, by which ERA RINF files without track geometry are recognised.
 RINF_NAMES = ("sectionofline", "operationalpoint", "solopstart", "uniqueopid", "uopid", "opstart")
+#: Message on ERA RINF files without track geometry.
 RINF_SECTIONS = (
     "sections of line and operational points of ERA RINF have no geometry of tracks; export the register's topology as "
     "RDF (.ttl, .rdf, .nt, .jsonld)"
@@ -72,7 +73,7 @@ class Segment:
     #: Standard deviation of the transformation of the coordinates in plan; NaN if unknown. It is added to the accuracy
     #: of the map.
     datum_plan_m: float = 0.0
-    datum_height_m: float = 0.0  #: Standard deviation of the transformation of the heights, likewise.
+    datum_height_m: float = 0.0  #: Standard deviation of the transformation of the heights; NaN if unknown.
     notes: tuple[str, ...] = ()
     nodes: tuple[str, ...] = ()  #: OpenStreetMap node ids of the points; empty if the file has no node ids.
 

@@ -26,7 +26,7 @@ UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names 
 #: length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of ellipsoidal heights of railways, including tunnels below the sea [m].
-ANOTHER_PLACE_M = 100_000.0  #: Distance between a log and a map beyond which their locations are different [m].
+ANOTHER_PLACE_M = 100_000.0  #: Distance beyond which a log and a map count as from different locations [m].
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,8 @@ from railfix.core.geodesy import axes_at
 from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
-#: Number of candidates in the first round of the search. In each further round, for positions with a nearest point that
-#: is not yet proven, the number is multiplied by 4.
+#: Number of candidate samples per position in the first round of the search. Each further round has four times as many,
+#: and only the positions for which a nearer point is still possible.
 _FIRST_CANDIDATES = 6
 _CHUNK = 2_000_000  #: Largest product of the numbers of positions and candidates in one array.
 
@@ -81,7 +81,7 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Return for each point (n, 3) the nearest of C candidate segments (n, C), the fraction and the distance."""
+    """Find for each point (n, 3) the nearest of C candidate segments (n, C), the fraction along it and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
     # return the first of equally near segments on the line, whatever the order of the candidates
@@ -104,7 +104,7 @@ def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest part of the line beside and parallel to an end [m]; NaN without a part."""
+    """Return the arc length of the nearest part of the line beside and parallel to an end [m]; NaN if there is none."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -273,22 +273,22 @@ class Trajectory(FrozenArrays, NotebookTable):
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
-        """Interpolate values, shape (V, ...), at arc lengths of any shape; NaN beyond the ends and for NaN."""
+        """Interpolate values, shape (V, ...), at arc lengths of any shape; NaN beyond the ends and for NaN input."""
         arc = np.asarray(arc_m, dtype=np.float64)
         return between_points(arc, self.arc_m, self.length_m, values, self.segment_at(arc)[0])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the ECEF position at arc lengths, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the ECEF position at arc lengths, shape (..., 3) [m]; NaN beyond the ends and for NaN input."""
         return self._interpolate(arc_m, self.ecef_m)
 
     def chainage_at(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the chainage of the reference point at arc lengths [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the chainage of the reference point at arc lengths [m]; NaN beyond the ends and for NaN input."""
         return self._interpolate(arc_m, self.chainage_m)
 
     def body_at(self, arc_m: ArrayLike) -> Floats:
         """Interpolate the chainage of the middle between the bogies at antenna arc lengths [m].
 
-        The result is NaN without a vehicle, beyond the ends, and for NaN.
+        The result is NaN without a vehicle, beyond the ends, and for NaN input.
         """
         if self.body_chainage_m is None:
             return np.full(np.shape(arc_m), np.nan)
@@ -297,7 +297,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
         """Interpolate the antenna's arc length at chainages of the middle between the bogies [m].
 
-        The result is NaN without a vehicle, beyond the ends, and for NaN.
+        The result is NaN without a vehicle, beyond the ends, and for NaN input.
         """
         if self.body_chainage_m is None:
             return np.full(np.shape(body_chainage_m), np.nan)
@@ -306,7 +306,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         )
 
     def arc_at_chainage(self, chainage_m: ArrayLike) -> Floats:
-        """Interpolate the arc length at chainages of the reference point [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the arc length at chainages of the reference point [m]; NaN beyond the ends and for NaN input."""
         chainage = np.asarray(chainage_m, dtype=np.float64)
         first, last = self.chainage_m[0] - _END_TOLERANCE_M, self.chainage_m[-1] + _END_TOLERANCE_M
         inside = (chainage >= first) & (chainage <= last)
@@ -319,8 +319,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
         """Return the arc length of the nearest point to each position (n, 3), and the distance to it, shape (n,) [m].
 
-        The search is exact: a k-d tree gives candidate segments, and a bound excludes all others. Of two equally near
-        points, the point with the smaller arc length is returned. Both results are NaN where the position is NaN.
+        The search is exact: a k-d tree provides candidate segments, and a bound excludes all others. Of two equally
+        near points, the point with the smaller arc length is returned. Both results are NaN where the position is NaN.
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where no segment was found

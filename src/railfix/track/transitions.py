@@ -1,7 +1,7 @@
-"""Transition curves in plan that are defined by ordinates over the tangent: cubic parabolas and the half-sine.
+"""Transition curves in plan that are defined by their offsets from the tangent: cubic parabolas and the half-sine.
 
-The abscissa x is measured along the tangent from the straight end, X is the length on the tangent, and R is the radius
-at the curved end:
+The abscissa x is measured along the tangent from the straight end, and the ordinate y is the offset from the tangent. X
+is the length on the tangent, and R is the radius at the curved end:
 
 - The cubic parabola ``y = x^3 / (6 R X)`` is used by many railways. IFC defines ``y = x^3 / (6 R L)`` with the length L
   of the curve.
@@ -22,7 +22,8 @@ from railfix.core.arrays import Floats
 
 Shape = Literal["cubic", "half-sine"]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-#: Number of intervals for the quadrature of the length, which is exact to rounding with 12 nodes in each interval.
+#: Number of intervals for the quadrature of the length. With 12 nodes in each interval, the length is exact to
+#: rounding.
 _PIECES: Final = 16
 _ROUNDS: Final = 30  #: Number of fixed-point iterations for the length on the tangent; ten are enough to converge.
 _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end of a half-sine.
@@ -30,7 +31,7 @@ _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end 
 
 @dataclass(frozen=True, kw_only=True)
 class OrdinateElement:
-    """Transition between straight and curve, defined by ordinates over the tangent at its straight end."""
+    """Transition between straight and curve, defined by offsets from the tangent at the straight end."""
 
     x_m: float  #: Easting of the first point.
     y_m: float  #: Northing of the first point.

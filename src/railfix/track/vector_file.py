@@ -2,7 +2,7 @@
 
 OpenStreetMap ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Export
 programs write the tags as columns, as an object or JSON text (`tags`), as hstore text (`other_tags` of GDAL), or as a
-class (`fclass` in the shapefiles of Geofabrik), and the id in many forms.
+class (`fclass` in the shapefiles of Geofabrik). They write the id in many forms.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _OTHERS: Final = (
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
     "turntable", "yard",
 )  # fmt: skip
-#: Columns that can contain the id of a feature; the first ones are written only by OpenStreetMap export programs.
+#: Columns that can contain the id of a feature; only OpenStreetMap export programs write the first four.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
 _ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
@@ -84,7 +84,7 @@ def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
-    """Return whether the id or the kind of a feature shows that it is from OpenStreetMap."""
+    """Return whether the id or the element kind of a feature shows that the feature is from OpenStreetMap."""
     names = (str(row.get(key) or "") for key in ("@id", "id"))
     of_id = any(row.get(key) is not None for key in _IDS[:4])
     of_kind = any(row.get(key) in ("way", "relation") for key in _KINDS)
@@ -175,7 +175,7 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection, in contrast to a slip."""
+    """Return whether a node is a crossing of tracks without a connection; a slip has a connection."""
     return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
@@ -203,7 +203,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
 def _place(path: FilePath, lon: Any, lat: Any) -> tuple[float, float]:
     for text in (lon, lat):
         if "," in str(text):
-            raise InputFileError(path, f"{text}: has a comma in a number; a point was expected")
+            raise InputFileError(path, f"{text}: has a comma in a number; a decimal point was expected")
     try:
         return float(lon), float(lat)
     except (TypeError, ValueError):
@@ -233,7 +233,7 @@ def _ways(
             places = np.array([place for _, place in part], dtype=np.float64)
             found.append(Way(row=row, points_deg=places, nodes=ids if all(ids) else ()))
     if not found and short:
-        raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; request the nodes from Overpass, too (out geom;)")
+        raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; also request the nodes from Overpass (out geom;)")
     if not found:
         raise InputFileError(path, "no way in this file has a tag railway")
     return [*found, *short]

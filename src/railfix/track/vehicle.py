@@ -93,8 +93,9 @@ def read_vehicle(path: FilePath) -> Vehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Positions and attitudes of the car body at n chainages; the axes are those of a vehicle that faces rising
-    chainage.
+    """Positions and attitudes of the car body at n chainages.
+
+    The axes are defined for a vehicle that faces rising chainage.
     """
 
     lower_m: Floats  #: Chainage of the bogie centre with the lower chainage, shape (n,).
@@ -198,7 +199,7 @@ def _side_of_bends(track: Track) -> Floats:
 
 
 def _bogies(line: _VehicleLine, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
-    """Return the chainages of both bogies [m], at equal distances from `middle`; the chord is the bogie distance."""
+    """Return the chainages of both bogies [m], equally far from `middle`; the chord between both is `distance_m`."""
     half = np.full(len(middle), distance_m / 2.0)
     active = np.arange(len(middle))
     for _ in range(_MAX_ITERATIONS):

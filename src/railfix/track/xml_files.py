@@ -129,7 +129,10 @@ _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read as segments the linear elements of a RINF file that have a geometry; InputFileError: there is none."""
+    """Read the linear elements of a RINF file as segments.
+
+    Elements without a geometry are left out. Raise InputFileError if no element has a geometry.
+    """
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [
@@ -143,7 +146,7 @@ def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
         try:
             points = np.array([[float(v) for v in p.split()] for p in lines[0]["points"].split(",")])
         except ValueError:
-            raise InputFileError(path, f"{element}: its WKT has points of other than two or three numbers") from None
+            raise InputFileError(path, f"{element}: each point of its WKT must have two or three numbers") from None
         of_file = MapReading(**{**vars(reading), "crs": choose_crs(path, reading.crs, named)})
         segments.append(plan_segment(points, of_file, path=str(path), name=_name(graph, element)))
     if not segments:

@@ -25,11 +25,9 @@ _CORNER_M: Final = 5.0
 class ReferenceLine:
     """Line before the adjustment, J points."""
 
-    #: ECEF positions of the points, and unit vectors across the line and upward, along which points are adjusted; shape
-    #: (J, 3).
-    ecef_m: Floats
-    across: Floats
-    up: Floats
+    ecef_m: Floats  #: ECEF positions of the points, shape (J, 3).
+    across: Floats  #: Unit vectors across the line, along which points are adjusted, shape (J, 3).
+    up: Floats  #: Upward unit vectors, along which points are adjusted, shape (J, 3).
     closed: bool = False  #: Whether the last point is joined to the first.
 
     def __len__(self) -> int:
@@ -80,7 +78,10 @@ class RunColumns:
 
 
 def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -> sp.csr_array:
-    """Build a sparse matrix from parts, each a column per observation (n,) and its coefficients (n, size)."""
+    """Build a sparse matrix from parts.
+
+    A part has one column index per observation, shape (n,), and the coefficients of this column, shape (n, size).
+    """
     count = len(parts[0][0])
     row = np.arange(count * size)
     rows = np.concatenate([row for _ in parts])
@@ -155,7 +156,10 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Return the median of the group of each value: an approximate clock, so that the estimated clock is small."""
+    """Return, for each value, the median of its group.
+
+    The median is an approximate clock, so that only a small clock remains to be estimated.
+    """
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
     middle = np.minimum((first[:-1] + first[1:]) // 2, len(value) - 1)

@@ -38,7 +38,8 @@ _ADJUSTMENT_ROUNDS: Final = 15  #: Largest number of reweighting iterations.
 _SETTLED_M: Final = 0.02  #: Change of the solution at which the iterations end [m].
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Limits of the scale of stated standard deviations. Residuals do not show errors common to all satellites.
+#: Limits of the factor that scales stated standard deviations. The factor must not become too small, because residuals
+#: do not show errors common to all satellites.
 _SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Standard deviation of a loose prior of every unknown, for conditioning [m].
 #: Largest number of points whose standard deviations are computed; between these points they are interpolated.
@@ -50,11 +51,12 @@ _COLUMNS: Final = 20  #: Number of columns of the inverse that are computed at o
 class Adjusted:
     """Result of an adjustment."""
 
-    ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, without the offset of the run; shape (n, 3).
-    #: Distances of the points of the line from the reference line, across and upward, and their standard deviations;
-    #: shape (J, 2), or (0, 2) if not requested.
+    #: Adjusted positions of each run, after the offset of the run has been subtracted; shape (n, 3).
+    ecef_m: tuple[Floats, ...]
+    #: Distances of the points of the line from the reference line, across and upward; shape (J, 2), or (0, 2) without
+    #: a line.
     line_m: Floats
-    line_sigma_m: Floats
+    line_sigma_m: Floats  #: Standard deviations of `line_m`; shape (J, 2), or (0, 2) if not requested.
     #: Mean weight of the positions or codes in each row of each run, shape (n,); about 1 without outliers, 0 without
     #: an observation.
     weight: tuple[Floats, ...]
@@ -128,7 +130,7 @@ def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> F
 def _solve(
     systems: Sequence[Equations], unknowns: int, limits: SurveyLimits
 ) -> tuple[Floats, list[Floats], list[float]]:
-    """Solve by iterative reweighting; return the solution, and the weights and scale of each kind of equations."""
+    """Solve by iterative reweighting; return the solution, and for each of `systems` the weights and the scale."""
     weights = [np.ones(len(system.share)) for system in systems]
     scales = [1.0 for _ in systems]
     solution = np.zeros(unknowns)
@@ -209,8 +211,8 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 
 _ROUNDS: Final = 3  #: Number of adjustments with the line; passes are searched before each of them.
-#: Distance between the passes of both directions, in standard deviations of a run's offset, beyond which they are on
-#: separate tracks. The value is three standard deviations of the difference of two offsets.
+#: Distance between the passes of both directions beyond which the directions are treated as separate tracks, in
+#: standard deviations of a run's offset. The value is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
 _TURN_M: Final = 40.0  #: Distance over which a reversal is searched for [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
@@ -294,9 +296,8 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
 def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
     """Return additional standard deviations of the common error of a single run, plan and height, shape (2,) [m].
 
-    If there is no second run, the common error is not observable. The addition then doubles
-    `SurveyRun.common_sigma_m`: without this addition, sigmas of single runs of low-cost receivers were half of their
-    errors.
+    If there is no second run, the common error is not observable. The addition then doubles `SurveyRun.common_sigma_m`:
+    without this addition, the sigmas of single runs of low-cost receivers were half of the actual errors.
     """
     return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
@@ -327,7 +328,10 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return the range of points of an open line without end points that do not advance, which are noise at rest."""
+    """Return the range of points of an open line, excluding end points that do not advance.
+
+    Such end points are noise at rest.
+    """
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
@@ -389,22 +393,22 @@ def _notes(
     notes = [
         ANTENNA_PATH,
         f"surveyed from {plural(runs, 'run')} of {driven:,.0f} m in total, {driven / length:.1f} times the length of "
-        f"the line, {against:.0%} of the distance against its direction; each point is passed {count.min()} to "
-        f"{count.max()} times",
+        f"the line, {against:.0%} of the distance against the direction of the line; each point is passed "
+        f"{count.min()} to {count.max()} times",
         f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height (95th percentiles along the "
         f"line)",
     ]
     steps = np.concatenate([np.diff(leg.arc_m) for leg in legs])
     if len(bridged := steps[steps > _TURN_M]):
         notes.append(
-            f"{plural(bridged, 'gap')} in the runs bridged by a curve, the longest {bridged.max():.0f} m: the accuracy "
-            "there is the accuracy at its ends"
+            f"{plural(bridged, 'gap')} in the runs bridged by a curve, the longest {bridged.max():.0f} m; within a "
+            "gap, the accuracy is assumed to be the accuracy at the ends of the gap"
         )
     if len(runs) == 1:
         plan, height = (2.0 * value for value in runs[0].common_sigma_m)
         notes.append(
             f"one run does not show the error that all its positions share: {plan:.1f} m in plan and {height:.1f} m in "
-            "height are in the accuracy for it; add runs of other days"
+            "height are assumed for this error in the accuracy of the map; add runs of other days"
         )
     if beside > 0.02 * driven:
         notes.append(
@@ -412,7 +416,7 @@ def _notes(
         )
     if apart:
         notes.append(
-            f"the runs of one direction lie {apart:.1f} m beside the runs of the other: they are on another track, and "
-            "are left out; give the runs of each track separately"
+            f"the runs of one direction lie {apart:.1f} m beside the runs of the other direction: they are taken to be "
+            "on another track, and are left out; survey each track separately"
         )
     return tuple(notes)

@@ -19,8 +19,9 @@ _APART_WIDTHS: Final = 3.0
 _MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must fulfil a condition.
 _SEAM_M: Final = 200.0  #: Distance over which the difference of two passes is distributed where they are joined [m].
 _GAP_S: Final = 10.0  #: Time without rows that is a gap [s].
-#: Longest gap within a leg [m], and cosine of the largest change of direction over it; otherwise the leg ends.
+#: Longest gap within a leg [m]; the leg ends at a longer gap.
 BRIDGED_M: Final = 500.0
+#: Cosine of the largest change of direction over a gap; the leg ends at a gap with a larger change.
 _GOES_ON: Final = 0.9
 _NEIGHBOURS: Final = 24  #: Number of nearest vertices that are compared with a point.
 
@@ -98,7 +99,9 @@ def directions(point_m: Floats, *, closed: bool = False) -> Floats:
 
 
 def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
-    """Divide a run into legs at reversals, within `turn_m`, and at gaps over which it is not straight.
+    """Divide a run into legs at reversals and at gaps over which the run is not straight.
+
+    Reversals are searched for over the distance `turn_m`.
 
     Rows nearer than the spacing to the previous selected row are left out.
     """
@@ -327,7 +330,7 @@ def without_other_track(
 ) -> tuple[list[Pass], float]:
     """Remove the passes of one direction if both directions are on separate tracks.
 
-    Return the passes of the more frequent direction and the distance of the tracks [m], or all passes and 0 if the
+    Return the passes of the more frequent direction and the distance between the tracks [m], or all passes and 0 if the
     median distance is at most `tolerance_m`.
     """
     across: dict[int, Floats] = {}

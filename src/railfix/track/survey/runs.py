@@ -31,15 +31,15 @@ class SurveyLimits(Settings):
     """Assumptions of a survey."""
 
     interval_s: float = Field(default=1.0, gt=0)  #: Minimum time between two positions; faster logs are thinned.
-    #: Correlation time at standstill and correlation length of position errors.
+    #: Correlation time of position errors.
     correlation_s: float = Field(default=30.0, ge=0)
-    correlation_m: float = Field(default=50.0, ge=0)
+    correlation_m: float = Field(default=50.0, ge=0)  #: Correlation length of position errors along the path.
     #: Standard deviation of the change of horizontal velocity per axis in one second. Over five seconds, the duration
     #: of curves and braking, the changes of three road vehicles were 1.2 to 1.8 m/s times the root of the time in s.
     acceleration_mps2: float = Field(default=1.5, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t, which down-weights outliers.
     same_line_m: float = option(
-        "Passes nearer to each other than this, in the same or the opposite direction, are on one line.",
+        "Passes closer to each other than this distance, in the same or the opposite direction, count as one line.",
         20.0,
         name="--same-line",
         metavar="M",
@@ -64,18 +64,15 @@ class RunSignals(FrozenArrays):
 
     row: Indices  #: Row of the run, shape (M,).
     sat_ecef_m: Floats  #: Position of the satellite at transmission, shape (M, 3).
-    #: Corrected pseudoranges and their standard deviations, shape (M,).
-    code_m: Floats
-    sigma_m: Floats
+    code_m: Floats  #: Corrected pseudorange, shape (M,).
+    sigma_m: Floats  #: Standard deviation of the pseudorange, shape (M,).
     clock: Indices  #: Index of the receiver clock, shape (M,).
-    step: Indices  #: Row before each change, which is up to the next row; shape (C,).
-    #: Positions of the satellite at transmission for the rows before and after the change, shape (C, 3).
-    before_ecef_m: Floats
-    after_ecef_m: Floats
-    #: Change of the range from carrier phases or Dopplers, and its standard deviation; shape (C,).
-    change_m: Floats
-    change_sigma_m: Floats
-    by_doppler: Masks  #: Whether the change is from Dopplers, shape (C,).
+    step: Indices  #: Row at which each change begins; the change ends at the next row; shape (C,).
+    before_ecef_m: Floats  #: Position of the satellite at transmission, for the row before the change, shape (C, 3).
+    after_ecef_m: Floats  #: Position of the satellite at transmission, for the row after the change, shape (C, 3).
+    change_m: Floats  #: Change of the range, from carrier phases or Dopplers, shape (C,).
+    change_sigma_m: Floats  #: Standard deviation of the change, shape (C,).
+    by_doppler: Masks  #: Whether the change was computed from Dopplers, shape (C,).
 
 
 @dataclass(frozen=True, kw_only=True)
