@@ -65,9 +65,8 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
         console.print(f"{run.name}: {run.configuration}; line {run.line}")
         for antenna, method in run.method.items():
             by = "differences of chainage" if method == "chainage" else "along the trajectory"
-            console.print(
-                f"  {antenna}: against {run.reference}, {by}; {plural(run.outside[antenna], "epoch")} outside the reference"
-            )
+            outside = plural(run.outside[antenna], "epoch")
+            console.print(f"  {antenna}: against {run.reference}, {by}; {outside} outside the reference")
         show_notes(console, run.notes)
     for table in error_tables(evaluation):
         show_table(console, table)

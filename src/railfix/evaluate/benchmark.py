@@ -112,7 +112,9 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
     own = read_run(run)
     epochs = own.positions.filter(pl.col("antenna") == antenna)
     if len(epochs) < 2:
-        raise MismatchError(f"{log.path}: has positions of the {antenna} antenna, but the run has fewer than two epochs of it")
+        raise MismatchError(
+            f"{log.path}: has positions of the {antenna} antenna, but the run has fewer than two epochs of it"
+        )
     places = np.stack([floats(epochs, name) for name in ("x_m", "y_m", "z_m")], axis=1)
     trajectory, _, _ = find_trajectory(own, antenna, floats(epochs, "chainage_m"), places, TrackFiles())
     table = table_of_positions(log, epochs, trajectory)

@@ -108,7 +108,7 @@ def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
 def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[float]:
     """Return a point's cells (longitude, latitude, ...) as numbers; raise InputFileError if they are invalid."""
     if comma := next((cell for cell in cells if "," in str(cell)), None):
-        raise InputFileError(path, f"{where}: {comma} has a comma in a number; a point was expected")
+        raise InputFileError(path, f"{where}: {comma} has a comma in a number; a decimal point was expected")
     try:
         values = [float(str(cell)) for cell in cells]
     except ValueError:
