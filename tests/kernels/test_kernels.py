@@ -307,7 +307,7 @@ def test_a_terminal_is_told_of_compilation_once(tmp_path: Path, terminal: bool) 
     told = ""
     while not told.endswith("end\n"):
         told += os.read(reader, 1000).decode().replace("\r", "")
-    assert told == ("compiling for this processor, once: about a minute\n" if terminal else "") + "end\n"
+    assert told == ("compiling kernels for this processor once: about a minute\n" if terminal else "") + "end\n"
     for end in pipe:
         os.close(end)
 

@@ -1,9 +1,9 @@
-"""Functions on arrays, compiled with numba: the filter along the track, and the single-epoch stages.
+"""Functions on arrays, compiled with numba, for the filter along the track and for the single-epoch stages.
 
-A module of this package is imported at the first use of one of its functions (``kernels.ranges.misfits``), because
-numba takes half a second to load. The functions operate on arrays and numbers only, and the modules import nothing of
-railfix except this package and `railfix.core`. With ``NUMBA_DISABLE_JIT=1`` the functions are plain Python, for a
-debugger and for tests.
+A module of this package is imported when one of its functions is first used (``kernels.ranges.misfits``), because numba
+takes half a second to load. The functions operate only on arrays and numbers. The modules import nothing of railfix
+except this package and `railfix.core`. With ``NUMBA_DISABLE_JIT=1``, the functions are plain Python, for a debugger and
+for tests.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["hypotheses", "level", "model", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
 
-#: Modules with the kernels of the filter.
+#: Modules that have the kernels of the filter along the track.
 _FILTER_MODULES: Final = ("tracking.recursion", "tracking.velocity")
 
 
@@ -41,18 +41,19 @@ def _import_all() -> Any:
 
 
 def load() -> None:
-    """Load the machine code of all kernels, so that no epoch is delayed by loading."""
+    """Load the machine code of all kernels now, so that loading delays no epoch."""
     _import_all().load()
 
 
 def is_compiled() -> bool:
-    """Return whether this machine has the machine code of all kernels; missing kernels are compiled at their first
-    call.
+    """Return whether the machine code of all kernels is on this machine.
+
+    Other kernels are compiled at the first call.
     """
     compiled: bool = _import_all().is_compiled()
     return compiled
 
 
 def record_compiled() -> None:
-    """Record that this process has compiled all kernels, and their argument types."""
+    """Record that this process has compiled all kernels, and with which argument types."""
     _import_all().record_compiled()

@@ -1,8 +1,8 @@
 """Compilation with numba, with the machine code cached on disk.
 
-The cache is in the source folder, in the user's cache folder if the source folder is not writable, or in
-``NUMBA_CACHE_DIR``. numba recompiles a function when its own file changes, but does not check the files of the
-functions that it calls; `_remove_outdated` does.
+The cache is in ``NUMBA_CACHE_DIR``, or else in the source folder, or in the user's cache folder if that is not
+writable. numba recompiles a function when its own file changes; `_remove_outdated` checks the files of called
+functions.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from railfix.core.staged_files import stage_file
 Function = TypeVar("Function", bound=Callable[..., Any])
 #: Compiled functions of the imported modules.
 COMPILED: Final[list[Any]] = []
-#: Divisions by zero give infinities and NaN, as in numpy; multiplications and additions may be fused.
+#: Options of numba: divisions by zero give infinity or NaN, as in numpy, and multiply-add operations may be fused.
 OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 _PACKAGE: Final = Path(__file__).parent
 
 
 def is_plain() -> bool:
-    """Return whether kernels stay plain Python."""
+    """Return whether kernels are not compiled, but stay plain Python."""
     return os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
 def kernel(function: Function) -> Function:
     """Compile a function on arrays at its first call, without the interpreter lock, and cache the machine code on disk.
 
-    With ``NUMBA_DISABLE_JIT=1`` it stays plain Python.
+    With ``NUMBA_DISABLE_JIT=1``, the function stays plain Python.
 
     Raises
     ------
@@ -48,13 +48,14 @@ def kernel(function: Function) -> Function:
         No cache folder is writable.
     """
     if is_plain():
-        # Integer overflow, divisions by zero and NaN are intended, and machine code does not warn about them.
+        # Integer overflow, division by zero and NaN are intended; like machine code, plain Python does not warn about
+        # them.
         return np.errstate(all="ignore")(function)
     try:
         compiled = numba.njit(cache=True, **OPTIONS)(function)
     except RuntimeError as error:
         raise SettingsError(
-            f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
+            f"compiled kernels cannot be stored on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
             "written, or NUMBA_DISABLE_JIT=1 (a hundred times slower)"
         ) from error
     _remove_outdated(Path(compiled.stats.cache_path), function.__module__.removeprefix("railfix.kernels."))
@@ -63,7 +64,7 @@ def kernel(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """Compile a function that only kernels call; its machine code becomes part of the kernels' machine code."""
+    """Compile a function that only kernels call; the machine code becomes part of the calling kernels."""
     if is_plain():
         return function
     return cast(Function, numba.njit(**OPTIONS)(function))
@@ -72,7 +73,7 @@ def inner(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile a small function of an inner loop into its callers (`inline` of numba).
 
-    A call counts the references to each array argument, which takes longer than the function itself.
+    An ordinary call counts the references to each array argument, which takes longer than a small function.
     """
     if is_plain():
         return function
@@ -81,7 +82,7 @@ def inlined(function: Function) -> Function:
 
 @cache
 def _files(package: Path, module: str) -> set[Path]:
-    """Return the files of a module of this package, or of all modules of a subpackage, and of all their imports."""
+    """Return the file of a module of this package, or the files of a subpackage, with the files of all imports."""
     path = package / f"{module.replace('.', '/')}.py"
     if not path.exists():
         return set(path.with_suffix("").glob("*.py"))
@@ -91,7 +92,7 @@ def _files(package: Path, module: str) -> set[Path]:
 
 @cache
 def _tuples(package: Path) -> bytes:
-    """Return all named tuples of railfix by file: numba cannot load cached code for a tuple class that has moved."""
+    """Return all named tuples by file, because numba cannot load cached code for a tuple class that has moved."""
     named = re.compile(rb"^class \w+\(NamedTuple\)", re.MULTILINE)
     files = ((path, named.findall(path.read_bytes())) for path in sorted(package.parent.rglob("*.py")))
     return b"\n".join(
@@ -101,7 +102,7 @@ def _tuples(package: Path) -> bytes:
 
 @cache
 def compute_stamp(package: Path, module: str) -> str:
-    """Return the hash of everything that a module's machine code depends on: its files, constants and tuple names."""
+    """Return the hash of all that a module's machine code depends on: source files, constants and names of tuples."""
     files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
     return hashlib.sha256(b"".join([*(path.read_bytes() for path in files), _tuples(package)])).hexdigest()
 
@@ -121,9 +122,9 @@ def _remove_outdated(folder: Path, module: str) -> None:
 
 @cache
 def announce_compilation() -> None:
-    """Report once, on a terminal, that kernels are being compiled."""
+    """Report once, if standard error is a terminal, that kernels are being compiled."""
     if sys.stderr.isatty() and multiprocessing.parent_process() is None:
-        sys.stderr.write("compiling for this processor, once: about a minute\n")
+        sys.stderr.write("compiling kernels for this processor once: about a minute\n")
 
 
 def _name(function: Any) -> str:
@@ -131,7 +132,7 @@ def _name(function: Any) -> str:
 
 
 def _record_file() -> Path:
-    """Return the file that records the argument types for which all kernels of these sources have been compiled."""
+    """Return the path of the record of argument types for which all kernels of these sources have been compiled."""
     modules = sorted({function.py_func.__module__.removeprefix("railfix.kernels.") for function in COMPILED})
     stamps = [compute_stamp(_PACKAGE, module) for module in modules]
     name = hashlib.sha256("".join([*stamps, numba.__version__, sys.version]).encode()).hexdigest()
@@ -155,7 +156,7 @@ def is_compiled() -> bool:
 
 
 def load() -> None:
-    """Load the machine code of all kernels; kernels without it are compiled at their first call."""
+    """Load the machine code of all kernels; kernels without machine code are compiled when they are first called."""
     if not COMPILED or not is_compiled():
         return
     types = pickle.loads(_record_file().read_bytes())

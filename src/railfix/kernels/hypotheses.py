@@ -1,4 +1,4 @@
-"""Effect of each fault hypothesis on the position."""
+"""Effect of each fault hypothesis on the position error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from railfix.kernels.level_equations import (
 
 
 class _Tails(NamedTuple):
-    """Error offset, sigma and weight of all hypotheses (T, K); ratio of separation to threshold (K,)."""
+    """Offset, sigma and weight of the error for all hypotheses (T, K); ratio of separation to threshold (K,)."""
 
     offset: Floats
     sigma: Floats
@@ -36,12 +36,13 @@ class _Tails(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Inputs of one base of hypotheses: channel membership, and the remaining system without the base.
+    """Inputs for the hypotheses of one base (a shared fault): channels of the base, and the system without these
+    channels.
 
-    `others` has priors of the rest (n,), `removed` the effect of the base (4,), `own` work space (n,). By depth, for
-    sets of channels left out in sequence: the system `reduced` (2, n + 4, n), the part `taken` (3, 4), whether a fault
-    is `undetectable`, the next channel (`start`), the output index of its sets (`place`), and the product of the
-    priors; shape (3,).
+    `others`: fault priors of the other channels (n,). `removed`: effect of the base (4,). `own`: work space (n,). The
+    other fields are indexed by the number of channels left out so far: remaining system `reduced` (2, n + 4, n), effect
+    `taken` (3, 4), whether a fault is `undetectable`, next channel (`start`), output index (`place`), `product` of
+    priors (3,).
     """
 
     member: Masks
@@ -59,7 +60,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma, and ratio of separation to threshold, of sets of excluded channels in their order."""
+    """Offset, sigma, and ratio of separation to threshold, for sets of excluded channels, in order."""
 
     offset: Floats
     sigma: Floats
@@ -70,7 +71,8 @@ class _Sets(NamedTuple):
 def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
     """Leave out channels in sequence; return whether a fault of these channels is undetectable.
 
-    `removed` gets their effect; `work` has the rows of the remaining system, for all channels if `every` is set.
+    `removed` gets the effect of the channels, and `work` the rows of the remaining system, with `every` of all
+    channels.
     """
     n, undetectable = rows.shape[1], False
     for i in range(n + 4):
@@ -107,9 +109,9 @@ def _with_each_later(
     ranges: RangeErrors,
     sets: _Sets,
 ) -> None:
-    """Write the sets of channel i and one later channel, left out together from the system `rows`.
+    """Write the results for each pair of channel i and a later channel that are left out from the system `rows`.
 
-    `removed` and `undetectable` describe the channels left out before.
+    `removed` and `undetectable` describe the channels that were left out before.
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
@@ -144,9 +146,10 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     Returns
     -------
     channel : ndarray of int, shape (T, n)
-        Channels, those in use first.
+        Indices of the channels; channels in use come first.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
-        Arguments of `level.solve_level`: threshold plus bias, sigma (infinite for undetectable faults), prior.
+        Arguments of `level.solve_level`: threshold plus bias, sigma (infinite for undetectable faults), prior
+        probability.
     separation : ndarray, shape (T,)
         `ProtectionLevel.separation`.
     """
@@ -204,7 +207,7 @@ def _write_base(
     work: _Work,
     tails: _Tails,
 ) -> None:
-    """Write the hypotheses of a base at index `at` (epoch, base): its shared fault alone and with further channels."""
+    """Write the hypotheses of the base `at` (epoch, base): the shared fault alone, and with further faulty channels."""
     (t, base), n, rows = at, len(channels.root), system.rows
     order, first, prior = asked.order[t, base], asked.first[base], asked.shared_prior[t, base]
     some = False
@@ -241,7 +244,7 @@ def _write_one(
     common: Floats,
     tails: _Tails,
 ) -> None:
-    """Write a hypothesis from its effect; its error is unbounded if it is undetectable."""
+    """Write a hypothesis from the effect of the excluded channels; an undetectable fault gives an unbounded error."""
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = separate(
         removed[0], removed[1], removed[2], removed[3], more, common
     )
@@ -253,7 +256,7 @@ def _write_one(
 def _write_singles(
     t: int, at: int, system: System, ranges: RangeErrors, undetectable: bool, work: _Work, tails: _Tails
 ) -> None:
-    """Write the hypotheses that leave out one channel each, from index `at` on."""
+    """Write the hypotheses in which one further channel is left out, from index `at` on."""
     rows, n, limit, removed, whole = system.rows, len(work.own), system.common[LIMIT], np.empty(4), (0.0, 0.0, 0.0)
     if ranges.any:
         whole = of_ranges(rows[n], ranges)
@@ -273,7 +276,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write sets of two and more channels: the first `depth` are left out in sequence, then the last two together."""
+    """Write the sets of two and more channels; the last two channels are left out together, all others one by one."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

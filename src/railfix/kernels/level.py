@@ -10,17 +10,17 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import inner, kernel
 
-#: Relative step size below which the next level is exact to 1e-6; that step is the last.
+#: Relative step size below which the next level is exact to 1e-6; the step to it is the last.
 _CLOSE = 5e-4
-#: Largest number of steps; if they do not converge, the lowest level found within the risk is used.
+#: Largest number of steps; without convergence, the lowest level found within the risk is used.
 _STEPS = 60
-#: From this step on every second step bisects the bracket, because steps can alternate between two points.
+#: Number of the step from which every second step bisects the bracket, because steps can alternate between two points.
 _HALVING = 8
-#: Fraction of the risk that remains unused.
+#: Fraction of the risk that is left unused.
 _AIM = 0.002
 #: Relative difference below which two hypotheses require the same level; the first of them is reported.
 _ALIKE = 1e-9
-#: Q(x) is the density at x over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 %, x >= 0 (Borjesson and Sundberg 1979).
+#: a, b: for x >= 0, Q(x) is the density over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 % (Borjesson and Sundberg 1979).
 _MILLS = (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
@@ -44,7 +44,7 @@ _E = tuple(1.0 / math.factorial(k) for k in range(12))
 
 @inner
 def _mills(x: float) -> float:
-    """Return the Mills ratio at x >= 0: Gaussian tail over density."""
+    """Return the Mills ratio at x >= 0, that is, the Gaussian tail divided by the density."""
     y = x * _ROOT_HALF
     p = (((((((_P[0] * y + _P[1]) * y + _P[2]) * y + _P[3]) * y + _P[4]) * y + _P[5]) * y + _P[6]) * y + _P[7]) * y
     q = (((((((_Q[0] * y + _Q[1]) * y + _Q[2]) * y + _Q[3]) * y + _Q[4]) * y + _Q[5]) * y + _Q[6]) * y + _Q[7]) * y
@@ -71,7 +71,7 @@ def _bells(z: Floats, bits: Indices, out: Floats) -> None:
 
 @inner
 def _quantile(probability: float) -> float:
-    """Return the number of sigmas that a standard normal variable exceeds with a probability, as `one_sided_k`."""
+    """Return the value that a standard normal variable exceeds with a probability, as `one_sided_k` does."""
     if probability >= 1.0:
         return -np.inf
     if not probability > 0.0:
@@ -90,8 +90,8 @@ def _quantile(probability: float) -> float:
 
 
 class _Room(NamedTuple):
-    """Work space of an epoch. For each hypothesis, shape (K,): inverse sigma, weight if its fault is checked, required
-    level, sigmas to the level, exp(-z^2/2) and tail. For each kind: the sum of the tails.
+    """Work space of an epoch. For each hypothesis (K,): inverse sigma, weight (0 if undetectable), required level,
+    sigmas to the level, exp(-z^2/2) and tail; for each kind of hypothesis, the sum of the tails.
     """
 
     inverse: Floats
@@ -111,9 +111,9 @@ def solve_level(
     """Find the level at which the summed tails of all hypotheses, ``weight Q((L - offset)/sigma)``, stay within the
     risk.
 
-    Undetectable faults use the risk with their full weight; the remaining risk is for checked faults. The largest part
-    is a level within the risk, because the risk is divided among the parts. From there the level is lowered until the
-    sum of the tails reaches 0.998 of the risk.
+    Undetectable faults use risk equal to their full weight; the remaining risk is for checked faults. Divided among the
+    kinds of hypotheses, the risk requires a level for each kind. The largest of these levels is lowered in steps until
+    the sum of the tails reaches 0.998 of the risk.
 
     Parameters
     ----------
@@ -130,11 +130,12 @@ def solve_level(
     -------
     level_m : ndarray, shape (T,) [m]
     spender : ndarray of int8, shape (T,)
-        Kind that uses most of the risk at that level.
+        Kind of hypothesis that uses most of the risk at that level.
     part_m, k : ndarray, shape (T, kinds)
-        Largest ``offset + k sigma`` of each kind; 0, with k = -inf, where its hypotheses fit into its share unchecked.
+        Largest ``offset + k sigma`` of each kind; 0, with k = -inf, where the total weight of the kind is within its
+        `share`.
     worst : ndarray of int, shape (T, kinds)
-        Hypothesis that requires `part_m`, counted within its kind; -1 if there is none.
+        Index within the kind of the hypothesis that requires `part_m`; -1 if there is none.
     """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
@@ -168,7 +169,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return a kind's risk left for checked faults, its k, the largest required level, and the hypothesis of it."""
+    """Return, for one kind, the risk left for checked faults, k, the largest required level, and the index of it."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]
@@ -195,9 +196,7 @@ def _require(
 
 @inner
 def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _Room) -> tuple[float, int]:
-    """Return the level whose summed tails equal `aim`, found by steps down from `highest`, and the kind with the
-    largest sum.
-    """
+    """Return the level at which the tails sum to `aim`, by steps from `highest`, and the kind with the largest sum."""
     level, spender, here, below, above = highest, 0, highest, 0.0, highest
     for number in range(_STEPS):
         _write_tails(offset, here, number == 0, room)
@@ -221,7 +220,7 @@ def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _R
 
 @inner
 def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> None:
-    """Write the tail of each hypothesis beyond a level: its weight times Q."""
+    """Write the tail of each hypothesis beyond a level: weight times Q, which is exact to 0.3 % if `roughly` is set."""
     for m in range(len(offset)):
         room.z[m] = (offset[m] - level) * room.inverse[m]
     _bells(room.z, room.bits, room.bell)
@@ -238,7 +237,7 @@ def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> No
 
 @inner
 def _step(bounds: Indices, here: float, highest: float, aim: float, room: _Room) -> tuple[float, float]:
-    """Return the logarithm of the tails over `aim`, and the next level from its first and second derivative."""
+    """Return the logarithm of summed tails over `aim`, and the next level, from the derivatives of the logarithm."""
     total, slope, bend = 0.0, 0.0, 0.0
     for kind in range(len(room.of_kind)):
         room.of_kind[kind] = 0.0

@@ -1,4 +1,4 @@
-"""Equations of an epoch for fault hypotheses: channels, their projector, gains and residuals."""
+"""Equations of an epoch for fault hypotheses: channels, and the channels' projector, gains and residuals."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 
-#: Smallest effect of a satellite on the position, in position sigmas; a smaller effect is taken as zero.
+#: Effect of a satellite on the position, in position sigmas, below which the effect is taken as zero.
 _NO_EFFECT = 1e-6
-#: Separations below this fraction of sigma are taken as zero.
+#: Separation, as a fraction of sigma, below which the separation is taken as zero.
 _SAME = 1e-9
 #: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to map errors
 #: across and up, mean map error across and up, false-alarm threshold in sigmas, smallest threshold, flag of equations
@@ -21,7 +21,7 @@ _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FR
 
 
 class Channels(NamedTuple):
-    """Channels of one epoch, contiguous, channels in use first; zero for the others. Shape (n,) each."""
+    """Contiguous arrays of one epoch's channels, shape (n,); channels in use come first, the others have zeros."""
 
     number: Indices  #: Index of the channel in the model.
     root: Floats  #: Root of the channel's weight [1/m].
@@ -29,17 +29,17 @@ class Channels(NamedTuple):
     along: Floats  #: Whitened design.
     across: Floats
     up: Floats
-    prior: Floats  #: Prior probability of a fault.
+    prior: Floats  #: Prior probability of a fault of the channel.
     bias: Floats  #: Mean error, whitened.
-    beyond: Floats  #: Variance beyond the noise, whitened.
-    shared: Floats  #: Covariance of two channels through their clocks; shape (n, n).
+    beyond: Floats  #: Variance in addition to the noise, whitened.
+    shared: Floats  #: Covariance of two channels due to their clocks; shape (n, n).
 
 
 class System(NamedTuple):
     """Equations of one epoch.
 
-    `rows`: the projector of the channels, and below it their gains, residuals, and responses to map errors across and
-    up; shape (n + 4, n). `common`: values common to all channels; shape (11,).
+    `rows`: projector of the channels, and below it the channels' gains, residuals, and responses to map errors across
+    and up; shape (n + 4, n). `common`: values that are the same for all channels; shape (11,).
     """
 
     rows: Floats
@@ -47,7 +47,7 @@ class System(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Misfits summed by clock (C,) and by axis (3,), and the steps of position and clocks that they imply."""
+    """Misfits summed by clock (C,) and by axis (3,), and the steps of position and clocks that the sums imply."""
 
     by_clock: Floats
     by_axis: Floats
@@ -56,10 +56,9 @@ class _Fit(NamedTuple):
 
 
 class RangeErrors(NamedTuple):
-    """Errors of single ranges in addition to the noise, where there are `any`: `bias`, and additional variance
-    `beyond`.
+    """Errors of single ranges in addition to the noise, if there are `any`: `bias`, and variance `beyond`.
 
-    `gain` is the gain of the ranges before any exclusion, `own` is work space for other gains.
+    `gain` is the gain of the ranges before exclusions; `own` is work space for gains after exclusions.
     """
 
     any: bool
@@ -71,7 +70,7 @@ class RangeErrors(NamedTuple):
 
 @inner
 def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
-    """Return the contributions of single-range gains to bias, variance of the distance, and variance."""
+    """Return what the gains `left` of single ranges contribute to bias, variance of the separation, and variance."""
     bias, apart, total = 0.0, 0.0, 0.0
     for m in range(len(left)):
         bias += abs(left[m]) * ranges.bias[m]
@@ -84,7 +83,7 @@ def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
 def separate(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
-    """Return offset, sigma, and ratio of separation to threshold of a set of excluded channels from its effect."""
+    """Return offset, sigma, and ratio of separation to threshold, from the effect of a set of excluded channels."""
     noise, whole_across, whole_up = common[_NOISE], across + common[_MAP_ACROSS], up + common[_MAP_UP]
     apart = noise * square + (1.0 - noise) * (across * across + up * up)
     whole = whole_across * whole_across + whole_up * whole_up
@@ -128,7 +127,7 @@ def choose_channels(root: Floats, number: Indices) -> None:
 
 @inner
 def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Channels) -> None:
-    """Write the channels of one epoch contiguously, in the order of `channels.number`."""
+    """Write the data of one epoch's channels contiguously, in the order of `channels.number`."""
     n = len(channels.number)
     for i in range(n):
         m = channels.number[i]
@@ -174,7 +173,7 @@ def fit_misfits(model: Any, t: int, channels: Channels, fit: _Fit) -> None:
 
 @inner
 def _spread(channels: Channels, i: int, covariance: Floats) -> tuple[float, float, float]:
-    """Return the product of the position covariance and a channel's design vector."""
+    """Return the product of the position covariance and the design vector of a channel."""
     x, y, z = channels.along[i], channels.across[i], channels.up[i]
     return (
         x * covariance[0, 0] + y * covariance[1, 0] + z * covariance[2, 0],
@@ -185,7 +184,7 @@ def _spread(channels: Channels, i: int, covariance: Floats) -> tuple[float, floa
 
 @inner
 def _write_projector(channels: Channels, covariance: Floats, rows: Floats) -> None:
-    """Write the projector of the channels by the covariance of the position, and below it their gains."""
+    """Write the projector of the channels, computed with the position covariance, and below it the channels' gains."""
     n = len(channels.root)
     for i in range(n):
         along, across, up = _spread(channels, i, covariance)
@@ -198,7 +197,7 @@ def _write_projector(channels: Channels, covariance: Floats, rows: Floats) -> No
 
 @inner
 def write_with_map(model: Any, errors: Any, k: float, t: int, channels: Channels, fit: _Fit, system: System) -> None:
-    """Write the equations of an epoch with a correct map; `k` is the false-alarm threshold in sigmas."""
+    """Write the equations of an epoch for a correct map; `k` is the false-alarm threshold in sigmas."""
     n, rows, common, covariance = len(channels.root), system.rows, system.common, model.covariance_m2[t]
     root_across, root_up = math.sqrt(model.prior[1, 1]), math.sqrt(model.prior[2, 2])
     _write_projector(channels, covariance, rows)
@@ -223,7 +222,7 @@ def write_without_map(
 ) -> bool:
     """Write the equations without the map, and return whether they determine a position.
 
-    Offsets include the full distance from the position with the map, and separations are not tested.
+    Offsets include the full distance between the positions without and with the map, and separations are not tested.
     """
     n, rows, common = len(channels.root), system.rows, system.common
     information, variance = errors.map_information[t], errors.scale[t] ** 2
@@ -247,7 +246,7 @@ def write_without_map(
 
 @inner
 def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: float) -> tuple[Floats, bool]:
-    """Return the covariance of the position with other information instead of the map, and whether it exists."""
+    """Return the position covariance with `information` in place of the prior from the map, and whether it exists."""
     normal, regular = _inverse(covariance)
     for a in range(3):
         for b in range(3):

@@ -1,4 +1,4 @@
-"""Ranges linearised at a position and whitened, with clocks eliminated; their residuals."""
+"""Linearisation and whitening of ranges at a position, with the clocks eliminated, and residuals of the ranges."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _write_clock_covariance(totals: Floats, tie_sigma_m: Floats, rho: Floats, co
 
 @inner
 def _invert_scaled(matrix: Floats, scale: Floats, inverse: Floats) -> None:
-    """Invert a symmetric 3 x 3 matrix, scaled to a unit diagonal in place; NaN where singular."""
+    """Invert a symmetric 3 x 3 matrix, which is scaled to a unit diagonal in place; NaN if it is singular."""
     for i in range(3):
         scale[i] = 1.0 / math.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else math.nan
     for i in range(3):
@@ -98,7 +98,7 @@ def linearise_ranges(
                     rows[m, i] = -(u0 * axes[t, i, 0] + u1 * axes[t, i, 1] + u2 * axes[t, i, 2])
                     sums[i, g] += w * rows[m, i]
             total += totals[g]
-        # Subtracting a constant common to all ranges changes no residual and preserves digits of the sums.
+        # Subtracting one constant from all ranges changes no residual, and preserves digits of the sums.
         common = common / total if total > 0.0 else 0.0
         _write_clock_covariance(totals, sigma_m[t] if tied else no, rho, clocks[t])
         for i in range(3):
@@ -131,7 +131,7 @@ def linearise_ranges(
 
 @kernel
 def residuals(model: Any) -> tuple[Floats, Floats, Floats]:
-    """Compute step, residuals and redundancies of the best fit to the misfits of `ModelArrays` (see `LinearModel`)."""
+    """Compute step, residuals and redundancies of the best fit to the misfits in `ModelArrays` (see `LinearModel`)."""
     root_weight, clock, clock_covariance_m2, design, covariance_m2, _, misfit = model
     epochs, channels = root_weight.shape
     groups = clock_covariance_m2.shape[1]

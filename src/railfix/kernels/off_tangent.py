@@ -1,4 +1,4 @@
-"""Risk that the true position is on a part of the line that departs from the tangent."""
+"""Risk that the true position is on a part of the line that deviates from the tangent at the estimated position."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 
 @inner
 def _inverse(matrix: Floats) -> Floats:
-    """Return the inverse of a symmetric 3 x 3 matrix; not finite where it is singular."""
+    """Return the inverse of a symmetric 3 x 3 matrix; the elements are not finite if the matrix is singular."""
     inverse = np.empty((3, 3))
     for a in range(3):
         i, j = (a + 1) % 3, (a + 2) % 3
@@ -30,7 +30,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 @inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
-    """Return an upper bound of the tail of a form that is at least ``1 - tau`` times the form of all channels."""
+    """Return an upper bound of the tail of a quadratic form that is at least ``1 - tau`` times that of all channels."""
     if not tau < 1.0:
         return 1.0
     form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
@@ -43,8 +43,8 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
     """Return the minimum point of a quadratic form, the diagonal cofactors of its matrix, and 1 over the determinant.
 
-    Forms are `constant`, `slope` (3), and the matrix by its elements xx, xy, xz, yy, yz, zz. The last number is 0 where
-    the matrix is singular.
+    A form is an array of `constant`, `slope` (3), and the matrix elements xx, xy, xz, yy, yz, zz. If the matrix is
+    singular, all returned numbers are 0.
     """
     sx, sy, sz = form[1], form[2], form[3]
     xx, xy, xz, yy, yz, zz = form[4], form[5], form[6], form[7], form[8], form[9]
@@ -63,7 +63,7 @@ def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, flo
 
 @inner
 def _compute_tail(form: Floats, clear_m: float) -> float:
-    """Return the tail of a form from its own matrix and slope."""
+    """Return the tail of a quadratic form, computed from the matrix and slope of this form."""
     x, y, z, c_xx, c_yy, _, inverse = _lowest(form)
     if inverse == 0.0:
         return 1.0
@@ -75,7 +75,7 @@ def _compute_tail(form: Floats, clear_m: float) -> float:
 
 
 class _Residuals(NamedTuple):
-    """Residuals of the used channels, their projector, and their change with the position."""
+    """Residuals of the used channels, projector of these channels, and change of the residuals with the position."""
 
     projector: Floats  # (M, M)
     residual: Floats  # (M,)
@@ -94,7 +94,7 @@ def _work_space(channels: int) -> _Residuals:
 
 @inner
 def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> None:
-    """Write the form without the channels i and j (-1 for none), from the form of all channels."""
+    """Write the quadratic form without the channels i and j (-1 for none), computed from the form of all channels."""
     projector, residual, rows, _, _ = residuals
     for k in range(10):
         form[k] = every[k]
@@ -141,7 +141,7 @@ def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> Non
 
 @inner
 def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, form: Floats) -> bool:
-    """Write the form without the channels of a side, left out in sequence; return whether the side has two channels."""
+    """Write the quadratic form without the channels of a side; return whether the side has at least two channels."""
     projector, residual, rows, _, _ = residuals
     n, count = len(used), 0
     member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
@@ -182,7 +182,7 @@ def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, for
 def _whiten(
     model: Any, t: int, noise: float, sigma_m: tuple[float, float], used: Indices, residuals: Any, every: Floats
 ) -> int:
-    """Write the channels in use, their residuals, and the form of all of them; return the number of these channels.
+    """Write the channels in use, their residuals, and the quadratic form of all of them; return their number.
 
     The map error is taken as equal in all horizontal directions, because the tangent differs between positions.
     """
@@ -249,11 +249,11 @@ def risk_off_tangent(
 ) -> Floats:
     """Return an upper bound of the probability that the true position lies off the tangent beyond a distance.
 
-    At a distance D along and across, a form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C) - c
-    . s``: c is its lowest point and C the inverse of its matrix, both along and across, and s its slope. Without the
-    channels J the matrix is at least ``1 - tau`` times the matrix of all channels, ``tau = trace(F_J C F_J^T S_JJ^-1)``
-    with their rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the other
-    epochs each subset has its own bound.
+    At a distance D along and across, a quadratic form exceeds its value at the position by at least ``(D - |c|)^2 /
+    trace(C) - c . s``. Here c is the minimum point, C the inverse of the matrix, both along and across, and s the
+    slope. Without the channels J, the matrix is at least ``1 - tau`` times that of all channels, with ``tau = trace(F_J
+    C F_J^T S_JJ^-1)`` and these channels' rows F_J of the design. The largest tau of one channel and of two decides
+    most epochs; in the other epochs, each subset is bounded separately.
 
     Parameters
     ----------
@@ -261,13 +261,13 @@ def risk_off_tangent(
         T epochs by M channels.
     scale : ndarray, shape (T,)
     likely : ndarray, shape (M,)
-        Probability of a fault of each channel.
+        Prior probability of a fault of each channel.
     sides : ndarray of bool, shape (T, S, M)
-        Channels that are faulty together.
+        Groups of channels that are assumed to be faulty together.
     side_prior : float
-        Probability of a fault of a whole side.
+        Prior probability of a fault of a whole side.
     clear_m : ndarray, shape (T,) [m]
-        Distance within which no part of the line is off the tangent.
+        Distance within which no part of the line deviates from the tangent.
     sigma_m : tuple of float [m]
         Map sigmas in plan and height.
     enough : float
@@ -276,7 +276,7 @@ def risk_off_tangent(
     Returns
     -------
     ndarray, shape (T,)
-        Sum over the hypotheses of no fault, one faulty satellite, two, and a faulty side.
+        Sum over the hypotheses: no fault, one or two faulty satellites, a faulty side.
     """
     epochs, channels = model.root_weight.shape
     used, total, leverage = np.empty(channels, dtype=np.intp), np.empty(epochs), np.empty(channels)
@@ -291,7 +291,7 @@ def risk_off_tangent(
             for b in range(a, 3):
                 matrix[a, b] = matrix[b, a] = every[at]
                 at += 1
-        # Largest tau of one channel and of two.
+        # Largest tau of one channel and of two channels.
         of_all = _inverse(matrix)
         spread, start, one, two = of_all[0, 0] + of_all[1, 1], 0.0, 0.0, 0.0
         for a in range(3):
@@ -343,7 +343,7 @@ def risk_off_tangent(
 def forms_of_hypotheses(
     model: Any, scale: Floats, likely: Floats, sides: Masks, side_prior: float, sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the K forms without fault, and without each channel, each pair and each side.
+    """Return the quadratic forms of K hypotheses: no fault, and a fault of each channel, each pair and each side.
 
     Parameters are those of `risk_off_tangent`.
 
@@ -402,20 +402,20 @@ def risk_beyond(
     length_m: Floats,
     beyond_m: Floats,
 ) -> Floats:
-    """Return the probability that the true position lies beyond a level off the tangent, over K hypotheses, shape (T,).
+    """Return the probability that the true position is off the tangent and beyond a level, for K hypotheses, (T,).
 
     Parameters
     ----------
     prior, form : ndarray
         Returned by `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` at the displacement d.
     radius_m : ndarray, shape (T, K)
-        A hypothesis is included if a part of the line beyond the level is nearer than this.
+        Distance of the line beyond the level below which a hypothesis is included.
     first : ndarray of int, shape (T + 1,)
         First section of each epoch.
     start_m, tangent : ndarray, shape (P, 3)
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of the sections beyond the level; infinite for other sections.
+        Distance of each section that is beyond the level; infinite for other sections.
     """
     epochs, hypotheses = prior.shape
     spent = np.zeros(epochs)

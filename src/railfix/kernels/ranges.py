@@ -1,4 +1,4 @@
-"""Pseudorange residuals at a position with the clocks eliminated, and positions from pseudoranges."""
+"""Pseudorange residuals at a position, with the clocks eliminated, and positions from pseudoranges."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from railfix.kernels.sight import sight
 
 
 class _Epoch(NamedTuple):
-    """One epoch of `RangeArrays`; `offset_m` has length 0 without known clock offsets."""
+    """One epoch of `RangeArrays`; `offset_m` has length 0 if no clock offsets are known."""
 
     sat_ecef_m: Floats
     code_m: Floats
@@ -24,7 +24,7 @@ class _Epoch(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Results of `reduced_equations` for one epoch, and the weights of the clock groups."""
+    """Results of `reduced_equations` for one epoch, and weights of the clock groups."""
 
     system: Floats
     means: Floats
@@ -37,7 +37,7 @@ class _Equations(NamedTuple):
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
     """Compute the normal equations of one epoch.
 
-    The loops over all channels have no branches, so that they are vectorised; unused channels must have finite values.
+    The loops over all channels have no branches, so that they are vectorised. Unused channels must have finite values.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
     system, means, rows, totals, _ = equations
@@ -127,13 +127,13 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     Returns
     -------
     system : ndarray, shape (T, 4, 4)
-        Normal matrix of the three axes and the residual.
+        Normal matrix of four columns: the three axes and the residual.
     means : ndarray, shape (T, 4, G)
-        Weighted means of the groups.
+        Weighted means of the clock groups.
     rows : ndarray, shape (T, 4, M)
-        Design and residual less their group means; 0 where the weight is 0.
+        Design and residual minus the means of the clock group; 0 where the weight is 0.
     seen : ndarray of bool, shape (T, G)
-        Groups with weight.
+        Clock groups that have a weight above 0.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
@@ -153,7 +153,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
 
 @kernel
 def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
-    """Compute `normal_equations.misfit` of arrays in C order, with a position for each of `epochs`."""
+    """Compute `normal_equations.misfit` for arrays in C order, at one position for each of `epochs`."""
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     channels, groups = weight.shape[1], len(starts)
     tied = len(offset_m) == len(code_m)
@@ -195,9 +195,9 @@ def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
 
 @inner
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
-    """Compute clocks and residuals of one epoch after a step, to first order.
+    """Compute the clocks and residuals of one epoch after a step of the position, to first order.
 
-    A step of 5 m leaves an error of 0.03 mm: the design neglects the gradient of the Earth's rotation correction.
+    After a step of 5 m the error is 0.03 mm, as the design neglects the gradient of the Earth's rotation correction.
     """
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
@@ -234,7 +234,7 @@ def iterate_points(
     enough : ndarray of bool, shape (T,)
         Epochs with enough satellites for a position; results of other epochs are NaN.
     tolerance_m, most
-        Convergence limit of the step, and largest number of steps.
+        Step [m] below which the iteration has converged, and largest number of steps.
 
     Returns
     -------
@@ -317,7 +317,7 @@ def _form(system: Floats, a: Floats, b: Floats) -> float:
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:
-    """Return step, sigma, sigma with an exact map, and minimum WSSE along a section, with the map error included.
+    """Return step, sigma, sigma with an exact map, and minimum WSSE along a section; the others include the map error.
 
     The Schur complement eliminates the map error, so that only the distance along the line remains.
     """
@@ -356,7 +356,7 @@ def iterate_along(
     vertex : ndarray of int, shape (T,)
         Start point; -1 for none.
     tolerance_m, most
-        Convergence limit of the step, and largest number of steps.
+        Step [m] below which the iteration has converged, and largest number of steps.
 
     Returns
     -------

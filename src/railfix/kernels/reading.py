@@ -1,4 +1,4 @@
-"""Decode lines and observation fields of a text, and compute their array indices."""
+"""Decode the lines and observation fields of a text, and compute the array indices of the fields."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
 _U = np.uint64
-#: Constants of `railfix.io.rinex.observations_decode`.
+#: The same constants as in `railfix.io.rinex.observations_decode`.
 _WIDTH, _TAIL_WRONG, _BLANK, _ZERO = 16, np.uint8(255), np.uint8(32), np.uint8(48)
 _BLANKS, _ZEROS, _ZEROS_POINT = _U(0x2020202020202020), _U(0x3030303030303030), _U(0x30303030302E3030)
 _NOT_A_DIGIT, _MINUS, _BYTE, _ONE, _NONE = _U(0x1010101010101010), _U(0x0D0D0D0D0D0D0D0D), _U(0xFF), _U(1), _U(0)
@@ -24,14 +24,14 @@ _LOW_PAIR, _HIGH_PAIR = _U(100 + (1_000_000 << 32)), _U(1 + (10_000 << 32))
 
 @inner
 def _eight_digits(word: np.uint64) -> np.uint64:
-    """Return the value of eight digits; the lowest byte is the most significant digit."""
+    """Return the value of eight decimal digits; the lowest byte is the most significant digit."""
     word = word * _10 + (word >> _8)
     return ((word & _PAIRS) * _LOW_PAIR + ((word >> _16) & _PAIRS) * _HIGH_PAIR) >> _32
 
 
 @inner
 def _word(data: Bytes, at: np.uintp) -> np.uint64:
-    """Return eight characters as an integer, with the first as the lowest byte; compiled to one load instruction."""
+    """Return eight characters as an integer, the first in the lowest byte; this is compiled to one load instruction."""
     word = _U(data[at])
     for i in range(1, 8):
         word |= _U(data[at + np.uintp(i)]) << _U(8 * i)
@@ -42,7 +42,7 @@ def _word(data: Bytes, at: np.uintp) -> np.uint64:
 def decode_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
-    """Decode the fields of standard form, shape (n, k); the arguments are those of `read_fields`.
+    """Decode the fields that have the standard form, shape (n, k); the arguments are those of `read_fields`.
 
     Returns the values (NaN where blank or not of standard form), the loss-of-lock digits (uint8, 255 where the last two
     characters are neither blanks nor digits), and a mask of the fields that do not have the standard form.
@@ -103,7 +103,7 @@ def place_fields(
     kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
         One array per kind of observable.
     cell : ndarray of int, shape (n,)
-        For each line, epoch times M plus the satellite's first channel.
+        For each line, the epoch's index times M, plus the satellite's first channel.
     kind, signal : ndarray of int, shape (k,)
         Kind of observable of each field, and its channel index within the satellite.
     value, digit : ndarray, shape (n, k)

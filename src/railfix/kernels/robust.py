@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
-#: Smallest scale of whitened residuals, because ranges agree more closely only by chance.
+#: Smallest scale of whitened residuals; ranges agree more closely only by chance.
 _LEAST_SCALE = 0.05
 
 
@@ -60,7 +60,7 @@ def reweight_ranges(
         Linearisation points, in C order.
     information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
     correction : ndarray, shape (T,)
-        Ratio of the scale of the residuals to their median.
+        Ratio of the scale of the residuals to the median of the residuals.
     keep, reject : float
     iterations : int
 
@@ -70,7 +70,7 @@ def reweight_ranges(
     wsse : ndarray, shape (T,)
         Weighted sum of squared residuals of the kept ranges.
     solved : ndarray of bool, shape (T,)
-        False where the last step was not determined.
+        False where the equations of the last step were singular.
     """
     epochs, channels = ranges.weight.shape
     tied, informed = len(ranges.offset_m) == epochs, len(information) == epochs
@@ -113,7 +113,7 @@ def _new_room(channels: int, clocks: int) -> _Room:
 
 @inner
 def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
-    """Write the used channels contiguously, with their sights and misfits, and return their number."""
+    """Write the used channels contiguously, with unit vectors to the satellites and misfits; return their number."""
     channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
     for g in range(clocks):
         room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels
@@ -134,7 +134,7 @@ def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
 
 @inner
 def _sum_clocks(room: _Room) -> None:
-    """Write the weights, and the sum and mean row of each clock; subtract the mean from the rows."""
+    """Write the weights, and the total weight and mean row of each clock; subtract the mean from the rows."""
     for g in range(len(room.total)):
         total = x = y = z = misfit = 0.0
         for k in range(room.begin[g], room.begin[g + 1]):
@@ -197,7 +197,7 @@ def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, ve
 
 @inner
 def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
-    """Solve three symmetric equations, and return whether they are determined; otherwise the step is zero."""
+    """Solve three symmetric equations, and return whether they are regular; if they are not, the step is zero."""
     a, b, c, d, e, f = normal[0, 0], normal[0, 1], normal[0, 2], normal[1, 1], normal[1, 2], normal[2, 2]
     of_x, of_y, of_z = d * f - e * e, c * e - b * f, b * e - c * d
     determinant, mean = a * of_x + b * of_y + c * of_z, (a + d + f) / 3.0
@@ -213,7 +213,7 @@ def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
 
 @inner
 def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
-    """Write the whitened residuals after the step of the position and of each clock; zero without a step."""
+    """Write the whitened residuals after the step of position and clocks; they are zero if there is no step."""
     for g in range(len(room.total)):
         known = 1.0 if solved and room.total[g] > 0.0 else 0.0
         clock = room.mean[3, g]
@@ -225,7 +225,7 @@ def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
 
 @inner
 def _median(count: int, room: _Room) -> float:
-    """Return the median of the whitened residuals; their order is kept, because it changes little between calls."""
+    """Return the median of the whitened residuals; `room.order` keeps the order, which changes little between calls."""
     for k in range(count):
         at, number = k, room.order[k]
         while at > 0 and room.white[room.order[at - 1]] > room.white[number]:

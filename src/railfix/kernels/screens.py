@@ -1,4 +1,4 @@
-"""Code offsets of satellites after jumps; medians over the channels of a clock; signs of interference."""
+"""Kernels of screens: code offsets after jumps, medians over the channels of a clock, and signs of interference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
-#: Time of an event that has not occurred: NaT as a number.
+#: Time of an event that has not occurred (NaT as an integer).
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
 
@@ -38,10 +38,10 @@ def suspicions(
 ) -> tuple[Masks, Floats, Integers]:
     """Track the offset of each satellite's code after a jump.
 
-    An offset is the sum of the metric from the jump on, so that chunk boundaries have no effect. `metric` and `limit`
-    have shape (T, M), in C order; the previous offsets and starts of suspicions have shape (M,), `NEVER` for none.
-    Returns the rejections, the offsets (0 without suspicion, NaN without a metric), and the starts of the suspicions
-    that continue after the chunk.
+    An offset is the sum of the metric since the jump, so that chunk boundaries have no effect. `metric` and `limit`
+    have shape (T, M), in C order. The offsets and the starts of suspicions before the chunk have shape (M,); the start
+    is `NEVER` without a suspicion. Return the rejections, the offsets (0 without a suspicion, NaN without a metric),
+    and the starts of the suspicions that continue after the chunk.
     """
     epochs, channels = metric.shape
     reject, level = np.zeros((epochs, channels), dtype=np.bool_), np.empty((epochs, channels))
@@ -55,7 +55,7 @@ def suspicions(
             suspected = suspected and not math.isnan(value) and time_ns[t] <= start + hold_ns
             if suspected:
                 total += value
-                suspected = abs(total) > limit[t, m]  # the epoch of return is not checked again
+                suspected = abs(total) > limit[t, m]  # the epoch at which the code returns is not tested for a new jump
             elif abs(value) > limit[t, m]:
                 start, total, suspected = time_ns[t], value, True
             if suspected:
@@ -67,9 +67,10 @@ def suspicions(
 
 @kernel
 def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Return the median of the values (T, M) of each clock at its channels; NaN is ignored.
+    """Return for each channel the median of the values (T, M) of all channels of the same clock; NaN is ignored.
 
-    NaN with fewer than `least` finite satellites; clock and satellite of each channel are integers, shape (M,).
+    It is NaN with fewer than `least` finite satellites. `clock` and `satellite` are the indices of each channel, shape
+    (M,).
     """
     epochs, channels = values.shape
     result = np.full(values.shape, math.nan)
@@ -117,10 +118,11 @@ def falls_of_cn0(
     known_after_s: float,
     least: int,
 ) -> tuple[Floats, Floats, Floats, tuple[Floats, Floats, Floats]]:
-    """Return the falls of C/N0 below the recent peaks: the statistics of `PowerSigns`, shape (T,), and the new state.
+    """Return the falls of C/N0 below recent peaks: the statistics of `PowerSigns`, shape (T,), and the state
+    afterwards.
 
-    `before` are peaks, start times and times of the last observations of `PowerState`, shape (K,); a peak decays by
-    `decay` per second.
+    `before` has the peaks, start times and last observation times of `PowerState`, shape (K,). A peak decays by `decay`
+    per second.
     """
     epochs, channels = cn0_dbhz.shape
     peak, first, last = before[0].copy(), before[1].copy(), before[2].copy()
@@ -159,10 +161,10 @@ def clock_steps(
     longest_s: float,
     least: int,
 ) -> tuple[Floats, tuple[Floats, Floats, Integers]]:
-    """Return the median change of codes (T, K) less the change by Dopplers, shape (T,), and the new state.
+    """Return the median over channels of code change minus Doppler change, shape (T,), and the state afterwards.
 
-    `before` and the new state are each channel's last code, Doppler and time, shape (K,). Values are not compared
-    across a break or after more than `longest_s`; the result is NaN with fewer than `least` channels.
+    `before` and the returned state have each channel's last code, Doppler and time, shape (K,). Values are not compared
+    across a break or after more than `longest_s`. The median is NaN with fewer than `least` channels.
     """
     epochs, channels = code_m.shape
     code, rate, since = before[0].copy(), before[1].copy(), before[2].copy()
@@ -196,10 +198,10 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return masks of the conditions that have been true for their required time, and of those still active, (T, C).
+    """Return masks (T, C): conditions that have been true for the required time, and conditions that are still active.
 
-    The new state is also returned (`integrity.interference.limits.hold_signs`). `before` is the duration of each
-    condition, and the time of its last activity, shape (C,).
+    The state after the chunk is also returned (see `integrity.interference.limits.hold_signs`). `before` has the
+    duration of each condition and the time at which the condition was last active, shape (C,).
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

@@ -1,4 +1,4 @@
-"""Search for line points near a position and for the best of them; distances to parts of a line off its tangent."""
+"""Search for line points near a position, and for the best of them; distances within which a line is straight."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import ALONG, CLEAR_M, FAN_OUT, ON_TANGENT_M, ROTATION_GRADIENT
 from railfix.kernels.compiling import inner, kernel
 
-#: Half the inverse of the shortest range to a navigation satellite, rounded down (GLONASS at the zenith) [1/m].
+#: Half the inverse of the shortest range to a navigation satellite (GLONASS at the zenith), rounded down [1/m].
 _CURVATURE = 1.0 / (2.0 * 1.9e7)
-#: Allowance for rounding in the radius of a stretch [m].
+#: Allowance for rounding errors in the radius of a stretch [m].
 _SLACK_M = 1e-6
 
 
 @inner
 def _bend_m(distance_m: float) -> float:
-    """Return the largest linearisation error of a range at a distance from its expansion point [m]."""
+    """Return the largest linearisation error of a range [m] at a distance from the linearisation point."""
     return distance_m * distance_m * _CURVATURE + ROTATION_GRADIENT * distance_m
 
 
@@ -36,12 +36,12 @@ def radii_of_balls(
 ) -> Floats:
     """Return the radius of the ball around each 3-D position that contains every candidate point, shape (n,) [m].
 
-    NaN where linearisation errors make it indeterminate.
+    The radius is NaN where linearisation errors make it indeterminate.
 
     Parameters
     ----------
     distance_m, away_m : ndarray, shapes (n,), (n, 3) [m]
-        Distance and vector to the nearest point of the line.
+        Distance and vector from the 3-D position to the nearest point of the line.
     matrix, covariance_m2, wsse : ndarray, shapes (n, 3, 3), (n, 3, 3), (n,)
         Normal matrix, covariance and WSSE of the 3-D positions.
     weight_norm : ndarray, shape (n,)
@@ -77,9 +77,9 @@ def points_within(
     nodes: Indices,
     below: Indices,
 ) -> tuple[Indices, Indices, int]:
-    """Find the points of a line in a ball, by `SearchIndex.stretches`.
+    """Find the points of a line that are within a ball, with `SearchIndex.stretches`.
 
-    Returns the work array with the points, the other work array, and the number of points.
+    Return the work array that has the points, the other work array, and the number of points.
     """
     middle, reach_m, first = stretches
     x, y, z = centre_m
@@ -116,7 +116,7 @@ def points_in_balls(
     least: Floats,
     weight_norm: Floats,
 ) -> tuple[Indices, Indices, Floats, Floats, Masks]:
-    """Find the points of a line in one ball per epoch, and their q by the quadratic form around its centre.
+    """Find the points of a line in one ball per epoch, and q at each point by a quadratic form about the ball's centre.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def points_in_balls(
         `SearchIndex.stretches`.
     centre_m, radius_m : ndarray, shapes (n, 3), (n,) [m]
     matrix, least : ndarray, shapes (n, 3, 3), (n,)
-        The quadratic form: normal matrix, and q at the centre.
+        Coefficients of the quadratic form: normal matrix, and q at the centre.
     weight_norm : ndarray, shape (n,)
         Root of the summed weights.
 
@@ -176,7 +176,7 @@ def points_in_balls(
 
 @inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
-    """Return the minimum q on the two sections that meet at a point, from its quadratic form."""
+    """Return the minimum of q on the two sections that meet at a point, computed with the quadratic form."""
     floor = q
     for side in range(2):
         section, sign = vertex - side, 1.0 - 2.0 * side
@@ -200,7 +200,7 @@ def best_points(
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
-    """Select the best point of each epoch, and the best point of any other position.
+    """Select for each epoch the best point, and the best point that counts as another position.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def best_points(
     line : tuple of ndarray
         `arc_m`, `tangent` and `length_m` of the trajectory.
     separation_m : float
-        Points nearer to each other than this along the line are one position.
+        Points closer together than this along the line count as one position.
     turn_m : float
         Length of a closed line; infinite for an open line.
 
@@ -258,9 +258,9 @@ def clear_of_sections(
     stretches: tuple[Indices, Floats, Indices],
     section: Indices,
 ) -> Floats:
-    """Return a distance along and across within which no part of a line is off its sections' tangents, (S,) [m].
+    """Return for each section a distance, along and across, within which the line is on the tangent; shape (S,) [m].
 
-    `ecef_m` are the points of the line (P, 3), the other arrays its sections; `stretches` is a field of `SearchIndex`.
+    `ecef_m` has the points of the line (P, 3), the other arrays its sections; `stretches` is a field of `SearchIndex`.
     """
     clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
     nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)

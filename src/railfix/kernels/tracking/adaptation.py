@@ -1,8 +1,8 @@
-"""Adaptation to the measurements: phase and Doppler noise, doubt, length errors of the map, faulty satellites.
+"""Adaptation to the measurements: phase and Doppler noise, contradictions, length errors of the map, faulty satellites.
 
-The normalised innovations of a satellite's codes have a mean near 0 over a minute, even with reflections, which come
-and go. A wrong clock record or a persistent reflection gives innovations of constant sign. The mean of the innovations,
-each clipped to one standard deviation, shows the fault (`is_faulty`).
+The normalised innovations of a satellite's codes have a mean near 0 over a minute, even if there are reflections for a
+short time. A wrong clock record or a persistent reflection causes innovations of constant sign. The mean of the
+innovations, each clipped to one standard deviation, then shows the fault (`is_faulty`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
 @inner
 def mean_square(rows: Rows, own: slice, found: Fit) -> float:
-    """Return the weighted mean square of normalised residuals of one kind; NaN for three or fewer residuals."""
+    """Return the weighted mean square of normalised residuals of one measurement kind; NaN for three or fewer
+    residuals.
+    """
     size, total = own.stop - own.start, 0.0
     for j in range(own.start, own.stop):
         total += found.weight[j] * (found.residual[j] ** 2 + found.fitted[j]) / rows.variance[j]
@@ -30,7 +32,7 @@ def mean_square(rows: Rows, own: slice, found: Fit) -> float:
 
 @inner
 def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
-    """Return the log scale of a variance updated by an epoch's mean square; NaN leaves it unchanged."""
+    """Return the log scale of a variance, updated with an epoch's mean square; NaN leaves the log scale unchanged."""
     if not math.isnan(mean_square):
         log_scale += (1.0 - math.exp(-min(dt, 1.0) / constants.SCALE_S)) * math.log(mean_square)
     return min(max(log_scale, constants.LEAST_SCALE), constants.LARGEST_SCALE)
@@ -38,7 +40,7 @@ def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
 
 @inner
 def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
-    """Update the duration of low weights of motion and of codes, and the filtered misfit of Dopplers and phases."""
+    """Update the timers of low motion weights and low code weights, and the filtered misfit of Dopplers and phases."""
     code, motion = mean_weights(rows, rows.variance, found.weight)
     if motion < constants.LOST_MOTION_WEIGHT:
         monitors.weak_motion_s += dt
@@ -46,7 +48,7 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
         monitors.weak_motion_s = max(monitors.weak_motion_s - constants.MOTION_LEAK * dt, 0.0)
     misfit = 0.0 if math.isnan(motion) else 1.0 - motion
     for j in range(rows.sensor.start, rows.sensor.stop):
-        misfit = 0.0 if rows.channel[j] < ix.FORCE_COLUMN else misfit  # a sensor measures the speed
+        misfit = 0.0 if rows.channel[j] < ix.FORCE_COLUMN else misfit  # a wheel or radar measures the speed
     monitors.motion_misfit += (1.0 - math.exp(-dt / constants.MOTION_FIT_S)) * (misfit - monitors.motion_misfit)
     if rows.code_s > 0.0:
         if code < constants.LOST_CODE_WEIGHT:
@@ -84,7 +86,7 @@ def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation
 
 @inner
 def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
-    """Return a satellite's mean normalised innovation, updated by a new innovation."""
+    """Return a satellite's mean normalised innovation, updated with a new innovation."""
     share = 1.0 - math.exp(-min(code_s, 1.0) / constants.BIAS_MEMORY_S)
     return code_bias + share * (min(max(innovation, -constants.BIAS_MOST), constants.BIAS_MOST) - code_bias)
 
@@ -99,9 +101,10 @@ def is_faulty(code_bias: float) -> bool:
 def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, weight: Floats) -> float:
     """Return the normalised position shift that the codes of an epoch imply; 0 with too few codes.
 
-    It is the score of the innovations v against a shift, ``h' S^-1 v / sqrt(h' S^-1 h)`` with h the coefficients of the
-    arc length: standard normal and white over epochs where the model holds. `covariance`, shape (Q, Q), is H P H' of
-    the quantities before the measurements, codes first; `weight`, shape (M,), are the first weights, limited to 1.
+    The shift is the score of the innovations v, ``h' S^-1 v / sqrt(h' S^-1 h)``, where h are the coefficients of the
+    arc length. It is standard normal and white over epochs if the model is correct. `covariance`, shape (Q, Q), is H P
+    H' of the quantities before the measurements, codes first. `weight`, shape (M,), are the initial weights, limited to
+    1.
     """
     codes = rows.code.stop
     if codes < constants.MISFIT_CODES:
@@ -123,7 +126,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
 
 @inner
 def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
-    """Update the mean code shift by an epoch's shift, and raise or lower the length error of the map."""
+    """Update the mean code shift with an epoch's shift, and raise or lower the length error of the map."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / constants.MAP_MISFIT_S)
     if abs(shift) > constants.STEP_SIGMAS:

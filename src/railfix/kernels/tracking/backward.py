@@ -1,4 +1,4 @@
-"""Information of later epochs carried backward through an epoch, for the smoother."""
+"""Propagation of information from later epochs backward through an epoch, for the smoother."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from railfix.kernels.tracking.update import correct
 def before_measurements(
     P: Floats, row: Floats, value: Floats, variance: Floats, vector: Floats, matrix: Floats
 ) -> tuple[Floats, Floats]:
-    """Carry the information of later epochs on the unknowns backward through an epoch's measurements.
+    """Propagate the information that later epochs give on the unknowns backward through an epoch's measurements.
 
     docs/filter-equations.md has the formula of one measurement (G. J. Bierman, 1973).
 
-    The measurements, shapes (M, N), (M,), (M,), are in the order of the filter and are processed backward from the
-    last. P, shape (N, N), is the covariance before the measurements; `vector` and `matrix`, shapes (N,) and (N, N), are
-    l and L after them.
+    The measurements, shapes (M, N), (M,), (M,), are in the order of the filter, and are processed backward from the
+    last. P, shape (N, N), is the covariance before the measurements. `vector` and `matrix`, shapes (N,) and (N, N), are
+    l and L after the measurements.
     """
     count, size = row.shape
     P, x, gain = P.copy(), np.zeros(size), np.empty(size)

@@ -1,8 +1,8 @@
-"""Measurement equations of one epoch, linearised at one Gaussian: the rows of H and A in docs/filter-equations.md.
+"""Measurement equations of one epoch, linearised at one Gaussian: rows of H and A in docs/filter-equations.md.
 
-That page has an equation for each kind of row, in the letters of its table of unknowns. For the change of a carrier
-phase the direction of the chord is used at both ends. With the tangent at each end the phases would measure the
-absolute position from the bend of the line more precisely than the line is known.
+That page has an equation for each kind of row. For the change of a carrier phase, the direction of the chord is used at
+both ends. With the tangent at each end, the phases would determine the absolute position from the bend of the line more
+precisely than the line is known.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class Geometry(NamedTuple):
     """Points and lines of sight at which the equations of an epoch are linearised."""
 
     point: Floats  #: Position at this epoch, ECEF [m]; shape (3,).
-    axes: Floats  #: Tangent, right and up at that position; shape (3, 3).
+    axes: Floats  #: Tangent, right and up at this epoch's position; shape (3, 3).
     before: Floats  #: Position at the previous epoch, ECEF [m]; shape (3,).
-    #: Direction of the displacement since the previous epoch; the tangent when nearly at rest; shape (3,).
+    #: Direction of the displacement since the previous epoch, or of the tangent when nearly at rest; shape (3,).
     chord: Floats
     distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
     sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
     along: Floats  #: Components of `sight` along `axes`; shape (K, 3).
 
 
-#: Unknowns of the distance travelled since the previous epoch: s - s' + q_a.
+#: Unknowns of the distance travelled since the previous epoch, which is s - s' + q_a.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
-#: Motion quantities that are a single unknown each.
+#: Motion quantities that consist of a single unknown, with this unknown.
 OWN_UNKNOWNS = (
     (ix.M_CLOCK, ix.PHASE_CLOCK), (ix.M_RIGHT, ix.STEP_RIGHT), (ix.M_UP, ix.STEP_UP), (ix.M_DRIFT, ix.DRIFT),
 )  # fmt: skip
@@ -63,8 +63,8 @@ def linearise(
 ) -> None:
     """Write the equations of an epoch linearised at the arc lengths `at` of this epoch and the previous one [m].
 
-    The innovations refer to the mean x; its difference from `at` is added to first order. `wheel_sign` is the result of
-    `find_wheel_sign`.
+    The innovations refer to the mean x; the difference between x and `at` is added to first order. `wheel_sign` is the
+    result of `find_wheel_sign`.
     """
     geometry = _compute_geometry(given, t, at)
     _write_codes(given, t, rows, x, geometry, x[ix.ARC] - at[0], equations)
@@ -76,9 +76,7 @@ def linearise(
 
 @inner
 def find_wheel_sign(x: Floats, direction: float) -> float:
-    """Return the sign for an unsigned wheel distance: the sign of the speed, or of the last speed with a known
-    direction.
-    """
+    """Return the sign for an unsigned wheel distance: that of the speed, or of the last speed of known direction."""
     return math.copysign(1.0, x[ix.SPEED]) if abs(x[ix.SPEED]) > constants.DIRECTION_MPS else direction
 
 
@@ -108,8 +106,8 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
     """Write the six quantities of phases and Dopplers, from index `first` on; return their values at the mean, shape
     (6,).
 
-    The value of the distance is the offset of the mean from the points at the arc lengths `at`. It includes the map's
-    length error, because phases measure the distance travelled, not the distance on the map.
+    The value of the distance is the offset of the mean from the points at the arc lengths `at`. This value includes the
+    map's length error, because phases measure the distance travelled, not the distance on the map.
     """
     unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
     unknown[first + ix.M_DISTANCE, :3], coefficient[first + ix.M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
@@ -125,7 +123,9 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
 def _write_codes(
     given: Given, t: int, rows: Rows, x: Floats, geometry: Geometry, moved: float, equations: Equations
 ) -> None:
-    """Write the codes, each as a row and a quantity of the same index; the mean is `moved` metres beyond the point."""
+    """Write the codes, each as a row and a quantity of the same index; the mean is `moved` metres beyond the geometry's
+    point.
+    """
     unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
@@ -147,7 +147,7 @@ def _write_codes(
 
 @inner
 def _write_motion_value(value: float, j: int, motion: Floats, equations: Equations) -> None:
-    """Write the innovation of a phase or Doppler: the measured value less the prediction by the mean's motion."""
+    """Write the innovation of a phase or Doppler: measured value minus the value predicted from the mean's motion."""
     for a in range(ix.MOTION):
         value -= equations.design[j, a] * motion[a]
     equations.value[j] = value
@@ -182,11 +182,11 @@ def _write_dopplers(given: Given, t: int, rows: Rows, geometry: Geometry, motion
 
 @inner
 def write_range_rate(channel: Record, point: Floats, u: Floats, per_velocity: Floats) -> float:
-    """Return the satellite's part of the range rate [m/s], and write its gradient with respect to the receiver
-    velocity.
+    """Return the satellite's part of the range rate [m/s], and write the rate's gradient by the receiver velocity.
 
-    ``rate = (A + g . v) / (1 + A / c)``: A is the satellite's velocity along u, the unit vector to it; g is -u; both
-    include the Earth's rotation. `per_velocity` is ``g / (1 + A / c)``. All arrays have the shape (3,).
+    ``rate = (A + g . v) / (1 + A / c)``: u is the unit vector to the satellite, A the satellite's velocity along u, and
+    g is -u; A and g include the Earth's rotation. `per_velocity` is ``g / (1 + A / c)``. All arrays have the shape
+    (3,).
     """
     sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
     moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]
@@ -199,7 +199,7 @@ def write_range_rate(channel: Record, point: Floats, u: Floats, per_velocity: Fl
 
 @inner
 def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: float, equations: Equations) -> None:
-    """Write the equations of the sensors."""
+    """Write the equations of the on-board sensors."""
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
         column, q = rows.channel[j], find_quantity(rows, j)
@@ -225,7 +225,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: floa
 
 @inner
 def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations: Equations) -> float:
-    """Write the equation of a range to a ground unit; return the range at the mean [m]."""
+    """Write the equation of a range to a ground unit; return the range predicted from the mean [m]."""
     sensor, point, axes = given.sensor[t, column], np.empty(3), np.empty((3, 3))
     age, lever = sensor.age_s, sensor.lever_m
     write_point(given.vertex, given.line[0], x[ix.ARC] - age * x[ix.SPEED] + lever[0], point, axes)

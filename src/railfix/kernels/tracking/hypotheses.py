@@ -1,4 +1,4 @@
-"""Probabilities of hypotheses, and pruning."""
+"""Update of the probabilities of hypotheses, and pruning of hypotheses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from railfix.kernels.tracking.line import write_point
 
 @inner
 def log_sum(values: Floats) -> float:
-    """Return the logarithm of the sum of exponentials."""
+    """Return the logarithm of the sum of the values' exponentials."""
     largest = values.max()
     return float(largest + math.log(np.exp(values - largest).sum()))
 
 
 @inner
 def clip_odds(odds: float, gained: float, reach: float) -> float:
-    """Return log odds after a gain, bounded by `reach` unless they exceeded it before."""
+    """Return log odds after a gain, limited to +-`reach` unless the odds were beyond this limit before."""
     return min(max(odds + gained, min(odds, -reach)), max(odds, reach))
 
 
@@ -31,15 +31,15 @@ def clip_odds(odds: float, gained: float, reach: float) -> float:
 def reweigh(
     parameters: Record, state: State, evidence: Floats, code_evidence: Floats, points: Floats, arc: Floats, dt: float
 ) -> None:
-    """Update the branch probabilities, and their part due to codes, by the evidence of motion and codes.
+    """Update the branch probabilities, and the part due to codes, with the evidence of motion and codes.
 
-    The bounds of both are in docs/filter-equations.md. Branches within the map error have the same range difference at
-    every epoch. Errors of the motion are correlated over seconds, so its evidence is multiplied by the interval, at
-    most 1 s. All satellites on one side of a street share code errors for minutes. For laps within `ALIKE` times
-    map_branch_m the recent evidence of codes is kept as `log_recent`; only `find_leading` uses it.
+    docs/filter-equations.md has the bounds of the evidence. Branches within the map error have the same range
+    difference at every epoch. Motion errors are correlated over seconds, so the evidence of motion is multiplied by the
+    interval, at most 1 s. All satellites on one side of a street share code errors for minutes. For laps within `ALIKE`
+    times map_branch_m, the recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
 
-    `evidence` and `code_evidence`, shape (H,), are the log evidence of the motion, and of the codes given the motion;
-    `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
+    `evidence`, shape (H,), is the log evidence of the motion, and `code_evidence`, shape (H,), that of the codes given
+    the motion. `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
     """
     hypothesis, monitors, count = state.hypothesis, state.monitors[0], len(evidence)
     travel = monitors.branch_m
@@ -74,9 +74,7 @@ def reweigh(
 
 @inner
 def find_leading(hypothesis: Records, count: int) -> int:
-    """Return the hypothesis to report: the first, unless another is `SWITCH` times as probable with the recent code
-    evidence.
-    """
+    """Return the hypothesis to report: the first, unless recent codes make another `SWITCH` times as probable."""
     lead = hypothesis["log_probability"][:count] + hypothesis["log_recent"][:count]
     best = int(np.argmax(lead))
     return best if lead[best] - lead[0] > math.log(constants.SWITCH) else 0
@@ -84,10 +82,9 @@ def find_leading(hypothesis: Records, count: int) -> int:
 
 @inner
 def prune(given: Given, state: State) -> Indices:
-    """Sort the hypotheses, merge duplicates and drop improbable ones; return the previous indices of the remaining
-    hypotheses.
+    """Sort the hypotheses, merge duplicates and drop improbable ones; return previous indices of those that remain.
 
-    Improbable hypotheses are dropped once the first has travelled far enough for motion to distinguish them.
+    Improbable hypotheses are dropped once the first hypothesis has travelled far enough to separate branches by motion.
     """
     count = state.monitors[0].hypotheses
     order = np.argsort(-state.hypothesis["log_probability"][:count], kind="mergesort")
@@ -108,10 +105,10 @@ def prune(given: Given, state: State) -> Indices:
 
 @inner
 def _merge_twins(given: Given, state: State, ranked: Indices) -> tuple[Indices, Floats]:
-    """Return the hypotheses, and their probabilities, without those within the standard deviations of a more probable
-    hypothesis; the smaller one counts for positions that another lap has too.
+    """Return hypotheses and their probabilities, without those within the standard deviations of a more probable one.
 
-    If such a position were merged into a wrong position of its lap, the next bend would contradict this lap alone.
+    If a hypothesis on another lap has the same position within the map error, the smaller of two standard deviations is
+    the limit. Merging into a wrong position on the same lap would let the next bend contradict only this lap.
     """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     arc, points, axes = state.x[: len(ranked), ix.ARC], np.empty((len(ranked), 3)), np.empty((3, 3))

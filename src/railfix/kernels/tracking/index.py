@@ -30,37 +30,38 @@ DOPPLER_SPEED: Final = 15
 SLOW_CODE: Final = 16
 #: Speed at the previous epoch [m/s].
 PREVIOUS_SPEED: Final = 17
-#: Letters of the code clocks, in the order of their offsets in the state.
+#: System letters of the code clocks, in the order of the clock offsets in the state.
 CLOCKS: Final = ("G", "E", "C", "R", "I")
 CLOCK_COUNT: Final = len(CLOCKS)
-#: Index of the first clock offset, and of the first satellite code error, which is in units of its standard deviation.
+#: Index of the first clock offset, and of the first satellite code error. A code error is in units of its sigma.
 OFFSETS: Final = 18
 SATELLITES: Final = OFFSETS + CLOCK_COUNT
-#: Unknowns that restart at every epoch: code clock and map displacements.
+#: Unknowns that are restarted at every epoch: code clock and map displacements.
 PER_EPOCH: Final = (CODE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR)
 
-#: Quantities whose sums are the phases and Dopplers: distance, change of the phase clock, map displacement to the right
-#: and up, speed, drift.
+#: Motion quantities, from which phases and Dopplers are computed: distance, change of the phase clock, map displacement
+#: to the right and up, speed, drift.
 M_DISTANCE, M_CLOCK, M_RIGHT, M_UP, M_SPEED, M_DRIFT = 0, 1, 2, 3, 4, 5
 MOTION: Final = 6
-#: Largest number of unknowns in a quantity; the last is its clock.
+#: Largest number of unknowns in a quantity; the last is the clock of the quantity.
 TERMS: Final = 7
 CLOCK_TERM: Final = TERMS - 1
 
 #: Kinds of GNSS measurements of a channel.
 CODE, PHASE, DOPPLER = 0, 1, 2
-#: Sensor columns: wheel, radar, force, position, balises in turn, and one column per range to a ground unit.
+#: Columns of the sensors: wheel, radar, force, position, two for alternate balises, one per range to a ground unit.
 WHEEL_COLUMN, RADAR_COLUMN, FORCE_COLUMN, PLACE_COLUMN, RANGE_COLUMN = 0, 1, 2, 3, 6
-#: Kinds of sensors: the columns, with all ranges as one kind.
+#: Number of kinds of sensors: one per column, but one for all ranges.
 SENSORS: Final = 7
-#: Sub-filter sources after the sensors: all Dopplers, all phases, codes of satellites ahead, codes of satellites
-#: behind, the map; and no source, for all satellites in view.
+#: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, codes of satellites
+#: behind, the map. The last excludes no source (all satellites in view).
 OTHERS: Final = 6
 ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0, 1, 2, 3, 4, 5
-#: Bits of the reasons for a position search before an epoch: the track is lost, there were no measurements for a long
+#: Reasons for a position search before an epoch, as bits: the track is lost, there were no measurements for a long
 #: time, or motion contradicts the position.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
-#: Flags of the first epoch of a call: not predicted; predicted and the position searched for; the same, track lost.
+#: Flags of the first epoch of a call: not predicted; predicted, with the position search done; the same with the track
+#: lost.
 NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 
@@ -94,7 +95,7 @@ class TrackStatus(IntEnum):
 
     @property
     def text(self) -> str:
-        """Status text written to files: ``several_branches``."""
+        """Status text that is written to files, such as ``several_branches``."""
         return self.name.lower()
 
 

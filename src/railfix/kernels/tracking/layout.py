@@ -1,8 +1,8 @@
-"""Arrays of the recursion: state unknowns, records with their shapes and units, and the tuples that group them.
+"""Arrays of the recursion: records, with the shapes and units of the fields, and the tuples that group the arrays.
 
-numpy records name the fields of an epoch, a channel, a sensor and a vertex. The records of the settings, of the state's
-scalars and of the results have the fields of `railfix.tracking.limits.TrackingLimits`,
-`railfix.tracking.state.Monitors` and `railfix.tracking.result.Tracked`, which define them.
+numpy records name the fields of an epoch, a channel, a sensor and a vertex. The records of settings, of the state's
+scalars and of results are defined by `railfix.tracking.limits.TrackingLimits`, `railfix.tracking.state.Monitors` and
+`railfix.tracking.result.Tracked`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 
-#: Array of records, whose fields are defined below.
+#: Array of records; their fields are defined below.
 Records: TypeAlias = Any
 Record: TypeAlias = Any
 
 
 def record_of(fields: dict[str, Any]) -> np.dtype[Any]:
-    """Return a record type of named fields, each with a type, or a type and an array shape."""
+    """Return a record type with named fields; each field has a type, or a type and an array shape."""
     listed = [(name, *kind) if isinstance(kind, tuple) else (name, kind) for name, kind in fields.items()]
     return np.dtype((np.record, np.dtype(listed, align=True)))
 
@@ -30,7 +30,7 @@ EPOCH: Final = record_of({
     "interval_s": float,  # since the previous epoch [s]
     "begins": bool,  # the state restarts before this epoch
     "coded": bool,  # a satellite has codes
-    "tilt_scale": float,  # error of the ionospheric model in units of a quiet ionosphere's; 0 for codes free of it
+    "tilt_scale": float,  # error of the ionospheric model relative to a quiet ionosphere; 0 without this error
     "motion_measured": bool,  # phases or Dopplers of at least four satellites, enough to propagate the position
     "velocity_mps": (float, (3,)),  # ECEF, from phases or Dopplers without the line [m/s]; NaN if unknown
     "velocity_covariance": (float, (3, 3)),  # [m2/s2]
@@ -41,7 +41,7 @@ EPOCH: Final = record_of({
 #: One channel at one epoch: measurements of one satellite.
 CHANNEL: Final = record_of({
     "satellite": np.intp,  # index of the satellite, its code error and its sub-filter; -1 if never measured
-    "clock": np.intp,  # index of its code clock in `CLOCKS`
+    "clock": np.intp,  # index of the satellite's code clock in `CLOCKS`
     "sat_ecef_m": (float, (3,)),  # at the time of transmission [m]
     "sat_velocity_mps": (float, (3,)),  # [m/s]
     "before_ecef_m": (float, (3,)),  # at the previous epoch [m]
@@ -53,9 +53,9 @@ CHANNEL: Final = record_of({
 #: One sensor at one epoch.
 SENSOR: Final = record_of({
     "value": float,  # distance [m], force [m/s2], position [m] or range [m]; NaN without a measurement
-    "sigma": float,  # its standard deviation, in the same unit
+    "sigma": float,  # standard deviation of `value`, in the same unit
     "age_s": float,  # age at the epoch [s]; positions, balises, ranges
-    "unsigned": bool,  # distance without a sign, which gets the sign of the speed
+    "unsigned": bool,  # whether `value` is a distance without a sign, which gets the sign of the speed
     "unit_ecef_m": (float, (3,)),  # ground unit of a range [m]
     "lever_m": (float, (3,)),  # from the trajectory's point to the vehicle's unit: along, right, up [m]
 })  # fmt: skip
@@ -81,7 +81,7 @@ LINE: Final = record_of({
 #: One source of faults, with the sub-filter that excludes it.
 SOURCE: Final = record_of({
     "running": bool,  # whether the sub-filter exists
-    "contradicted_s": float,  # time for which its measurements have contradicted it [s]
+    "contradicted_s": float,  # time for which measurements have contradicted the sub-filter [s]
     "prior": float,  # probability of a fault; with 0 there is no sub-filter
     "k": float,  # normal quantile of the risk over that probability
     "k_speed": float,  # the same quantile for the speed
@@ -90,7 +90,7 @@ SOURCE: Final = record_of({
 
 
 class Given(NamedTuple):
-    """Inputs of the recursion: T epochs, K channels, C sensors, S satellites, V vertices, N unknowns."""
+    """Inputs of the recursion, for T epochs, K channels, C sensors, S satellites, V vertices and N unknowns."""
 
     epoch: Records  #: `EPOCH`; shape (T,).
     channel: Records  #: `CHANNEL`; shape (T, K).
@@ -104,14 +104,14 @@ class Given(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of the recursion, changed in place: the Gaussians of H hypotheses and B sub-filters."""
+    """State of the recursion, changed in place, with the Gaussians of H hypotheses and B sub-filters."""
 
-    x: Floats  #: Means, hypotheses first, with the units of `index.py`; shape (H + B, N).
-    P: Floats  #: Covariances in products of these units; shape (H + B, N, N).
+    x: Floats  #: Means, hypotheses first, in the units of `index.py`; shape (H + B, N).
+    P: Floats  #: Covariances, in products of these units; shape (H + B, N, N).
     hypothesis: Records  #: `railfix.tracking.state.HYPOTHESIS`; shape (H,).
     monitors: Records  #: `railfix.tracking.state.Monitors`; shape (1,).
     code_bias: Floats  #: Mean normalised innovation of each satellite's codes, no unit; shape (S,).
-    offset_known: Masks  #: Clocks that have had an observation; shape (CLOCK_COUNT,).
+    offset_known: Masks  #: Code clocks that have been observed so far; shape (CLOCK_COUNT,).
     source: Records  #: `SOURCE`: satellites, clocks, sensors, others; shape (B,), 0 where levels are off.
 
 
@@ -123,25 +123,25 @@ class Results(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """Record of one epoch for the smoother: H hypotheses, N unknowns, at most M measurements; H is 0 if absent."""
+    """Record of one epoch for the smoother: H hypotheses, N unknowns, up to M measurements; H is 0 without a record."""
 
     prior: Floats  #: Covariances before the measurements; shape (H, N, N).
     row: Floats  #: Measurement matrix, 0 for unused measurements; shape (H, M, N).
-    value: Floats  #: Innovations, units of the measurements; shape (H, M).
-    variance: Floats  #: White variances over the weights; infinite for unused measurements; shape (H, M).
+    value: Floats  #: Innovations, in the units of the measurements; shape (H, M).
+    variance: Floats  #: White variances divided by the weights; infinite for unused measurements; shape (H, M).
     restarted: Masks  #: Unknowns that have restarted; shape (H, N).
-    kept: Indices  #: Index before the epoch of each hypothesis after it; shape (H,).
+    kept: Indices  #: For each hypothesis after the epoch, the index that it had before; shape (H,).
 
 
 class Rows(NamedTuple):
-    """Measurements of one epoch in their order: M rows of four kinds."""
+    """Measurements of one epoch in the order of processing: M rows of four kinds."""
 
-    #: Rows of each kind.
+    #: Rows of each measurement kind.
     code: slice
     phase: slice
     doppler: slice
     sensor: slice
-    channel: Indices  #: Channel of each row; for sensors their column; shape (M,).
+    channel: Indices  #: Channel of each row, or column of a sensor; shape (M,).
     #: Variance of white errors, including the adapted scales [m2, (m/s)2, squared units of the sensors]; shape (M,).
     variance: Floats
     left_out: Masks  #: True for codes of a satellite that is left out as faulty; shape (M,).

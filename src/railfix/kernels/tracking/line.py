@@ -13,7 +13,7 @@ from railfix.kernels.tracking.layout import Record, Records
 
 @inner
 def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
-    """Return the arc length on a closed line of a position beyond its end (`railfix.tracking.line.Line.round_m`)."""
+    """Return the arc length of a position beyond the end of a closed line (`railfix.tracking.line.Line.round_m`)."""
     first, last = vertex[0].arc_m, vertex[-1].arc_m
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
@@ -24,7 +24,9 @@ def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float:
-    """Return the arc length of a position, modulo laps, nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
+    """Return the arc length of a position in the lap nearest to another arc length
+    (`railfix.tracking.line.Line.nearest_m`).
+    """
     inside = wrap_arc(vertex, line, to)
     nearest = place
     if line.end_turn_m > 0.0 and place >= vertex[-1].arc_m - line.end_turn_m:
@@ -57,7 +59,7 @@ def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: 
 
 @inner
 def gradient_at(vertex: Records, line: Record, arc: float) -> float:
-    """Return the gradient of the line, linear between the middles of segments."""
+    """Return the gradient of the line, interpolated linearly between the middles of segments."""
     arc = wrap_arc(vertex, line, arc)
     segments = len(vertex) - 1
     if segments == 1 or arc <= vertex[0].middle_m:
@@ -70,9 +72,9 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def excess_beyond_end(line: Record, arc: float, sigma: float) -> float:
-    """Return the distance of a position beyond an open end [m]; 0 within two of its standard deviations.
+    """Return the distance of a position beyond an open end of the line [m]; 0 within two standard deviations.
 
-    Beyond the end the line is continued straight: the train may leave the map.
+    The line is continued straight beyond the end, because the train may leave the map.
     """
     excess = abs(min(max(arc, line.start_m), line.end_m) - arc)
     return excess if excess > 2.0 * sigma else 0.0

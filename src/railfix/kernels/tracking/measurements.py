@@ -1,4 +1,4 @@
-"""Selection of an epoch's measurements, their variances, and the start of their clocks."""
+"""Selection of an epoch's measurements, variances of the measurements, and start of the clocks."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.model import restart
 from railfix.kernels.tracking.update import Equations, median
 
-TIE_S = 1e-6  #: Times that differ by less are equal, because their rounding depends on the first epoch [s].
+TIE_S = 1e-6  #: Difference below which times are equal [s], because rounding of times depends on the first epoch.
 
 
 @inner
 def _code_interval_s(given: Given, t: int, state: State) -> float:
     """Return the time interval that the codes of an epoch represent [s]; 0 where the codes are not used.
 
-    Codes are not used where phases or Dopplers propagate the position and other codes were used within the period.
+    Codes are not used if phases or Dopplers propagate the position and the period since the last use has not passed.
     """
     epoch, period = given.epoch[t], given.parameters[0].code_period_s
     dt, since = epoch.interval_s, epoch.time_s - state.monitors[0].coded_s
@@ -35,9 +35,7 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
 
 @inner
 def _is_sensor_used(given: Given, t: int, column: int, state: State) -> bool:
-    """Return whether a sensor value is usable: an unsigned wheel requires a known direction, a range to a ground unit a
-    minimum speed.
-    """
+    """Return whether a sensor value is usable: unsigned wheels require a known direction, ranges a minimum speed."""
     sensor, monitors = given.sensor[t, column], state.monitors[0]
     used = math.isfinite(sensor.value) and (
         column < ix.RANGE_COLUMN or abs(state.x[0, ix.SPEED]) >= constants.STILL_MPS
@@ -86,10 +84,10 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
 def start_clocks(
     given: Given, t: int, rows: Rows, offset_known: Masks, x: Floats, P: Floats, equations: Equations, restarted: Masks
 ) -> None:
-    """Start the clocks of an epoch in a predicted Gaussian, and subtract them from its innovations.
+    """Start the clocks of an epoch in a predicted Gaussian, and subtract the clocks from the innovations.
 
-    The median of each kind of innovation is added to its clock; clocks that have stepped restart. `restarted`, shape
-    (N,), marks the restarted unknowns.
+    The median innovation of each measurement kind is added to the clock of this kind; clocks that have stepped are
+    restarted. `restarted`, shape (N,), marks the restarted unknowns.
     """
     if rows.code.stop > 0:
         first = ix.OFFSETS + given.channel[t, rows.channel[0]].clock
@@ -111,9 +109,9 @@ def start_clocks(
 def _start_code_clocks(
     given: Given, t: int, rows: Rows, known: Masks, x: Floats, P: Floats, equations: Equations
 ) -> bool:
-    """Add the median innovation of the codes to the code clock, and the medians of new constellations to their offsets.
+    """Add the median code innovation to the code clock, and the medians of new constellations to the clock offsets.
 
-    At the first epoch the first constellation defines the clock. Returns whether it is the first epoch.
+    At the first epoch, the first constellation defines the code clock. Return whether this is the first epoch.
     """
     codes, value = rows.code.stop, equations.value
     clock_of = given.channel[t]["clock"][rows.channel[:codes]]

@@ -1,7 +1,7 @@
 """Process model: transition F and noise Q of all unknowns between epochs, for filter, sub-filters and smoother.
 
-docs/filter-equations.md tabulates both. The standard deviation of the speed grows with every epoch without redundancy,
-and consistent reflections from one wall can then give a wrong speed; `narrow_speed_range` limits it.
+docs/filter-equations.md tabulates F and Q. The standard deviation of the speed grows at every epoch without redundancy.
+Consistent reflections from one wall can then cause a wrong speed, which `narrow_speed_range` limits.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.update import add_row
 
-#: Minimum variance of displacements and clocks that begin at an epoch [m2], so that none of these is exactly known.
+#: Minimum variance of displacements and clocks that begin at an epoch [m2], so that none of them is exactly known.
 _LEAST_M2 = 1e-8
 _LEAST_CLOCK_M2 = 1e-6
 
 
 class Transition(NamedTuple):
-    """Transition F in sparse form: ``F[i, unknown[i, k]] = coefficient[i, k]``; shapes (N, 3)."""
+    """Transition F in sparse form, with ``F[i, unknown[i, k]] = coefficient[i, k]``; shapes (N, 3)."""
 
     unknown: Indices
     coefficient: Floats
@@ -41,7 +41,7 @@ def identity(unknowns: int) -> Transition:
 
 @inner
 def compute_transition(speed: float, epoch: Record, unknowns: int) -> Transition:
-    """Return the transition to an epoch for a given speed [m/s]."""
+    """Return the transition F to an epoch for a given speed [m/s]."""
     dt, travel = epoch.interval_s, abs(speed) * epoch.interval_s
     unknown, coefficient = identity(unknowns)
     for i in range(3):
@@ -91,8 +91,8 @@ def predict(
 ) -> None:
     """Predict a Gaussian to epoch t, in place: ``x = F x``, ``P = F P F' + Q``.
 
-    `map_log_variance` is the field of `Monitors`, `wrong_map_m` a standard deviation of the map in addition to the
-    line's own [m]; `scratch`, shape (N, N), is overwritten.
+    `map_log_variance` is the field of `Monitors`. `wrong_map_m` is a standard deviation of the map [m] in addition to
+    that of `LINE`. `scratch`, shape (N, N), is overwritten.
     """
     epoch, speed = given.epoch[t], x[ix.SPEED]
     F = compute_transition(speed, epoch, len(x))
@@ -110,16 +110,14 @@ def _add_noise(
     F: Transition,
     P: Floats,
 ) -> None:
-    """Add the process noise Q of an interval to a covariance; `of_map` holds the map's log variance and sigma of
-    `predict`.
-    """
+    """Add the process noise Q of an interval to P; `of_map` has `map_log_variance` and `wrong_map_m` of `predict`."""
     dt, travel, (map_log_variance, wrong_map_m) = epoch.interval_s, abs(speed) * epoch.interval_s, of_map
     for i in range(3):
         for j in range(3):
             P[i, j] += epoch.noise[i, j]
     P[ix.ARC, ix.ARC] += constants.LEAST_STEP_M2
     P[ix.SPEED, ix.SPEED] += constants.LEAST_STEP_M2
-    walk = constants.CLOCK_WALK_MPS**2  # drift; the phase clock is its integral
+    walk = constants.CLOCK_WALK_MPS**2  # of the clock drift; the phase clock is the integral of the drift
     P[ix.DRIFT, ix.DRIFT] += walk * dt
     P[ix.PHASE_CLOCK, ix.PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
     P[ix.PHASE_CLOCK, ix.DRIFT] += walk * dt**2 / 2.0
@@ -140,13 +138,13 @@ def _add_noise(
     P[ix.RADAR, ix.RADAR] += constants.RADAR_WALK**2 * dt
     for i in range(ix.OFFSETS, ix.SATELLITES):
         P[i, i] += constants.OFFSET_WALK_M**2 * dt
-    # map displacement
+    # map displacement over the interval
     changed = 2.0 * (1.0 - math.exp(-travel / constants.MAP_CORRELATION_M))
     across = max(constants.MAP_ROUGHNESS_M, line.sigma_plan_m)
     above = max(constants.MAP_ROUGHNESS_M, constants.HEIGHT_ROUGHNESS * line.sigma_height_m)
     P[ix.STEP_RIGHT, ix.STEP_RIGHT] = across**2 * changed + _LEAST_M2
     P[ix.STEP_UP, ix.STEP_UP] = above**2 * changed + _LEAST_M2
-    # The distance on the map is the distance travelled less the length error, which affects codes but not phases.
+    # The distance on the map is the distance travelled minus the length error, which affects codes but not phases.
     length = constants.MAP_SCALE_M**2 * math.exp(map_log_variance) * travel + constants.PHASE_WALK_M**2 * dt
     P[ix.ARC, ix.ARC] += length
     P[ix.MAP_LENGTH_ERROR, ix.MAP_LENGTH_ERROR] = length + _LEAST_M2
@@ -155,9 +153,9 @@ def _add_noise(
 
 @inner
 def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
-    """Add to the lateral displacements the deviation of the curved line over the position uncertainty.
+    """Add to the lateral displacements the deviation of the curved line from its tangent over the position uncertainty.
 
-    `at` holds the arc lengths at this epoch and the previous one [m].
+    `at` has the arc lengths at this epoch and at the previous epoch [m].
     """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], at[0], point, axes)
@@ -179,12 +177,12 @@ def restart(P: Floats, unknown: int, variance: float) -> None:
 
 @inner
 def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
-    """Return whether a measured speed is possible after the previous ones, and narrow the range of possible speeds.
+    """Return whether a measured speed is possible after the previous speeds, and narrow the range of possible speeds.
 
-    There are no bounds with several branches. Speeds from enough satellites, from codes alone, or supported by a sensor
-    on board, are accepted outside the range too. If the speed is not accepted, the range grows by emergency braking, so
-    that braking is followed from the next epoch on. Without a measurement `sigma` is infinite, and the range grows by
-    service braking.
+    With several branches, the range has no bounds. Speeds from enough satellites, from codes alone, or supported by an
+    on-board sensor, are accepted even outside the range. After a rejected speed, the range grows by emergency braking,
+    so that braking is followed from the next epoch on. Without a measurement, `sigma` is infinite, and the range grows
+    by service braking.
     """
     low, high = -math.inf, math.inf
     if monitors.hypotheses == 1:

@@ -1,7 +1,7 @@
 """Monitors of the filter's position: velocity across the line, the open end of a map, a step of all codes.
 
-Where a monitor contradicts the position, the protection level is withheld. If the contradiction persists, the track is
-lost and the whole line is searched.
+If a monitor contradicts the position, the protection level is withheld. If the contradiction persists, the track is
+lost, and the whole line is searched.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from railfix.kernels.tracking.subfilters import find_other
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the squared difference of the measured velocity from the line's, over its variance; NaN without one.
+    """Return the squared difference between measured velocity and line, over its variance; NaN without a velocity.
 
-    It is taken along and across the line, at the best of three positions within the position's standard deviation.
+    The difference is computed along and across the line, at three positions about the estimate; the smallest is
+    returned.
     """
     epoch, line, x, P = given.epoch[t], given.line[0], state.x[h], state.P[h]
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance
@@ -46,10 +47,11 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
 def update_monitors(
     state: State, contradiction: float, shift: float, beyond_m: float, dt: float, code_s: float
 ) -> None:
-    """Update the monitors by the contradictions of an epoch.
+    """Update the monitors with the contradictions of an epoch.
 
     For the reported hypothesis, `contradiction` is the result of `compute_contradiction`, `shift` the shift implied by
-    codes, `beyond_m` the distance beyond an open end of the line; `code_s` is the time interval of the codes.
+    codes, and `beyond_m` the distance beyond an open end of the line. `code_s` is the interval that the codes represent
+    [s].
     """
     monitors = state.monitors[0]
     if not math.isnan(contradiction):
@@ -88,9 +90,7 @@ def _is_doubtful(monitors: Record) -> bool:
 
 @inner
 def _is_contradicted_by_subfilter(state: State) -> bool:
-    """Return whether measurements contradict a sub-filter, or the sub-filter for a wrong map shows a lateral
-    displacement.
-    """
+    """Return whether measurements contradict a sub-filter, or that for a wrong map shows a lateral displacement."""
     if (state.source["running"] & (state.source["contradicted_s"] > constants.LEVEL_DOUBT_S)).any():
         return True
     wrong = find_other(state, ix.WRONG_MAP)

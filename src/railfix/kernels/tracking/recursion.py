@@ -1,8 +1,8 @@
 """The filter along the track, epoch by epoch.
 
 The steps of an epoch are: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt and monitor,
-correct the sub-filters, prune, level and status. The position search (`railfix.tracking.search`) is outside the
-recursion, between the prediction of an epoch and its update.
+correct the sub-filters, prune, and write level and status. The position search (`railfix.tracking.search`) is outside
+the recursion, between the prediction and the update of an epoch.
 """
 
 from __future__ import annotations
@@ -39,9 +39,7 @@ from railfix.kernels.tracking.update import (
 
 @inner
 def _find_search_reasons(given: Given, t: int, state: State) -> int:
-    """Return the reasons for a position search before an epoch, as bits from `index.LOST_TRACK` on; 0 if none is
-    needed.
-    """
+    """Return the reasons for a position search before an epoch, as bits (`index.LOST_TRACK`, ...); 0 without any."""
     epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
     lost = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
     lost = lost or monitors.contradiction >= constants.CONTRADICTION_LOST
@@ -91,7 +89,7 @@ def _predict_all(given: Given, t: int, state: State) -> None:
 
 @inner
 def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
-    """Start the correction of a predicted hypothesis: equations and innovations."""
+    """Start the correction of a predicted hypothesis with the equations and innovations."""
     x, P, equations = state.x[h].copy(), state.P[h].copy(), new_equations(rows)
     restarted = np.zeros(len(x), dtype=np.bool_)
     sign = find_wheel_sign(x, state.monitors[0].direction)
@@ -106,9 +104,9 @@ def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) ->
 
 @inner
 def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple[list[Correction], float]:
-    """Return the corrections of all hypotheses, and the shift implied by codes for the hypothesis reported so far.
+    """Return the corrections of all hypotheses, and the shift that codes imply for the hypothesis reported so far.
 
-    The equations are linearised again at the corrected position while it moves by more than `MOVED_M`.
+    The equations are linearised again at the corrected position as long as it moves by more than `MOVED_M`.
     """
     count = state.monitors[0].hypotheses
     corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
@@ -139,7 +137,7 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 
 @inner
 def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
-    """Correct a hypothesis again, linearised at the corrected position; return the further position change [m]."""
+    """Linearise again at the corrected position and correct again; return the further change of the position [m]."""
     arc, sign = one.x[ix.ARC], find_wheel_sign(one.x_prior, state.monitors[0].direction)
     linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), sign, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
@@ -152,7 +150,7 @@ def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction
 
 @inner
 def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction]) -> None:
-    """Update the hypothesis probabilities by the evidence of an epoch."""
+    """Update the probabilities of the hypotheses with the evidence of an epoch."""
     count = len(corrections)
     motion, code, arc = np.empty(count), np.empty(count), np.empty(count)
     points, axes = np.empty((count, 3)), np.empty((3, 3))
@@ -165,7 +163,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
 
 @inner
 def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
-    """Store the corrected hypotheses, adapt and monitor, and correct the sub-filters; return the leading hypothesis."""
+    """Store the corrected hypotheses, adapt, monitor, and correct the sub-filters; return the leading hypothesis."""
     monitors = state.monitors[0]
     for h, one in enumerate(corrections):
         state.x[h], state.P[h] = one.x, one.P
@@ -180,7 +178,8 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leading)
-    if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have affected the position so far
+    # the codes of the excluded satellite have affected the position so far
+    if excluded and abs(shift) < constants.INFLATED_SIGMAS:
         state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
     contradiction = compute_contradiction(given, t, state, leading)
     beyond_m = excess_beyond_end(given.line[0], best.x[ix.ARC], math.sqrt(best.P[ix.ARC, ix.ARC]))
@@ -214,7 +213,7 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
     """Write the record of the corrections for the smoother."""
     for h, one in enumerate(corrections):
         codes, count, equations = rows.code.stop, len(rows.variance), one.equations
-        H = np.zeros((len(equations.unknown), len(one.x)))  # measurement matrix of the quantities
+        H = np.zeros((len(equations.unknown), len(one.x)))  # measurement matrix H of the quantities
         for q in range(len(H)):
             for k in range(ix.TERMS):
                 H[q, equations.unknown[q, k]] += equations.coefficient[q, k]
@@ -229,7 +228,7 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
 
 @inner
 def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> None:
-    """Update direction, time and distance on the branches, and prune the hypotheses."""
+    """Update the direction and the time and distance on the branches, and prune the hypotheses."""
     monitors, dt = state.monitors[0], given.epoch[t].interval_s
     speed = state.x[leading, ix.SPEED]
     if abs(speed) > constants.DIRECTION_MPS:
@@ -250,7 +249,7 @@ def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> N
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write position, speed, level and status; `status` is the status without doubt and other branches."""
+    """Write position, speed, level and status; `status` does not yet consider doubt and other branches."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
@@ -289,10 +288,10 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
 
 @inner
 def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: Trace, lost: bool) -> None:
-    """Process an epoch whose state has been predicted."""
+    """Process an epoch to which the state has been predicted."""
     monitors, dt, leading = state.monitors[0], given.epoch[t].interval_s, 0
     rows = choose_measurements(given, t, state)
-    believed = len(rows.variance) > 0  # without measurements only the prediction remains
+    believed = len(rows.variance) > 0  # without measurements, there is only the prediction
     if believed:
         corrections, shift = _correct_hypotheses(given, t, state, rows)
         if len(corrections) > 1:
@@ -309,7 +308,7 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
         _write_measurements(t, rows, corrections[leading], believed, results)
     else:
         narrow_speed_range(given.parameters[0], monitors, rows, 0.0, math.inf, dt)
-    if not believed:  # the prediction continues
+    if not believed:  # the state remains predicted
         leading = find_leading(state.hypothesis, monitors.hypotheses)
         monitors.level_hold_s = max(monitors.level_hold_s - dt, 0.0)
     monitors.distance_since_code_m += abs(state.x[leading, ix.SPEED]) * dt
@@ -324,11 +323,11 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
 def advance(
     given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], sought: int
 ) -> tuple[int, int]:
-    """Process a span of epochs; return the first epoch that requires a position search with its reasons, or the end of
-    the span and 0.
+    """Process a span of epochs; return the first epoch that requires a position search and the reasons, or the end and
+    0.
 
-    The epoch of the search is left predicted; a call for it alone with `index.SOUGHT` completes it. An epoch with a
-    restart is returned with 0, and so is the epoch after one whose position is not finite.
+    At the epoch of the search, the state is only predicted; a call for this epoch alone with `index.SOUGHT` completes
+    it. An epoch with a restart is returned with 0, and so is the epoch after an epoch without a finite position.
     """
     for t in range(span[0], span[1]):
         if sought == ix.NOT_SOUGHT:

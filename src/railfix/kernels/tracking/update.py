@@ -1,10 +1,10 @@
-"""Sequential correction of Gaussians by the measurements of an epoch, with Student's t errors.
+"""Sequential correction of Gaussians with the measurements of an epoch, whose errors have Student's t distribution.
 
 The measurements depend on a Gaussian N(x, P) through the quantities ``q = H x`` of docs/filter-equations.md. Rounds of
-reweighting correct the Gaussian of the quantities, N(0, H P H'), instead of the state; all phases and Dopplers are
-compressed to six rows; each measurement in turn is one division, so that no matrix is inverted.
+reweighting correct the Gaussian of the quantities, N(0, H P H'), instead of the state. All phases and Dopplers are
+compressed to six rows. Measurements are processed one by one with a division each, so that no matrix is inverted.
 
-Named tuples of array views belong to one Gaussian: `Equations` has the measurements, `Fit` the results.
+Two named tuples of array views belong to each Gaussian: `Equations` has the measurements, `Fit` the results.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from railfix.kernels.tracking.layout import Rows
 class Equations(NamedTuple):
     """Measurement equations of one Gaussian with N unknowns: Q quantities and M measurements."""
 
-    #: Quantity q is the sum of ``coefficient[q, k] x[unknown[q, k]]``, its clock last; shapes (Q, TERMS).
+    #: Quantity q is the sum of ``coefficient[q, k] x[unknown[q, k]]``, with the clock last; shapes (Q, TERMS).
     unknown: Indices
     coefficient: Floats
     #: Coefficients of phases and Dopplers for the six motion quantities; 0 for other rows; shape (M, MOTION).
@@ -33,12 +33,12 @@ class Equations(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Fit of one Gaussian to an epoch's measurements; shapes (M,), the last two (1,)."""
+    """Fit of one Gaussian to an epoch's measurements; fields have shape (M,), the last two (1,)."""
 
     #: Weight by Student's t, no unit; 1 at an error of one standard deviation, less for a late code.
     weight: Floats
-    residual: Floats  #: Innovation less its prediction from the corrected quantities, in its unit.
-    fitted: Floats  #: Variance of that prediction, in its unit squared.
+    residual: Floats  #: Innovation minus its prediction from the corrected quantities, in the unit of the measurement.
+    fitted: Floats  #: Variance of this prediction, in the squared unit.
     log_determinant: Floats  #: ``log det(I + R^-1 H P H')``.
     distance: Floats  #: ``q' (H P H')^-1 q`` of the corrected mean q of the quantities.
 
@@ -50,7 +50,7 @@ class Correction(NamedTuple):
     x_prior: Floats
     P_prior: Floats
     equations: Equations
-    #: Covariance of the quantities before the measurements, and its diagonal without the clocks; shapes (Q, Q), (Q,).
+    #: Covariance of the quantities before the measurements, and the diagonal without the clocks; shapes (Q, Q), (Q,).
     covariance: Floats
     without_clock: Floats
     fit: Fit
@@ -63,7 +63,7 @@ class Correction(NamedTuple):
 
 @inlined
 def find_row(rows: Rows, q: int) -> int:
-    """Return the row of a code's or sensor's quantity; the six motion quantities have no row."""
+    """Return the row of the quantity of a code or sensor; the six motion quantities have no row."""
     return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
 
 
@@ -91,8 +91,8 @@ def add_row(target: Floats, factor: float, matrix: Floats, i: int) -> None:
 def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float, gain: Floats) -> None:
     """Correct a Gaussian by one measurement: ``K = g / S``, ``x + K y``, ``P - K g'``.
 
-    x, shape (N,), and P, shape (N, N), are changed; g, shape (N,), is P h, the innovation y, its variance
-    ``S = h' P h + r``; `gain`, shape (N,), gets K.
+    x, shape (N,), and P, shape (N, N), are changed. g, shape (N,), is P h; y is the innovation and ``S = h' P h + r``
+    the variance of y. K is written into `gain`, shape (N,).
     """
     for a in range(len(g)):
         gain[a] = g[a] / variance
@@ -106,7 +106,7 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
 
 @inner
 def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]:
-    """Return the covariance H P H' of the quantities, and its diagonal without the clocks; shapes (Q, Q), (Q,)."""
+    """Return the covariance H P H' of the quantities, and the diagonal without the clocks; shapes (Q, Q), (Q,)."""
     unknown, coefficient = equations.unknown, equations.coefficient
     size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
@@ -129,8 +129,8 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
 def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats, T: Floats, z: Floats) -> None:
     """Write the six rows ``T q_motion = z + N(0, I)`` that are equivalent to all phases and Dopplers at their weights.
 
-    ``T' T`` is the Cholesky factorisation of their normal matrix, T an upper triangle; rows of unmeasured quantities
-    are 0.
+    ``T' T`` is the Cholesky factorisation of the normal matrix of phases and Dopplers, and T is upper triangular. Rows
+    of unmeasured quantities are 0.
     """
     design, value = equations.design, equations.value
     diagonal = np.empty(ix.MOTION)
@@ -176,9 +176,9 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the initial weights from the innovations; the median of each GNSS kind is subtracted.
+    """Write the initial weights, computed from the innovations minus the median of each GNSS measurement kind.
 
-    The variances exclude the clocks, whose prior would hide every outlier.
+    The variances exclude the clocks, because the prior of the clocks would hide every outlier.
     """
     covariance, without_clock = expected
     design, value, codes = equations.design, equations.value, rows.code.stop
@@ -204,7 +204,7 @@ def write_first_weights(
 
 @inner
 def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Correct the quantities, ``N(0, covariance)``, with the weights of `found`; write its other fields."""
+    """Correct the quantities, ``N(0, covariance)``, with the weights of `found`, and write its other fields."""
     size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
     mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -241,7 +241,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
 
 @inner
 def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, variance: Floats, found: Fit) -> float:
-    """Write residuals and variances of the fitted quantities; return the weighted square sum of codes and sensors."""
+    """Write residuals and variances of the fitted measurements; return the weighted square sum of codes and sensors."""
     design, value, codes, square = equations.design, equations.value, rows.code.stop, 0.0
     for j in range(len(rows.variance)):
         residual, fitted = value[j], 0.0
@@ -261,7 +261,7 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
 
 @inner
 def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
-    """Write the weights that follow from the residuals of a fit and their variances."""
+    """Write the weights that follow from the residuals of a fit and the variances of the residuals."""
     for j in range(len(rows.variance)):
         relative = (found.residual[j] ** 2 + found.fitted[j]) / variance[j]
         late = j < rows.code.stop and found.residual[j] > 0.0
@@ -282,7 +282,7 @@ def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Flo
 
 @inner
 def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Floats, x: Floats, P: Floats) -> None:
-    """Correct the state sequentially by all measurements of finite variance with their weights."""
+    """Correct the state sequentially with all weighted measurements of finite variance."""
     codes, value = rows.code.stop, equations.value
     change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -311,7 +311,7 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
 
 @inlined
 def _project(equations: Equations, q: int, vector: Floats) -> float:
-    """Return ``h' vector`` for a quantity h."""
+    """Return ``h' vector``, where h is row q of H."""
     total = 0.0
     for k in range(ix.TERMS):
         total += equations.coefficient[q, k] * vector[equations.unknown[q, k]]
@@ -320,7 +320,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
 
 @inlined
 def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: Floats, g: Floats) -> float:
-    """Add a multiple of ``P h`` for a quantity h to g; return the same multiple of ``h' mean``."""
+    """Add a multiple of ``P h`` to g, and return the same multiple of ``h' mean``, where h is row q of H."""
     total = 0.0
     for k in range(ix.TERMS):
         f = factor * equations.coefficient[q, k]
@@ -342,7 +342,7 @@ def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
 
 @inner
 def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, float]:
-    """Return the mean weights of codes that are not left out, and of phases and Dopplers; NaN without any.
+    """Return the mean weight of codes that are not left out, and the mean weight of phases and Dopplers; NaN for none.
 
     Only measurements of finite variance are included.
     """
@@ -358,9 +358,9 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
 
 @inner
 def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
-    """Return the log evidence of all measurements except the codes, and of the codes given the others.
+    """Return the log evidence of all measurements except codes, and the log evidence of the codes given the others.
 
-    Either is 0 with too few measurements, which fit any speed and position.
+    An evidence is 0 if there are too few measurements, because these fit any speed and position.
     """
     joint = compute_log_evidence(rows, rows.variance, one.fit)
     without_codes, found = rows.variance.copy(), new_fit(rows)
@@ -377,7 +377,7 @@ def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
 
 @inner
 def refit_inflated_prior(rows: Rows, one: Correction) -> None:
-    """Fit again with initial weights for inflated position and speed variances; keep the fit with more evidence."""
+    """Fit again from initial weights for inflated position and speed variances, and keep the fit with more evidence."""
     inflated, found = one.P_prior.copy(), new_fit(rows)
     inflated[ix.ARC, ix.ARC] += constants.FREEDOM_PLACE_M2
     inflated[ix.SPEED, ix.SPEED] += constants.FREEDOM_SPEED_M2PS2

@@ -1,7 +1,7 @@
 """Antenna velocities without the line, from carrier-phase changes or Dopplers.
 
-Least squares for velocity and clock with Student's t errors, for a train on gradients of at most a few per cent. If the
-velocity points across the line, the position, the branch or the map is wrong.
+Velocity and clock are fitted by least squares with Student's t errors, for a train on gradients of a few per cent at
+most. If the velocity points across the line, the position, the branch or the map is wrong.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from railfix.kernels.tracking.update import correct, median
 
 #: Standard deviation of the vertical velocity [m/s].
 CLIMB_MPS = 0.3
-#: Loose prior for conditioning: standard deviation of the velocity, and of the clock about the median [m/s].
+#: Standard deviation of a loose prior of the velocity, and of the clock about the median, for conditioning [m/s].
 PRIOR_MPS = 1e3
 #: Degrees of freedom of the errors, rounds of reweighting, required redundancy, and smallest mean weight, below which
 #: the measurements do not agree with each other.
@@ -32,12 +32,11 @@ AGREEING = 0.9
 
 @kernel
 def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: Floats) -> None:
-    """Write the velocities of epochs with covariances and ages: from phases, or from Dopplers where phases give none.
+    """Write velocities of epochs with covariances and ages; Dopplers are used where phases give no velocity.
 
-    The velocity is NaN where the measurements are too few or do not agree. A velocity from phases applies half an
-    interval before the epoch. `epoch` and `channel` are `EPOCH` and `CHANNEL`, shapes (T,) and (T, K); `near_ecef_m`,
-    shape (T, 3), is a position accurate to hundreds of metres, NaN if unknown; `up`, shape (T, 3), is the vertical at
-    the position.
+    The velocity is NaN where the measurements are too few or do not agree. A velocity from phases is valid half an
+    interval before the epoch. `epoch` (T,) and `channel` (T, K) are records `EPOCH` and `CHANNEL`. `near_ecef_m`, shape
+    (T, 3), is a position accurate to hundreds of metres, NaN if unknown; `up`, shape (T, 3), is the vertical there.
     """
     epochs, channels = channel.shape
     h, y, r, u = np.empty((channels + 1, 4)), np.empty(channels + 1), np.empty(channels + 1), np.empty(3)
@@ -71,9 +70,9 @@ def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: 
 def fit_velocity(h: Floats, y: Floats, r: Floats, count: int, up: Floats, velocity: Floats, covariance: Floats) -> bool:
     """Fit velocity and clock to measurements ``y = h . v + clock``; return whether they are sufficient and consistent.
 
-    h, y, r, shapes (M, 4), (M,), (M,), are coefficients, values [m/s] and variances, of which the first `count` are
-    used. The median is subtracted from y, and a vertical velocity of 0 is appended. `velocity`, shape (3,), and
-    `covariance`, shape (3, 3), which is scaled with the residuals, are written.
+    h, y, r, shapes (M, 4), (M,), (M,), are coefficients, values [m/s] and variances; the first `count` are used. The
+    median is subtracted from y, and a vertical velocity of 0 is appended. The results are written into `velocity`,
+    shape (3,), and `covariance`, shape (3, 3), which is scaled with the residuals.
     """
     if count - 3 < REDUNDANT:
         return False
