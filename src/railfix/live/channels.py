@@ -1,8 +1,8 @@
 """Two-channel operation: two processes compute each message, and the messages are compared byte by byte (P1 2.1).
 
-Both channels receive the same epochs, records and clock readings. The second channel returns its messages, and digests
-of the results of each processing stage. At the first difference, the output stops, and the error names the first stage
-whose results differ.
+Both channels receive the same epochs, records and clock readings. The second channel sends the first channel its
+messages and a digest of the results of each processing stage. At the first difference, the output stops, and the error
+message names the first stage with different results.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ P = ParamSpec("P")
 
 #: First object that the second channel sends, once it is ready for calls.
 _READY: Final = "ready"
-#: Compared arrays of `AntennaResult`, by processing stage in the order of processing.
+#: Arrays of `AntennaResult` that are compared after each processing stage; the stages are in the order of processing.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -36,8 +36,10 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Return, for each output, the SHA-256 digest of each processing stage and the encoded message, as hexadecimal
-    digits.
+    """Return one dictionary per output: the SHA-256 digest of the results of each processing stage, and the encoded
+    message.
+
+    All values are hexadecimal digits.
     """
     return [
         {
@@ -85,7 +87,7 @@ def _second_channel(
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
-    """Return a method that calls the given engine method, and records the call for execution in the second channel."""
+    """Return a method that calls a method of the engine, and records the call so that the second channel repeats it."""
 
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
@@ -96,7 +98,7 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 
 
 class TwoChannels(LiveEngine):
-    """`LiveEngine` that has its calls repeated by a second engine in another process.
+    """`LiveEngine` whose calls are repeated by a second engine in another process.
 
     Raise ChannelsDisagreeError if the second process does not start.
     """
@@ -110,7 +112,7 @@ class TwoChannels(LiveEngine):
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # Wait here, before any data arrive; waiting later would delay the data, and the reaction to signals.
+        # Wait here, before any data arrive; a later wait would delay the data and the reaction to signals.
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
@@ -151,7 +153,7 @@ class TwoChannels(LiveEngine):
 
 
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:
-    """Raise ChannelsDisagreeError at the first difference between the digests of two channels."""
+    """Raise ChannelsDisagreeError if the digests of the two channels differ."""
     if len(ours) != len(theirs):
         raise ChannelsDisagreeError(
             f"the channels disagree: {len(ours)} messages in the first, {len(theirs)} in the second"

@@ -92,7 +92,9 @@ def _files_read(inputs: LiveInputs) -> list[Path]:
 
 
 def _check_outputs(inputs: LiveInputs) -> None:
-    """Raise OutputError if an output file is also an input or another output, or is unusable as log or state file."""
+    """Raise OutputError if a file is given for an input and an output, or for two outputs, or cannot serve as log or
+    state file.
+    """
     named = [parse_file_target(text) for text in inputs.send]
     written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
     for k, path in enumerate(written):
@@ -109,7 +111,7 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """Run a session until its sources end, or until SIGINT or SIGTERM.
 
     Return the lines of the summary, and whether SIGTERM ended the session. A SIGHUP is only logged and counted. Raise
-    RailfixError if a source, sink, file or setting is invalid, or two channels disagree.
+    RailfixError if a source, sink, file or setting is invalid, or if the two channels disagree.
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
@@ -193,7 +195,7 @@ def _hooks(
     *,
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
-    """Return the session's hooks, and the states of the receiver streams from the state file.
+    """Return the session's hooks, and the states of the receiver streams that were read from the state file.
 
     The hooks write the result tables and the state file, show the status line, and check the sensors.
 
@@ -260,7 +262,7 @@ def _close(outlet: Outlet[Any], log: SessionLog) -> None:
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
-    """Return the line, and an epoch processor that has the data of all files read at the start."""
+    """Read the files that are needed at the start; return the line, and an epoch processor that has their data."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
         raise SettingsError(

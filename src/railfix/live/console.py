@@ -1,7 +1,7 @@
 """Log, status line, metrics and checks of a session.
 
-The metrics are served as Prometheus text over HTTP. The checks compare the on-board sensors with satellite positions
-and speeds, and the line with 3-D positions. Contradictions are logged.
+The metrics are served as Prometheus text over HTTP. The checks compare the on-board sensors with positions and speeds
+derived from satellites, and the line with 3-D positions. Contradictions are logged.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _WAITING: Final = 1000
 
 
 class _Terminal:
-    """Display on the standard error output: the lines of the log (str), with the status line (`Text`) below."""
+    """Display on the standard error output: lines of the log (str), and the status line (`Text`) below them."""
 
     def __init__(self, *, status: bool) -> None:
         self._console = Console(stderr=True, highlight=False)
@@ -69,7 +69,7 @@ class _Terminal:
 
 
 class _Behind(logging.Handler):
-    """Logging handler that passes lines or records to an outlet, so that logging never waits for a terminal or disk."""
+    """Logging handler that passes log records to an outlet, so that logging never waits for a terminal or disk."""
 
     def __init__(self, outlet: Outlet[Any], *, line: logging.Formatter | None = None) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ _LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
 
 
 def check_log_file(path: Path) -> None:
-    """Raise OutputError if an existing file is not a session's log, so that nothing is appended to it."""
+    """Raise OutputError if an existing file is not the log of a session; the new log would be appended to the file."""
     try:
         with path.open("rb") as file:
             begin = file.read(64)
@@ -150,7 +150,7 @@ class SessionLog:
             self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
     def close(self) -> None:
-        """Write the remaining lines, and print how many lines are missing in the log file, if any."""
+        """Write the remaining lines; if lines are missing in the log file, print their number."""
         for handler in self._handlers:
             self._logger.removeHandler(handler)
         self._logger.propagate = True
@@ -163,7 +163,7 @@ class SessionLog:
         self._terminal.close()
 
 
-#: Number of latest values from which the statistics of times are computed.
+#: Number of latest values from which the percentiles of processing times and intervals are computed.
 _LAST: Final = 1000
 
 
@@ -175,7 +175,7 @@ class Metrics:
     #: Number of epochs by outcome; this is `LiveEngine.counts`.
     epochs: Mapping[str, int] = field(default_factory=dict)
     skipped: Counter[str] = field(default_factory=Counter)  #: Number of unused bytes, messages and lines, by reason.
-    lost: Counter[str] = field(default_factory=Counter)  #: Number of broken connections, by source.
+    lost: Counter[str] = field(default_factory=Counter)  #: Number of times that a connection broke, by source.
     sinks: Sequence[Sink] = ()
     hangups: int = 0  #: Number of SIGHUP signals received.
     processing_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))  #: Processing time per output [s].
@@ -185,8 +185,9 @@ class Metrics:
     _sent: float | None = None
 
     def took(self, seconds: float, outputs: Sequence[LiveOutput]) -> None:
-        """Count the messages of outputs, and record processing times and intervals; all outputs together took
-        `seconds`.
+        """Count the messages of outputs, and record processing times and intervals between messages.
+
+        `seconds` is the processing time of all outputs together.
         """
         now = time.monotonic()
         for output in outputs:
@@ -274,8 +275,9 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
 #: Time from the first position to the check of all sensors [ns].
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000  #: Interval of the radar checks [ns].
-_EVERY_NS: Final = 500_000_000  #: Minimum interval of the positions that are used in the check [ns].
-#: Number of chunks of samples that are merged into one block, to save memory.
+#: Minimum interval between the positions that are used in the check of all sensors [ns].
+_EVERY_NS: Final = 500_000_000
+#: Number of chunks of sensor samples that are merged into one block, to save memory.
 _PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
 
@@ -327,13 +329,13 @@ class SensorWatch:
     def _hear(self, sensed: Sensed) -> None:
         """Store samples for the check of the sensors.
 
-        When samples have been collected for twice `WATCHED_NS`, the sensors are checked if there is a position, and the
-        samples are dropped.
+        After twice `WATCHED_NS`, the sensors are checked if there is a position; the stored samples are dropped in any
+        case.
         """
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
-            if len(self._samples) == _PIECES:  # a chunk of one row takes the memory of a hundred rows
+            if len(self._samples) == _PIECES:  # a chunk with a single row takes as much memory as a hundred rows
                 self._blocks.append(_join(self._samples))
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
@@ -387,7 +389,7 @@ def _times(time_ns: list[int]) -> Datetimes:
 
 
 def _join(parts: list[SensorSamples]) -> SensorSamples:
-    """Merge the parts pairwise, so that each sample is copied only a few times, and not once for every part."""
+    """Merge the parts pairwise, so that each sample is copied only a few times."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [early.merge(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]

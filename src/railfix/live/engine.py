@@ -34,7 +34,7 @@ from railfix.ranges.sbas import SbasMessages
 
 #: Time later than any epoch [ns].
 END_NS: Final = 1 << 62
-#: Largest number of epochs of one antenna that wait; more would wait only if the receivers' clocks differ.
+#: Largest number of waiting epochs of one antenna; more would wait only if the receivers' clocks differ.
 _LONGEST_QUEUE = 100
 #: Distance travelled between two checks of the order of the antennas [m].
 _ORDER_STEP_M = 10.0
@@ -67,7 +67,7 @@ class EngineState:
 
 @dataclass(frozen=True, kw_only=True)
 class _FromSatellites:
-    """Navigation records, SBAS messages and base-station epochs; `heard` is the serial number of the last arrival."""
+    """Navigation records, SBAS messages and base-station epochs; `heard` is the serial number of the last item."""
 
     heard: int
     navigation: Navigation | None = None
@@ -89,7 +89,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """Epoch that waits for the other antenna or for sensors; `heard` is the number of satellite data before it."""
+    """Epoch that waits for the other antenna or for sensors; `heard` is the number of satellite items before it."""
 
     epoch: Observations
     arrived_ns: int
@@ -114,8 +114,8 @@ class LiveEngine:
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log: replacements of missing data and their end, restarts, skipped epochs, the train's
-        direction, use of a saved state. The caller removes the sentences.
+        Sentences for the log, about replaced missing data, restarts, skipped epochs, the train's direction and the use
+        of a saved state. The caller removes the sentences that it has logged.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
@@ -160,7 +160,7 @@ class LiveEngine:
         self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
 
     def add_base(self, epoch: Observations) -> None:
-        """Add an epoch of the base station for later epochs; an epoch out of order is counted and dropped."""
+        """Add a base-station epoch, to be used for later epochs; an epoch out of order is counted and dropped."""
         if self._based_to is not None and epoch.time[0] <= self._based_to:
             self.counts["base station out of order"] += 1
             return
@@ -189,11 +189,11 @@ class LiveEngine:
             self._from_satellites.append(item)
 
     def start(self, *, now_ns: int) -> None:
-        """Start the periods at `now_ns`; from then on, each period has a message, even before the first epoch."""
+        """Start the periods at `now_ns`; then a message is due in each period, even before the first epoch."""
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session; `reserved` is added to the sequence number in case of a crash."""
+        """Return the state from which a restart continues; `reserved` is added to the sequence number for a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
@@ -205,7 +205,8 @@ class LiveEngine:
     def resume(self, saved: EngineState) -> None:
         """Continue from a saved state, if it is at most `LiveSettings.state_age_s` older than the first new epoch.
 
-        Otherwise, only the saved navigation records, SBAS messages and sequence number are used. `reports` has a note.
+        Otherwise, only the saved navigation records, SBAS messages and sequence number are used. In both cases, a note
+        is added to `reports`.
         """
         self._sequence = max(self._sequence, saved.sequence)
         self._saved = saved if saved.done_ns else None
@@ -235,7 +236,7 @@ class LiveEngine:
         queue.append(waiting)
 
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
-        """Use a saved state, or only its satellite data if the first new epoch is too late or before the state."""
+        """Use a saved state, or only its satellite data if the first new epoch precedes the state or is too late."""
         self._saved = None
         age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
@@ -256,7 +257,7 @@ class LiveEngine:
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether to process an epoch; restart after `restart_epochs` rising tags before the last tag."""
+        """Return whether to process an epoch; `restart_epochs` rising tags before the last tag cause a restart."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -286,16 +287,16 @@ class LiveEngine:
         self.reports.append("a receiver has restarted with older time tags; positioning restarts")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
-        self._samples = self._tables  # streams had only earlier samples; tables also have later ones
+        self._samples = self._tables  # all samples of streams preceded the restart; tables may have later samples
         for name in self._antennas:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return the outputs due: for complete pairs, for epochs that waited long enough, for a period without input.
+        """Return the outputs due: for complete pairs, epochs that waited long enough, or a period without input.
 
-        `now_ns` is the time of the clock that is used for `push`. With `sent_ns`, the GPS time of sending [ns], one
-        message is sent per period, for the newest epoch. Without `sent_ns`, as for recorded epochs, every epoch has a
-        message. At `END_NS` all waiting epochs are due, and no message without input is added.
+        `now_ns` is read from the same clock as for `push`. If `sent_ns`, the GPS time of sending [ns], is given, one
+        message is sent per period, for the newest epoch. Otherwise, as for recorded epochs, every epoch has a message.
+        At `END_NS` all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -316,13 +317,13 @@ class LiveEngine:
         return numbered
 
     def _patience_ns(self) -> int:
-        """Return the longest time without a message [ns]: 1.5 periods after an epoch, then one period."""
+        """Return the longest time without a message [ns]: 1.5 periods, or one period after a message without input."""
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
-        """Return the outputs; only the newest has a message, if the previous message is at least half a period old.
+        """Return the outputs; the newest has a message if the previous message is at least half a period old.
 
-        A newest message that comes earlier waits until one period after the previous one, unless a newer replaces it.
+        Otherwise, the message waits until one period after the previous message, unless a newer message replaces it.
         """
         if self._due_ns is None:
             self._due_ns = now_ns - self._period_ns
@@ -419,7 +420,7 @@ class LiveEngine:
         return replace(samples, silent=silent)
 
     def _tell_changes(self, state: State, of_epoch: tuple[str, ...]) -> None:
-        """Report each beginning and end of a replacement of missing data; report other notes on epochs only once."""
+        """Report each time that a replacement of missing data begins or ends; report other notes only once."""
         received = state.received or self.processor.received
         notes = (received if state.base is None else state.base.beside(received)).notes
         self.reports.extend(note for note in notes if note not in self._notes)

@@ -1,9 +1,9 @@
 """Message forms: functions that encode an output as bytes.
 
-``json`` (one line per message), ``cbor`` (`railfix.io.train_message`; in files and streams each message is preceded by
-its length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (gpsd TPV report), ``etcs``
-(position report of SUBSET-026, packet 0, one JSON line), ``positions``, ``train`` and ``passings`` (rows of the result
-tables, one JSON line per row).
+``json`` (one line per message), ``cbor`` (`railfix.io.train_message`; in files and streams, the length in two bytes,
+most significant first, precedes each message), ``nmea`` (GGA, RMC, GST), ``tpv`` (gpsd TPV report), ``etcs`` (position
+report of SUBSET-026, packet 0, one JSON line), ``positions``, ``train`` and ``passings`` (rows of the result tables,
+one JSON line per row).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from railfix.pipeline.results import Result
 from railfix.run.tally import TABLES
 
 Form = Callable[[LiveOutput], bytes]
-#: Largest uncertainty that an ETCS position report can express, minus a margin for the rounding of the distance [cm].
+#: Largest uncertainty that an ETCS position report can express, minus a margin for rounding [cm].
 _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
@@ -42,8 +42,8 @@ def cbor_bytes(output: LiveOutput) -> bytes:
 def nmea_bytes(output: LiveOutput) -> bytes:
     """Return the NMEA 0183 sentences GGA, RMC and GST of the first antenna.
 
-    The result is empty if the output has no input. Without a position, GGA and RMC have no coordinates, and GST is
-    omitted.
+    The result is empty if the output belongs to a period without input. Without a position, GGA and RMC have no
+    coordinates, and GST is omitted.
     """
     place = _geodetic(output)
     if output.result is None:
@@ -112,7 +112,7 @@ def etcs_form(settings: LiveSettings) -> Form:
 
 
 def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
-    """Return the form that encodes a table's rows, one JSON line per row; it yields no bytes without input or rows."""
+    """Return the form that encodes a table's rows, one JSON line per row; without rows, the form yields no bytes."""
 
     def rows_bytes(output: LiveOutput) -> bytes:
         table = None if output.result is None else table_of(output.result)
@@ -183,6 +183,6 @@ def wants(form: Form, output: LiveOutput) -> bool:
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:
-    """Return an encoded message without the length prefix of streams, for a target that separates messages."""
+    """Return the encoded message for a target that separates messages, without the length prefix that streams need."""
     data = form(output)
     return data[2:] if form is cbor_bytes else data

@@ -20,7 +20,7 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: K factor of the speed bound for a two-sided probability of 1e-7, the initial K of the protection levels of P1 2.4.
+#: K factor of the speed bound, for a two-sided probability of 1e-7; protection levels begin with the same K (P1 2.4).
 _SPEED_K = 5.33
 #: Amount by which bounds are increased because chainages are rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
@@ -33,7 +33,9 @@ _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIV
 
 
 def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, time_ns: int) -> TrainMessage:
-    """Return the message of a period without input, with the last epoch's tag; the sequence number is set later."""
+    """Return the message of a period without input; `time_ns` is the last epoch's time tag. The sequence number is set
+    later.
+    """
     return TrainMessage(
         train=settings.train,
         sequence=0,
@@ -120,8 +122,8 @@ def create_message(
     """Return the message of one processed epoch; the sequence number and the time of sending are set later.
 
     `running` is the direction of the train's leading end. The message has the chainage and bounds of the front end. The
-    bounds are wider if either end of the train may be ahead. If the position of the front end is unknown, the message
-    has the chainage and bounds of the reference point. A doubtful position has no bounds.
+    bounds are wider if it is unknown which end of the train is ahead. If the position of the front end is unknown, the
+    message has the chainage and bounds of the reference point. A doubtful position has no bounds.
     """
     antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
@@ -166,7 +168,7 @@ def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
 
 
 def _describe_place(place: TrainPlace, frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return the message's fields for chainage, bounds and safe ends, rounded so that the bounds remain valid."""
+    """Return the message's fields for chainage, bounds and safe ends; rounding never makes the bounds narrower."""
     values: dict[str, Any] = {}
     if not math.isfinite(place.chainage_m):
         return values
@@ -192,13 +194,13 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the most severe suspicion of interference of all antennas at the last epoch; None if the check is off."""
+    """Return the most severe suspicion of interference at any antenna at the last epoch; None if the check is off."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
-    """Return the sources of measurements, other than codes, that the filter used at the last epoch."""
+    """Return the kinds of measurement other than codes that the filter used at the last epoch."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))

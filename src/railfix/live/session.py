@@ -50,8 +50,9 @@ class Hooks:
     """Optional callbacks and the metrics of a session."""
 
     observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
-    sensed: Callable[[Sensed], None] | None = None  #: Called with the samples decoded from each sensor's source.
-    #: Called in idle time, every `LiveSettings.state_every_s`, with the state from which a restarted session continues.
+    sensed: Callable[[Sensed], None] | None = None  #: Called with each chunk of samples decoded from a sensor's source.
+    #: Called every `LiveSettings.state_every_s`, when no data wait, with the state from which a restarted session
+    #: continues.
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None  #: Called twice a second with the text of the status line.
     metrics: Metrics = field(default_factory=Metrics)  #: Metrics of the session, returned at its end.
@@ -79,22 +80,22 @@ async def run_session(
         Replay speed of recorded files relative to real time. If None, files are replayed as fast as possible, and the
         clock follows the time tags. For exactly one message per epoch, set `LiveSettings.no_input` to "skip".
     sensors : mapping of str to str, optional
-        Streams of on-board sensors (`railfix.live.stream`) by name. Tables from files must have been added to the
-        engine.
+        Source of each on-board sensor's stream (`railfix.live.stream`). Tables from files are not included; they must
+        be added to the engine before.
     date : datetime64, optional
-        A time within half a week of the observations in RTCM 3 streams, because these have no week number. The default
-        is the computer's time, which suits live streams.
+        A time within half a week of the observations in RTCM 3 streams. It is needed because RTCM 3 has no week
+        number. The default is the computer's time, which suits live streams.
     streams : mapping of str to ReceiverState, optional
         States from which the decoding of the receivers' streams continues, by source name.
 
     Raises
     ------
     InputFileError
-        A source cannot be opened, or a source breaks and is not opened again. Also raised if the first line of a
-        sensor's stream is not the header of the sensor's table.
+        A source cannot be opened, or breaks and is not opened again, or the first line of a sensor's stream is not the
+        header of the sensor's table.
     OutputError
-        A sink of a replay cannot be written. The error is raised when the other sinks are complete, or at once if no
-        sink is left.
+        A sink of a replay cannot be written. The error is raised after all other sinks have been written, or at once if
+        no sink is left.
     ChannelsDisagreeError
         The messages, or the results of a processing stage, of two channels differ.
     """
@@ -134,9 +135,10 @@ async def run_session(
 
 @dataclass(kw_only=True)
 class _Session:
-    """Running session: engine, sinks, stream states, and the monotonic times of the last actions [s].
+    """Running session: engine, sinks, states of the streams, and the monotonic times at which the state was last saved
+    and the status last shown [s].
 
-    `read_to_ns` has the latest time tag [ns] received from each source that has not ended, -1 before the first tag.
+    `read_to_ns` has the latest time tag [ns] of each source that has not ended, -1 before the first tag of the source.
     `place` is the last position as a GGA sentence, which is sent to the caster of a virtual base station.
     """
 
@@ -165,7 +167,8 @@ class _Session:
             while read_to_ns.keys() - {BASE}:  # a base station's stream may have no end
                 for pump in pumps:
                     if pump.done() and queue.empty():
-                        # an error of a source ends the session once the items received before the error are processed
+                        # an error of a source ends the session after the items received before the error have been
+                        # processed
                         pump.result()
                 wait = None if replay else max(self.engine.wait_s(now_ns=time.monotonic_ns()), 0.001)
                 item = await next_arrival(queue, pumps, wait_s=wait)
@@ -187,8 +190,8 @@ class _Session:
                 if self.engine.lag.skipped and not queue.empty() and now < due:
                     continue  # while epochs are skipped, do not wait for a second channel after each epoch
                 due = now + round(5e8 * self.engine.settings.period_s)
-                # In a replay, the clock is the time tag up to which all files have been read, so that pairs stay
-                # together.
+                # In a replay, the clock is the time tag up to which all files have been read, so that both epochs of a
+                # pair are available.
                 clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, self.clock())
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
@@ -205,7 +208,9 @@ class _Session:
         self.save()
 
     async def pump(self, name: str, source: str, turn: _Pace | _InTurn | None, queue: _Queue) -> None:
-        """Move the items decoded from a source into the queue, then None; epochs from files wait for their turn."""
+        """Move the items decoded from a source into the queue, and None at the end; epochs from files wait for their
+        turn.
+        """
         async for received in self.received(name, source):
             if turn is not None and received.epochs:
                 await turn.wait(name, received.epochs[-1].time[-1])
@@ -315,8 +320,8 @@ class _Session:
 
     @property
     def reserved(self) -> int:
-        """Number of messages in ten state periods; so many sequence numbers are reserved that none is sent twice after
-        a crash.
+        """Number of sequence numbers that are reserved, so that none is sent twice after a crash: the messages of ten
+        intervals `state_every_s`.
         """
         settings = self.engine.settings
         return math.ceil(10.0 * settings.state_every_s / settings.period_s)
@@ -329,7 +334,9 @@ class _Session:
 
 
 class _Pace:
-    """Common pace of all files: an epoch waits until it is due, counted from the earliest time tag of all files."""
+    """Common pace of all replayed files: an epoch is due at its time since the earliest time tag of all files, divided
+    by the replay speed.
+    """
 
     def __init__(self, speed: float, files: Sequence[str]) -> None:
         self._speed = speed
@@ -355,7 +362,7 @@ class _Pace:
         return int((min(self._first) - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64)) + round(elapsed_s * 1e9)
 
     def ended(self, name: str) -> None:
-        """Record that the first tag of a file is known, or that the file has no epochs."""
+        """Record that the first time tag of a file is known, or that the file has no epochs."""
         self._to_come.discard(name)
         if not self._to_come and not self._all_known.is_set():
             self._began = asyncio.get_running_loop().time()
@@ -363,9 +370,10 @@ class _Pace:
 
 
 class _InTurn:
-    """Order of reading files: by time tag, with a base station's epoch before the train's epochs of the same tag.
+    """Order in which epochs of files are processed: by time tag; a base station's epoch precedes the train's epochs
+    with the same tag.
 
-    An epoch is not passed on before the next epoch of every other file is known, so that files may begin at any time.
+    An epoch waits until the next epoch of every other file is known, so that files may begin at different times.
     """
 
     def __init__(self, files: Sequence[str]) -> None:

@@ -161,7 +161,7 @@ class LiveInputs(Settings):
 
     @property
     def files(self) -> dict[str, Path]:
-        """Files on which the positions depend, by their role."""
+        """Files that affect the positions, by the role of the file."""
         named = {f"track {k}": path for k, path in enumerate(self.track)}
         given = {
             "vehicle": self.vehicle, "ranging units": self.ranging_units, "balise list": self.balise_list,

@@ -1,4 +1,4 @@
-"""Sinks for messages, given as ``FORM@TARGET``; targets that may be slow have a queue.
+"""Sinks for messages, specified as ``FORM@TARGET``; targets that may be slow have a queue.
 
 The forms are functions of `railfix.live.forms`. The targets are ``-`` (standard output), a file, ``udp://HOST:PORT``
 (one datagram per message), ``tcp-server://HOST:PORT`` (all connected clients) and
@@ -93,11 +93,11 @@ class Outlet(Generic[Item]):
             raise OutputError(f"{self.name}: {self.failure}")
 
 
-#: Number of bytes that may wait for a client of a TCP sink; a client with more bytes is disconnected.
+#: Number of bytes that may wait for a client of a TCP sink; a client for which more bytes wait is disconnected.
 _LARGEST_BACKLOG: Final = 1 << 20
 #: Longest wait for an MQTT broker to accept a connection [s].
 _ANSWER_S: Final = 10.0
-#: Longest wait until the last messages are sent, when an MQTT target is closed [s].
+#: Longest wait for the last messages to be sent when an MQTT target is closed [s].
 _LEFT_S: Final = 2.0
 _HELP: Final = (
     "expected FORM@TARGET, where FORM is json, cbor, nmea, tpv, etcs, positions, train or passings, and TARGET is -, a "
@@ -124,14 +124,15 @@ class Sink(Protocol):
 class ByteTarget:
     """File or standard output, written without a buffer, so that messages reach their reader at once.
 
-    The earlier content of a file is replaced by the first epoch's message. Messages without input wait for it, because
-    a session whose sources cannot be opened has only these.
+    The earlier content of a file is kept until the first epoch's message replaces it. Messages without input wait for
+    this message, because a session whose sources cannot be opened sends only messages without input.
     """
 
     form: Form
     file: IO[bytes]
     path: Path | None = None  #: None for the standard output.
-    #: Messages that wait while the file has its earlier content; None if it has none.
+    #: Messages that wait while the file still has its earlier content; None if the earlier content has been replaced,
+    #: or there was none.
     waiting: bytes | None = None
 
     def send(self, output: LiveOutput) -> None:
@@ -234,7 +235,7 @@ class MqttTarget:
             if self._client.is_connected():
                 info.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
-        # in a thread, because a broker that has stopped reading would block this call while the connection lasts
+        # in a thread, because this call would not return while the broker keeps the connection open but reads nothing
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)
         ending.start()
         ending.join(max(until - time.monotonic(), 0.5))

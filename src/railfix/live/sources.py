@@ -23,7 +23,7 @@ from railfix.live.settings import LiveSettings
 Item = TypeVar("Item")
 #: Function that returns the present position as a GGA sentence, or no bytes without a position.
 Place = Callable[[], bytes]
-#: Function that writes to the other end of a connection until it is cancelled.
+#: Function that writes to the other end of a connection until the function is cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
 
 _BLOCK = 4096
@@ -31,26 +31,26 @@ _FORMS = (
     "a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), "
     "or - (standard input)"
 )
-#: Schemes of NTRIP without and with TLS.
+#: URL schemes of NTRIP: without TLS, with TLS.
 _NTRIP = ("ntrip", "ntrips")
 #: Longest wait for a connection to open [s].
 _CONNECT_S = 10.0
 #: Longest wait for a byte in one read of a serial line [s].
 _SERIAL_S = 0.05
-#: Additional wait for bytes that arrived while the program was busy [s].
+#: Time for a second read after a timeout, for bytes that arrived while the program was busy [s].
 _ONCE_MORE_S = 0.02
-#: Longest wait before the next attempt to send a position to a caster, while there is none [s].
+#: While there is no position: longest wait before the next attempt to send a position to a caster [s].
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
-#: Number of leading bytes of the content by which content other than a receiver's stream is recognised.
+#: Number of leading bytes of a caster's content that are examined to reject content other than a receiver's stream.
 _TELLING_BYTES: Final = 16
 _OK: Final = 200  #: HTTP status of a successful answer.
 
 
 @dataclass(frozen=True)
 class Connected:
-    """Event: a connection has been opened; `broken` is the number of times it has broken before."""
+    """Event: a connection has been opened; `broken` is the number of times that the connection broke before."""
 
     broken: int
 
@@ -157,7 +157,7 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
     """Return the result of a call; raise TimeoutError if the call takes too long.
 
-    After the time has passed, the call is repeated once for `_ONCE_MORE_S`, because data may have arrived while this
+    After a timeout, the call is repeated once with the timeout `_ONCE_MORE_S`, because data may have arrived while this
     program was busy. (`asyncio.wait_for` may lose a cancellation that arrives at the same time.)
     """
     with suppress(TimeoutError):
@@ -212,8 +212,8 @@ async def _tcp(
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
     """Yield the bytes of an NTRIP caster's mount point; the request is NTRIP 2, the answer may be NTRIP 1.
 
-    If `LiveSettings.gga_s` is not 0, the train's position is sent for a virtual station. It is part of the request if
-    it is already known (NTRIP 2), and is later sent as lines.
+    If `LiveSettings.gga_s` is not 0, the train's position is sent for a virtual station. A position that is already
+    known is part of the request (NTRIP 2); later positions are sent as lines.
     """
     if settings.gga_s == 0.0:
         place = None
@@ -262,7 +262,7 @@ class _Answer:
         self._plain = self.begun = self.ended = False
 
     def request(self, sentence: bytes) -> bytes:
-        """Return the request for the mount point, with the GGA sentence unless it is empty.
+        """Return the request for the mount point; the request has the GGA sentence `sentence` unless this is empty.
 
         Raise SettingsError if no valid request can be made from the source.
         """
@@ -283,7 +283,9 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content in further bytes of the answer; raise InputFileError if it is not a receiver's stream."""
+        """Return the content of further bytes of the answer; raise InputFileError if the content is not a receiver's
+        stream.
+        """
         if self._first is not None:
             self._first += data
             if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:

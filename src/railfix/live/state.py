@@ -1,9 +1,9 @@
-"""State file, from which a restarted session continues; the file is written regularly, and checked before use.
+"""State file from which a restarted session continues; the file is written regularly, and checked before use.
 
 The first line of the file is JSON with the versions, the hashes of map, vehicle and settings, and the length and
-SHA-256 of the state that follows. A state is used only if the state is complete and the other entries agree with the
-session. The state contains only plain values, arrays and data classes of this package (`railfix.live.state_values`);
-reading the file does not execute code from it.
+SHA-256 of the state, which follows this line. A state is used only if it is complete and the versions and hashes agree
+with the session. The state contains only plain values, arrays and data classes of this package
+(`railfix.live.state_values`); reading the file does not execute code from it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def belongs_to(
     """Return the entries of a state file that must agree with the session: versions, antennas, hashes of files and
     settings.
 
-    `base` is the given position of the base station.
+    `base` is the specified position of the base station.
     """
     own = f"{railfix.__version__} ({source_commit()})"
     return {
@@ -71,7 +71,7 @@ def belongs_to(
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
     """Write a state file with the entries `under` (see `belongs_to`).
 
-    If it cannot be written completely, keep the previous file, and raise OutputError.
+    If the file cannot be written completely, keep the previous file, and raise OutputError.
     """
     content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}

@@ -61,12 +61,14 @@ class ReceivedData:
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
-    """Yield the data completed by a chunk of a receiver's bytes, in stream order and independent of chunk boundaries.
+    """Yield the data completed by a chunk of a receiver's bytes, in the order of the stream.
 
-    Each item covers the bytes up to a message that completes an epoch, or to the end of the chunk, so that navigation
-    records received before an epoch are used for the epoch. At least one item is yielded; the state for the next chunk
-    is `ReceivedData.after` of the last item. Epochs with repeated or older time tags are included; `LiveEngine.push`
-    drops them.
+    The data do not depend on the boundaries of chunks.
+
+    Each item covers the bytes up to a message that completes an epoch, or up to the end of the chunk. Navigation
+    records received before an epoch are thus used for the epoch. At least one item is yielded; the state for the next
+    chunk is `ReceivedData.after` of the last item. Epochs with repeated or older time tags are included;
+    `LiveEngine.push` drops them.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
@@ -126,7 +128,7 @@ Item = TypeVar("Item")
 
 
 def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState:
-    """Return the state of a decoder before the first byte; for `date` see `railfix.live.run_session`."""
+    """Return the state of a decoder before the first byte of a source; for `date` see `railfix.live.run_session`."""
     if date is None and not is_file(source):
         date = np.datetime64(time.time_ns(), "ns")  # leap seconds are irrelevant here
     return ReceiverState() if date is None else ReceiverState(stream=StreamState(time=date.astype("datetime64[ns]")))
@@ -172,11 +174,11 @@ async def next_arrival(
 
 #: Time later than any epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
-#: Columns that must have a number in every row that has values besides the time.
+#: Columns that must have a number in every row with values other than the time.
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
-#: Number of bytes kept of an incomplete line; the beginning of a longer line is dropped.
+#: Largest number of bytes of an incomplete line that are kept; the beginning of a longer line is dropped.
 _LINE_BYTES: Final = 4096
 
 
@@ -276,20 +278,22 @@ class SensorLines:
         return SensorSamples(**samples)
 
 
-#: Largest drift of the computer's clock relative to GPS time [s/s]; the stored shortest delay grows at this rate.
+#: Largest drift of the computer's clock relative to GPS time [s/s]; the shortest delay in `Lag` grows at this rate.
 DRIFT: Final = 1e-4
-#: Time for which a delay must be constant to count as an offset of the time tags [s]. A processing delay would
-#: decrease, or increase if the computer is too busy even to skip epochs.
+#: Time for which a delay must be constant to count as an offset of the time tags [s]. A delay of processing would not
+#: be constant: it decreases while epochs are skipped, or increases if the computer is too busy even for that.
 ADMITTED_S: Final = 2.0
 #: Largest change of a delay that counts as constant [s].
 STEADY_S: Final = 0.2
-#: Number of epochs that must be skipped during the constant delay.
+#: Number of epochs that must be skipped while the delay is constant before it counts as an offset of the time tags.
 STEADY_EPOCHS: Final = 5
 
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs compared with the shortest delay so far; the clocks of receiver and computer need not agree."""
+    """Delay of epochs compared with the shortest delay so far, so that the clocks of receiver and computer need not
+    agree.
+    """
 
     #: Delay above which epochs are skipped, until the delay has fallen to a quarter of this limit [s]; may be infinite.
     behind_s: float

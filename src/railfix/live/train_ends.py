@@ -14,8 +14,8 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: Distance run against the direction of the leading end after which the train has changed ends [m]. It is longer than
-#: any distance that a train rolls back.
+#: A train that has run this distance against the direction of its leading end counts as having changed ends [m]. The
+#: distance is assumed to be longer than a train rolls back.
 CHANGED_ENDS_M: Final = 50.0
 
 
@@ -26,7 +26,7 @@ class Ends(NamedTuple):
     """
 
     front_m: float  #: Middle of the possible positions of the front end, positive ahead of the reference point.
-    spread_m: float  #: Largest distance of the front end from `front_m`.
+    spread_m: float  #: Half-width of the possible positions of the front end: largest distance from `front_m`.
     foremost_m: float  #: Largest distance of any part of the train ahead of the reference point.
     rearmost_m: float  #: Largest distance of any part of the train behind the reference point.
 
@@ -79,7 +79,7 @@ class TrainFrame:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences that name unknown properties of the train, and the settings that provide them."""
+        """Sentences that name the unknown properties of the train, and the settings by which these can be specified."""
         notes = []
         if not self.running:
             notes.append("the direction of the train's front end is unknown until the train has run 50 m: give a "
@@ -97,7 +97,9 @@ class TrainFrame:
         return tuple(notes)
 
     def reference_m(self, name: str, arc_m: float) -> float:
-        """Return the chainage of the reference point for an antenna's position along the line [m]; NaN if unknown."""
+        """Return the chainage of the reference point, computed from an antenna's position along the line [m]; NaN if
+        unknown.
+        """
         trajectory = self.trajectories[name]
         if trajectory.body_chainage_m is not None:
             return float(trajectory.body_at(arc_m))
@@ -126,7 +128,7 @@ class TrainFrame:
         longest, shortest = max(front, rear), min(front, rear)
         if not math.isfinite(front + rear):
             longest = shortest = math.nan
-        if running:  # it is unknown whether the front or the rear of the vehicle is ahead
+        if running:  # whether the front or the rear of the vehicle leads is unknown
             return Ends((longest + shortest) / 2.0, (longest - shortest) / 2.0, longest, longest)
         return Ends(0.0 if math.isfinite(longest) else math.nan, longest, longest, longest)
 
@@ -149,11 +151,13 @@ class RunningEnd:
     last_m: float = math.inf  #: Last chainage of the reference point [m]; infinite before the first position.
 
     def after(self, reference_m: float, bound_m: float, moving: int) -> RunningEnd:
-        """Return the state after an epoch, unchanged without a finite bound; `moving` is the direction of motion."""
+        """Return the state after an epoch; without a finite bound, the state is unchanged. `moving` is the direction of
+        motion.
+        """
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        # after a gap, or where the chainage of a closed line starts again
+        # The bounds begin anew after a gap, and where the chainage of a closed line starts again.
         if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction

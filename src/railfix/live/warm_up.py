@@ -33,8 +33,8 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import TrackState
 
-#: Settings, and numbers of epochs to process with them, that together call every kernel of single epochs except those
-#: in `_look_beyond`. With the second settings, there are too few satellites for 3-D positions.
+#: Pairs of settings and a number of epochs to process. Together they call every kernel of single epochs, except the
+#: kernels in `_look_beyond`. With the second settings, there are too few satellites for 3-D positions.
 _SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -45,15 +45,15 @@ _WITH_FILTER: Final[tuple[dict[str, Any], int]] = ({"filter": "track", "protecti
 def prepare_kernels() -> bool:
     """Compile the kernels that have no cached machine code; return whether any were compiled.
 
-    Epochs of the demonstration are processed both in one call and one by one, so that kernels are compiled for the
-    types of arrays in both cases. If the standard error output is a terminal, the duration is printed. Raise
-    InputFileError if the files of the demonstration are missing.
+    Epochs of the demonstration are processed in one call and then one by one, so that kernels are compiled for the
+    array types of both cases. If the standard error output is a terminal, the duration is printed. Raise InputFileError
+    if the files of the demonstration are missing.
     """
     if kernels.is_compiled():
         return False
     begin = time.monotonic()
-    # numba compiles only one function at a time in a process. The filter's functions, about half of all, are therefore
-    # compiled in another process.
+    # numba compiles only one function at a time in a process. The functions of the filter, about half of all functions,
+    # are therefore compiled in a second process.
     filter_process = subprocess.Popen(
         [sys.executable, "-c", f"from {__name__} import compile_filter; compile_filter()"]
     )
@@ -91,7 +91,7 @@ def compile_filter() -> None:
 
 
 def _read_logs() -> dict[str, Observations]:
-    """Read the first epochs of the demonstration, with a simulated fault that RAIM detects."""
+    """Read the first epochs of the demonstration's logs, and add a simulated fault that RAIM detects."""
     inputs, longest = demo_inputs(), max(epochs for _, epochs in (*_SINGLE_EPOCHS, _WITH_FILTER))
     logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
     strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
