@@ -30,7 +30,7 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
 
 
 def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
-    """Return the vertical delay on L1, as the median over channels of the mapped slant delays, shape (T,) [m].
+    """Return the median over channels of the slant delays, mapped to the vertical on L1, shape (T,) [m].
 
     `slant_m` and `elevation_deg` have shape (T, K), the carriers `frequency_hz` shape (K,). 0 where no delay is known.
     """

@@ -24,7 +24,8 @@ _SAME_S: Final = 0.05
 LONGEST_AGE_S: Final = 60.0
 #: Largest age of the station's phase errors [s]; they change by millimetres in a second.
 _PHASE_AGE_S: Final = 1.1
-#: Sigma of ionospheric, tropospheric and orbit error differences per kilometre between station and train [m].
+#: Sigma per kilometre of distance between station and train, due to the differences of their ionospheric, tropospheric
+#: and orbit errors [m].
 _PER_KM_M: Final = 0.004
 LONGEST_KM: Final = 100.0  #: Largest distance at which the station is used [km].
 
@@ -47,9 +48,12 @@ class BaseErrors:
     #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings
-    #: Corrected code minus range and the constellation's receiver clock; NaN where not observed; shape (B, S).
+    #: Corrected code minus geometric range, and minus the receiver clock offset of the constellation; NaN where not
+    #: observed; shape (B, S).
     code_m: Floats
-    phase_m: Floats  #: Corrected phase minus range and a clock common to all channels, with ambiguity; shape (B, S).
+    #: Corrected phase minus geometric range, and minus a clock offset common to all channels; the ambiguity remains;
+    #: shape (B, S).
+    phase_m: Floats
     arc: Integers  #: Number of the arc of each phase, shape (B, S).
 
     def __len__(self) -> int:
@@ -89,10 +93,13 @@ class BaseErrors:
     def at(
         self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
     ) -> BaseDifferences:
-        """Return the newest errors at a train's epochs (T,) and approximate positions (T, 3), for its channels (K,).
+        """Return the station's newest errors at a train's epochs (T,), for the train's channels (K,).
+
+        `receiver_ecef_m` are approximate positions of the train, shape (T, 3).
 
         For a channel that the station does not observe, another signal of the same band is used; the two signals differ
-        by a constant per constellation. The errors are NaN (arc -1) without a recent error, or beyond `LONGEST_KM`.
+        by a constant per constellation. Where the station has no recent error, or is farther away than `LONGEST_KM`,
+        the errors are NaN and the arcs -1.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -149,7 +156,7 @@ class BaseStationSource:
         return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the source `other` and the station's errors, with the sigma of the corrected ranges."""
+        """Return the delays of the source `other`, the station's errors, and the sigma of the corrected ranges."""
         given = self.other.delays(time, channels, satellites, seen)
         base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
         differenced = np.isfinite(base.code_m)

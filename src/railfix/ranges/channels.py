@@ -15,11 +15,11 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: Limits of a plausible pseudorange [m], beyond the ranges of all satellites at receiver clock offsets up to 33 ms.
+#: Limits of plausible pseudoranges [m]; they contain those of all satellites at receiver clock offsets up to 33 ms.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
-#: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
+#: Signals near L1 in order of preference, as RINEX 3 codes without the type letter.
 DEFAULT_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "G": ("1C", "1W", "1P", "1X", "1L", "1S"),
     "J": ("1C", "1X", "1L", "1S", "1Z"),
@@ -104,7 +104,7 @@ class Channels:
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
     frequency_hz: Floats  #: Carrier frequency of the K channels, shape (K,).
     every_frequency_hz: Floats  #: Carrier frequency of all channels of the log, shape (M,).
-    left_out: Integers  #: Reason why the settings leave a channel out, 0 for the other channels; shape (M,).
+    left_out: Integers  #: Reason why the settings leave a channel out, 0 for channels in use; shape (M,).
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
     #: Columns of the second signals of each channel's satellite in order of preference, -1 for none; shape (K, P). P is
     #: 0 with one frequency. With two frequencies it is at least 1, even if the log has no second signal.

@@ -58,9 +58,9 @@ def satellite_kind(satellite: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Mean:
-    """Mean C/N0 over elevation of one signal of one kind of satellites, in B elevation bins."""
+    """Mean C/N0 in B elevation bins, for one signal and one kind of satellites."""
 
-    kind: str  #: Key of `KINDS`.
+    kind: str  #: Kind of satellites, a key of `KINDS`.
     signal: str
     elevation_deg: Floats  #: Bin centres in ascending order, shape (B,).
     mean_dbhz: Floats  #: Mean C/N0 per bin, shape (B,).

@@ -23,13 +23,13 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
 _SHORT_S: Final = 12 * 3600.0  #: Duration below which a log causes a note [s]; P1 2.3(1) requires about a day.
-_DEFICIT_DBHZ: Final = 10.0  #: Deficit below the mean C/N0 with which P1 (table 6) rejects a signal [dB-Hz].
+_DEFICIT_DBHZ: Final = 10.0  #: P1 (table 6) rejects a signal whose C/N0 is this far below the mean [dB-Hz].
 #: Lowest elevation of the samples that are compared with the curve [deg], and largest fraction of these samples that
 #: may lie `_DEFICIT_DBHZ` below the curve without a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Fraction of satellites below `_BELOW_DEG` above which an error is raised.
+_BELOW_SHARE: Final = 0.05  #: Largest fraction of satellites below `_BELOW_DEG` that is accepted without an error.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ class AntennaRanges(NotebookTable):
     """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
 
     time: Datetimes  #: Time tags, shape (T,).
-    break_before: Masks  #: Epochs that must not be differenced with the previous epoch, shape (T,).
+    break_before: Masks  #: True where an epoch must not be differenced with the previous epoch, shape (T,).
     #: Properties of each channel, shape (K,).
     satellite: Strings
     signal: Strings
@@ -81,7 +81,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: Epochs with a gross error that cannot be identified; noise and map estimates leave them out; shape (T,).
+    #: True at epochs with an unidentified gross error, which noise and map estimates leave out; shape (T,).
     unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`); None if not used.
     base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.

@@ -77,7 +77,7 @@ class ErrorSamples:
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
-    """Return the statistics of the bins from the samples `which`, a mask of shape (n,).
+    """Return the statistics of all bins, computed from the samples that the mask `which` selects, shape (n,).
 
     A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of a wider set of bins, the first of the
     following sets with enough blocks: all azimuths at the bin's elevation and C/N0; all azimuths and C/N0 at the bin's
@@ -144,8 +144,8 @@ def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
     """Yield the rows of a table: one for each interval of elevation, for each sector and for each interval of C/N0.
 
     A row has a name, and count, bias, sigma and overbound before and after the screens. Bias and sigma are combined
-    from the bins of the row with the counts as weights. The overbound is the range of the bounding sigmas of these
-    bins.
+    from the bins of the row with the counts as weights. The overbound is stated as the smallest and the largest
+    bounding sigma of these bins.
     """
     bins = model.bins
     width = 360.0 / bins.sectors
@@ -193,7 +193,7 @@ def fault_rate(samples: ErrorSamples) -> FaultRate:
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
     every, bad = np.unique(samples.block[used]), np.unique(samples.block[faulty])
     ranges, count = int(used.sum()), int(faulty.sum())
-    # fraction of the ranges of a faulty block that are faulty; 1 without a faulty block
+    # fraction of faulty ranges in a faulty block; 1 without a faulty block
     part = (count / ranges) / (len(bad) / len(every)) if len(bad) else 1.0
     upper = _upper(len(bad), len(every))
     low = used & (samples.elevation_deg < _SIDE_ELEVATION_DEG)

@@ -72,7 +72,7 @@ def _correct_second_codes(corrected: CorrectedRanges, navigation: Navigation, no
 def _delays(
     navigation: Navigation, channels: Channels, states: SatelliteStates, choice: int
 ) -> tuple[Floats, Floats, Masks]:
-    """Return group delay, sigma of it [m], and whether the chosen second signals are unhealthy, shapes (T, K)."""
+    """Return the group delay and its sigma [m], and whether the chosen second signals are unhealthy, each (T, K)."""
     shape = states.record.shape
     delay, sigma = np.full(shape, np.nan), np.zeros(shape)
     sick = np.zeros(shape, dtype=bool)
@@ -90,7 +90,7 @@ def _delays(
 
 @lru_cache(maxsize=64)
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
-    """Return a signal's group delay, sigma of the delay [m], and whether the signal is unhealthy, for n records.
+    """Return the group delay of a signal and its sigma [m], and whether the signal is unhealthy, for n records.
 
     For GPS, QZSS and BeiDou the clocks of all messages refer to the same signals, so a missing delay is taken from the
     satellite's nearest record of another message.
@@ -120,6 +120,6 @@ _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of the group delay of L2C and L5 from LNAV, which has no ISC, shape (n,) [m]; 0 for others."""
+    """Return the sigma of the group delay, shape (n,) [m]; nonzero only for L2C and L5 with LNAV, which lacks ISC."""
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in P_CODES), 0.0)

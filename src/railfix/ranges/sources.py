@@ -98,7 +98,7 @@ def choose_ionosphere(
 
 @dataclass(frozen=True, kw_only=True)
 class BroadcastSource:
-    """Source with broadcast records, or precise orbits and clocks if the navigation data has them, and delay models."""
+    """Source that uses delay models, and precise orbits and clocks if available, otherwise broadcast records."""
 
     navigation: Navigation
     klobuchar: Floats | None  #: Coefficients, shape (8,); None leaves the ionosphere uncorrected.

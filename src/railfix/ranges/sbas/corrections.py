@@ -122,8 +122,9 @@ class SbasCorrections:
     def satellites(
         self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None
     ) -> SatelliteCorrections:
-        """Return the fast and long-term corrections for T epochs by K satellites; NOT_IN_MASK outside the mask.
+        """Return the fast and long-term corrections for T epochs and K satellites.
 
+        The state of satellites outside the mask is NOT_IN_MASK.
         A long-term correction is applied only if a record of `navigation` has the issue of data of the correction;
         otherwise the last correction with another issue is tried. Without navigation data, the newest correction is
         applied unchecked.
@@ -227,7 +228,7 @@ class SbasCorrections:
     def ionosphere(
         self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> IonosphereDelays:
-        """Return slant delays on L1 from the grid at positions (T,), towards K satellites at angles (T, K)."""
+        """Return slant delays on L1 that the grid implies for positions (T,) and directions to satellites (T, K)."""
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )

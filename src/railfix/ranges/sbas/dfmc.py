@@ -50,7 +50,8 @@ SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
 _ONE_MORE: Final = -2  #: Placeholder for an indicator that type 34 increases by one.
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations in the order of type 37.
-#: Validity of a mask, validity of an indicator, and time for which type 0 stops the use of the SBAS satellite [s].
+#: Validity of a mask (`MASK_S`) and of an indicator (`INDICATOR_S`), and time for which a message of type 0 stops the
+#: use of the SBAS satellite (`STOP_S`) [s].
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
 #: Time, covariance and indicator, which have equal bit positions in types 32 and 40.
@@ -109,14 +110,16 @@ class DfmcCorrections:
     """Corrections by SBAS on L5 for T epochs by K satellites."""
 
     state: Integers  #: `DfmcState`, shape (T, K).
-    issue: Integers  #: Issue of data of the record to which the correction refers; -1 if none does; shape (T, K).
+    #: Issue of data of the record to which the correction refers; -1 without a correction; shape (T, K).
+    issue: Integers
     record: Integers  #: Row of `navigation.kepler` with this issue, -1 without such a record; shape (T, K).
     position_m: Floats  #: Correction added to the broadcast position, shape (T, K, 3).
     clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
     sigma_m: Floats  #: Sigma from the indicator and the scale, before covariance and degradation; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
     growth_m: Floats  #: Degradation of the correction since the reception, shape (T, K).
-    constant: Floats  #: Constant added to the factor along a line of sight, shape (T, K).
+    #: Constant added to the factor on sigma that the covariance gives for a line of sight, shape (T, K).
+    constant: Floats
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:
         """Return the standard deviation of corrected ranges along unit vectors to the satellites, shape (T, K) [m]."""
@@ -298,7 +301,7 @@ class DfmcService:
         return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
 
     def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
-        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 if too old."""
+        """Return the indicator in force, from type 32 or a later message of types 34 to 36; -1 where it is too old."""
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)

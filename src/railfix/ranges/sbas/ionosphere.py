@@ -140,20 +140,20 @@ class Spans:
         self._edges = np.unique(np.concatenate(ends)) if len(time) else time
 
     def number(self, time: Datetimes) -> Integers:
-        """Return the number of the span of each instant; an instant at an edge has a separate number."""
+        """Return the number of the span that contains each instant; an instant at an edge has a separate number."""
         before = np.searchsorted(self._edges, time, side="left")
         return np.asarray(before + np.searchsorted(self._edges, time, side="right"), dtype=np.int64)
 
 
 def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indices, Indices]:
-    """Return the first row of each distinct combination of span (M,) and points (M, 4), and each row's combination.
+    """Return the first row of each distinct pair of span (M,) and points (M, 4), and the number of each row's pair.
 
     The number of a point is at least -1 and less than `points`.
     """
     # Successive rows of one span have one number; a span that occurs again later may have another number.
     key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
     pairs = (point[:, ::2] + 1) * (points + 1) + point[:, 1::2] + 1
-    # Renumbered half-way, so that the keys stay small for logs of any length.
+    # The keys are renumbered after the first two points, so that they stay small for logs of any length.
     _, key = np.unique(key * (points + 1) ** 2 + pairs[:, 0], return_inverse=True)
     _, first, which = np.unique(key * (points + 1) ** 2 + pairs[:, 1], return_index=True, return_inverse=True)
     return first, which
@@ -168,7 +168,7 @@ def look_up(
 ) -> NDArray[Answer]:
     """Return `answer` at the four points and the time of each row, shape (M, ...).
 
-    It is called once for all rows of one span with the same points.
+    `answer` is called once for all rows of one span that have the same points.
     """
     first, which = distinct_lookups(span, point, points)
     return np.asarray(answer(point[first], time[first])[which])
@@ -241,7 +241,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return corner points (M, 4), -1 where not used, and the position in the cell, (M,) and (M,), below 75 degrees."""
+    """Return corner points (M, 4), -1 where not used, and x and y in the cell, (M,) each, for latitudes below 75 deg."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
@@ -393,7 +393,7 @@ def _weights(
 def _values(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
-    """Return vertical delay and variance of corners, (M, 4), and whether type 10 is in force, (M,), at epochs `t`."""
+    """Return vertical delay and variance of corners, (M, 4), and whether type 10 is in force at epochs `t`, (M,)."""
     newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
     of_ten, delays, ten = newest[t], grid.delays, tables.degradation
     variance = _GIVE_VARIANCE[delays["givei"][row]]

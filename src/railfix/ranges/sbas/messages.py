@@ -77,7 +77,8 @@ class SbasMessages(RowArrays, NotebookTable):
     #: Bits of each message from the first preamble bit on, eight bits per byte, shape (N, 32). From bit 226 on they are
     #: the parity, if the source contains it, then zeros.
     bits: Bytes
-    parity_bits: Integers  #: Number of parity bits in the source, which were checked: 24, 6 or 0; shape (N,).
+    #: Number of parity bits that the source contains and that were checked: 24, 6 or 0; shape (N,).
+    parity_bits: Integers
     source: Integers  #: Index in `sources`, shape (N,).
     line: Integers  #: 1-based line of the file, shape (N,).
     sources: tuple[str, ...] = ()  #: Names of the files.

@@ -38,10 +38,10 @@ class FastInForce:
     growth_m: Floats  #: Degradation by the age of the correction (A.4.5.1.1).
     #: Degradation of the range rate per second; 0 where the rate does not degrade (A.4.5.1.2).
     rate_growth_mps: Floats
-    #: Time between the two corrections of the range rate; infinite where the rate does not degrade.
+    #: Time between the two fast corrections that determine the range rate; infinite where the rate does not degrade.
     rate_span_s: Floats
     since_s: Floats  #: Time since the time of applicability of the correction.
-    aged: Masks  #: Corrections older than the time-out of precision approach.
+    aged: Masks  #: True where the correction is older than the time-out of precision approach.
 
 
 def fast_in_force(
@@ -79,8 +79,8 @@ def fast_in_force(
 def _factors(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Integers, Floats, Masks]:
-    """Return the indicator of type 7, the largest indicator in the same message, the latency, and a mask of missing
-    values.
+    """Return the indicator of type 7, the largest indicator in the same message, the latency, and a mask that is true
+    where type 7 is missing.
 
     Where type 7 is missing, both indicators have the worst value.
     """
@@ -104,8 +104,8 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range rate, its degradation per second, the time between its two corrections, and a mask of missing
-    rates.
+    """Return the range rate, the degradation of the rate per second, the time between the two corrections used, and a
+    mask of missing rates.
 
     The rate is computed from the newest and the previous correction. After an alarm (IODF 3), the correction nearest to
     half the time-out before the newest is used in place of the previous correction.
@@ -131,7 +131,7 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Return, for each row, the same satellite's row received nearest to the time `before` earlier.
+    """Return, for each row, the same satellite's row nearest in time to the reception of the row minus `before`.
 
     Of two rows that are equally near, the later row is returned.
     """
@@ -201,7 +201,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the covariance in force, and a mask of satellites without one while the GEO sends others."""
+    """Return the row of the covariance in force, and a mask of satellites without one while the GEO sends type 28."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
@@ -215,7 +215,7 @@ def covariance_in_force(
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """Degradation terms [m], all (T, K); `missing` is true without type 10, `rss` where the squares are summed."""
+    """Degradation terms [m]; `missing` is true where type 10 is missing, `rss` where squares are summed; shapes (T, K)."""
 
     fast_m: Floats
     rate_m: Floats
@@ -259,7 +259,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of ages beyond the precision time-out."""
+    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of those beyond the precision time-out."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
@@ -298,7 +298,8 @@ class ServiceTable:
         """Return the factor on sigma UDRE at positions, NaN without type 27, and a mask of incomplete sets, shape (T,).
 
         The newest complete set of one issue is used. Inside several regions the factor of the highest priority applies,
-        or the smallest factor of equal priorities; outside all regions, the factor for other positions applies.
+        or the smallest factor of equal priorities; outside all regions, the factor that the message states for outside
+        positions applies.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1
@@ -337,7 +338,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return whether positions are in a rectangle, or the triangular half at the corner (latitude 1, longitude 2)."""
+    """Return whether positions are in a region: a rectangle, or half of a rectangle at (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

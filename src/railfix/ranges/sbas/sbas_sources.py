@@ -80,7 +80,7 @@ class DfmcSource:
         return SourceSatellites(states, None, lacking, fixes)
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the modelled ionosphere and the troposphere of DO-229D, with the sigmas of the corrections."""
+        """Return modelled ionospheric delays and DO-229D tropospheric delays, with the sigmas of the corrections."""
         fixes = satellites.fixes
         assert isinstance(fixes, DfmcCorrections)
         delays = dfmc_delays(fixes, time, seen, self.models.delays(time, channels, satellites, seen).delays)
@@ -126,10 +126,10 @@ def apply_dfmc(
 
 
 def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelled: Delays) -> Delays:
-    """Return the troposphere of DO-229D and the modelled ionosphere, with the sigma of corrected ionosphere-free codes.
+    """Return DO-229D tropospheric and modelled ionospheric delays, with the sigma of corrected ionosphere-free codes.
 
     ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without receiver noise. The
-    modelled ionosphere cancels in ionosphere-free codes.
+    modelled ionospheric delay cancels in ionosphere-free codes.
     """
     sight = seen.satellite_ecef_m - seen.receiver_ecef_m[:, None, :]
     along = fixes.sigma_along_m(sight / np.linalg.norm(sight, axis=-1, keepdims=True))

@@ -120,7 +120,7 @@ def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: i
 
 @dataclass(frozen=True, kw_only=True)
 class SatelliteCorrections(FrozenArrays):
-    """Corrections of T epochs by K satellites; NaN and -1 where `state` is not OK, except in `udrei` and `iode`.
+    """Corrections for T epochs and K satellites; NaN or -1 where `state` is not OK, except in `udrei` and `iode`.
 
     The corrected code is ``code + fast_m``. The corrected satellite position is ``broadcast + position_m`` and the
     corrected satellite clock ``broadcast + clock_s``, both from the record with the issue of data `iode`.
@@ -145,7 +145,7 @@ class SatelliteCorrections(FrozenArrays):
     covariance: Integers  #: Row of the covariance (type 28) in force, -1 if none is; shape (T, K).
 
     def take_satellites(self, which: Integers) -> SatelliteCorrections:
-        """Return the corrections of some satellites, by index."""
+        """Return the corrections of the satellites with the indices `which`."""
         return SatelliteCorrections(**{item.name: getattr(self, item.name)[:, which] for item in fields(self)})
 
     def sigma_flt_m(self, delta_udre: Floats | float = 1.0) -> Floats:
@@ -161,7 +161,7 @@ class SatelliteCorrections(FrozenArrays):
 
 @dataclass(frozen=True, kw_only=True)
 class IonosphereDelays(FrozenArrays):
-    """Ionospheric delays of T epochs by K satellites from the grid."""
+    """Ionospheric delays from the grid, for T epochs and K satellites."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).
     #: Slant delay on L1, to be subtracted from the code after multiplication by (f1/f)^2 for other carriers; NaN where

@@ -1,4 +1,4 @@
-"""SBAS messages received so far, and the corrections and the source of corrections from them."""
+"""SBAS messages received so far, and the corrections and the correction source that follow from these messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from railfix.ranges.sources import BroadcastSource, CorrectionSource
 class SbasState:
     """Messages of one GEO received so far; `add_messages` returns a new state with further messages.
 
-    Corrections at an epoch are the same as from the complete log, however the messages are divided into parts: a
+    However the messages are divided into parts, the corrections at an epoch are the same as from the complete log: a
     message is used from its reception on, and `drop_before` drops only messages that no later epoch can use.
 
     ::
@@ -67,7 +67,9 @@ class SbasState:
         return self.corrections.notes if self.log_notes is None else self.log_notes
 
     def add_messages(self, messages: SbasMessages) -> SbasState:
-        """Return the state after more messages, without other PRNs and messages repeated by a second receiver.
+        """Return the state after more messages.
+
+        Messages of other PRNs, and repetitions of a message by a second receiver, are left out.
 
         Raise SettingsError if `messages` are not `SbasMessages`.
         """
@@ -77,7 +79,7 @@ class SbasState:
 
     @property
     def dual_frequency(self) -> bool:
-        """Whether the corrections are for ionosphere-free codes, as with SBAS on L5."""
+        """Whether the corrections are for ionosphere-free codes, which is the case for SBAS on L5."""
         return self.band == "L5"
 
     @property
@@ -88,7 +90,7 @@ class SbasState:
     def source(self, models: BroadcastSource) -> CorrectionSource:
         """Return the source of corrections from the messages received so far, for the navigation records of `models`.
 
-        With SBAS on L5 the ionosphere of `models` is used by the screens; it cancels in the positions.
+        With SBAS on L5, the screens use the ionospheric delays of `models`; these delays cancel in the positions.
         """
         if isinstance(self.corrections, DfmcService):
             return DfmcSource(models=models, service=self.corrections)

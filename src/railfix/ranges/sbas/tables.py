@@ -138,7 +138,7 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return whether there is an active mask (T,), and whether the newest mask contains the satellites (T, K)."""
+        """Return whether the newest mask is active (T,), and whether this mask then contains the satellites (T, K)."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
@@ -152,7 +152,7 @@ class MaskTable:
 
 
 class SatelliteTables:
-    """Tables of all messages of one GEO on satellites, by number in the PRN mask.
+    """Tables of all messages of one GEO that concern satellites, by the number of the satellite in the PRN mask.
 
     `fast` has fast corrections; the column `fresh` is the first row since the satellite was last not monitored. `udre`
     has the UDREI from fast corrections and type 6; `grows_from` is the reception time from which degradation and
