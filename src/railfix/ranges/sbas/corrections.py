@@ -124,10 +124,9 @@ class SbasCorrections:
     ) -> SatelliteCorrections:
         """Return the fast and long-term corrections for T epochs and K satellites.
 
-        The state of satellites outside the mask is NOT_IN_MASK.
-        A long-term correction is applied only if a record of `navigation` has the issue of data of the correction;
-        otherwise the last correction with another issue is tried. Without navigation data, the newest correction is
-        applied unchecked.
+        The state of satellites outside the mask is NOT_IN_MASK. A long-term correction is applied only if a record of
+        `navigation` has the issue of data of the correction; otherwise the last correction with another issue is tried.
+        Without navigation data, the newest correction is applied unchecked.
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]

@@ -215,7 +215,7 @@ def covariance_in_force(
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """Degradation terms [m]; `missing` is true where type 10 is missing, `rss` where squares are summed; shapes (T, K)."""
+    """Degradation terms [m]; `missing` is true if type 10 is missing, `rss` where squares are summed; each (T, K)."""
 
     fast_m: Floats
     rate_m: Floats
@@ -259,7 +259,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of those beyond the precision time-out."""
+    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of those past the precision time-out."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
