@@ -41,7 +41,7 @@ from railfix.tracking import TrackStatus
 
 #: Names of three choices: all screens, no screens, and the filter along the track.
 ALL, NONE, FILTER = "all", "none", "filter"
-#: Filter sources that require sensor data, and the inputs of a run without which each source is absent.
+#: Filter sources that require sensor data, each with the inputs of a run that the source needs.
 _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
     "wheel": ("tachometer",),
     "radar": ("radar",),
@@ -71,7 +71,7 @@ class Effect:
     ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
     #: Errors of the conventional positions from the same ranges; None without a reference.
     conventional: Score | None = None
-    #: Errors at epochs without observations, as in tunnels; None if there are no such epochs or no reference.
+    #: Errors at epochs without observations, for example in tunnels; None if there are no such epochs or no reference.
     outage: Score | None = None
     #: 95th percentile of |error| / standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
@@ -104,7 +104,7 @@ class Ablation:
 
 
 def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the choices of screens by name: all, none, each screen alone, and all but one, without duplicates."""
+    """Return the distinct choices of screens by name: all screens, none, each screen alone, and all except one."""
     named = {ALL: tuple(screens), NONE: ()}
     named |= {f"only {name}": (name,) for name in screens}
     named |= {f"without {name}": tuple(other for other in screens if other != name) for name in screens}
@@ -113,7 +113,9 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of filter sources by name: all available sources, and all but one (never without codes)."""
+    """Return the choices of filter sources by name: all available sources, and all except one; codes are always
+    included.
+    """
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {

@@ -1,7 +1,7 @@
 """Error statistics of constrained and conventional positions by group of epochs, with confidence limits.
 
-Errors of a train are correlated over tens of seconds, so that epochs are not independent samples. Confidence limits are
-therefore computed by resampling blocks of one minute, which are nearly independent.
+The position errors of a train are correlated over tens of seconds, so that epochs are not independent samples.
+Confidence limits are therefore computed by resampling blocks of one minute, which are nearly independent.
 """
 
 from __future__ import annotations
@@ -170,9 +170,10 @@ POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Data type of columns of names during grouping. It suits them because they have many rows and few distinct names.
+#: Data type of columns of names during grouping. These columns have many rows and few distinct names.
 WORDS: Final = pl.Categorical()
-#: Name of the group of all epochs; also the entry in ``antenna``, ``run`` or ``line`` of rows that combine several.
+#: Name of the group of all epochs; also the entry in ``antenna``, ``run`` or ``line`` of rows that combine several
+#: antennas, runs or lines.
 ALL: Final = "all"
 #: Groups of the grouping ``signals``: epochs at which the single-epoch solution used a satellite, and epochs at which
 #: it used none.
@@ -222,7 +223,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "blocks": "number of time blocks for the confidence limits that follow",
     **dict.fromkeys(LIMIT_COLUMNS, "lower (`_low`) or upper (`_high`) confidence limit"),
 }
-#: Statuses of a position that passed every check, of single epochs and of the filter along the track.
+#: Statuses of positions that passed every check, in single epochs and in the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
 #: Columns of the table of epochs from which the error statistics are computed, in addition to `KEYS`.
 USED: Final = (

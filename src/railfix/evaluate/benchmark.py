@@ -164,7 +164,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
 
 
 def _unpack(paths: Sequence[Path], folder: Path, kind: str) -> list[Path]:
-    """Write copies of files without compression, which RTKLIB requires, into a folder; return their paths."""
+    """Write uncompressed copies of files, which RTKLIB requires, into a folder; return the paths of the copies."""
     unpacked = {folder / f"{number}.{kind}": path for number, path in enumerate(paths)}
     for target, path in unpacked.items():
         target.write_bytes(read_bytes(path))

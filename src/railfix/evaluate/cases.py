@@ -115,7 +115,7 @@ def read_case(folder: Path) -> Case:
 
 
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write ``case.toml`` into a folder from `content` without hashes; the SHA-256 of each file is added.
+    """Write ``case.toml`` into a folder: `content`, which has no hashes, and the SHA-256 of each file.
 
     Raise SettingsError if the content is not a valid case.
     """

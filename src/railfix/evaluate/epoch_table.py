@@ -107,8 +107,8 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
     """Return the epochs of a log with missing epochs added, a mask of logged epochs, and the median interval [s].
 
-    Epochs are missing where an interval is longer than 1.5 times the median interval; they are spread evenly over this
-    gap. With fewer than two epochs, the median interval is NaN.
+    Epochs are missing where an interval is longer than 1.5 times the median interval; the missing epochs are spread
+    evenly over this interval. With fewer than two epochs, the median interval is NaN.
     """
     if len(time) < 2:
         return time, np.ones(len(time), dtype=np.bool_), float("nan")
@@ -129,8 +129,8 @@ def distance_travelled(
     """Return the distance travelled since the first known reference position, shape (T,) [m].
 
     `step_m` are the distances between successive known positions. Steps at a speed below `options.standing_mps` are not
-    counted. Over gaps, the distance is interpolated in time. It is NaN before the first and after the last known
-    position.
+    counted. Over gaps, the distance is interpolated in time. The result is NaN before the first and after the last
+    known position.
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)

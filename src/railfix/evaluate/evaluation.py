@@ -53,7 +53,7 @@ class RunAndReference:
     configuration: str | None = None  #: Name of the configuration; if None, a name is made from the settings.
     table: str = POSITIONS_TABLE  #: Name of the table, see `railfix.evaluate.evaluation_inputs.list_position_tables`.
     #: Folder of another run on the same log; its conventional positions replace those of `run`. For the comparison of
-    #: P1, that other run has only the elevation and C/N0 screens.
+    #: P1, the other run has only the elevation and C/N0 screens.
     conventional: Path | None = None
 
 
@@ -96,7 +96,7 @@ class Evaluation(NotebookTable):
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return the value in column `name` of the one row of `figures` in which other columns have the values `where`.
+        """Return the value in column `name` of the row of `figures` that has the values `where`, given by column name.
 
         The defaults are `grouping` "all", `epochs_of` "own" and `position` "constrained". Raise LookupError unless
         exactly one row has these values.
@@ -191,7 +191,7 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Evaluate a run; return it without its name, the epochs of each antenna, and the kind and limit of its levels.
+    """Evaluate a run; return the run, still unnamed, the epochs of each antenna, and kind and limit of the levels.
 
     References that are read from files are kept in `read`, so that several runs share them.
     """
@@ -299,7 +299,7 @@ def reference_beside(run: RunFolder) -> Path:
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
-    """Return a name for the settings of each run: the given label, or the preset and the settings that differ.
+    """Return a name for the settings of each run: the given label, or the preset and the settings that differ by run.
 
     The name of a single run consists of the preset and the screens.
     """
@@ -317,7 +317,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return the runs with configurations and short distinct names, which state the table if it is not `positions`."""
+    """Return the runs with configurations and short distinct names; a name includes a table other than `positions`."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
@@ -350,9 +350,9 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Yield the rows of each value of the column `by`, with the columns `as_one` set to `ALL`.
+    """Yield the rows with each value in the column `by`, after the columns `as_one` have been set to `ALL`.
 
-    With two antennas, yield the rows of each value again with both antennas combined: ``antenna`` is `ALL`, too.
+    With two antennas, yield the rows with each value again with both antennas combined, where ``antenna`` is `ALL`.
     """
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):

@@ -57,7 +57,7 @@ class RunFolder(RunRecord):
 
     @property
     def chainage_of(self) -> Mapping[str, str]:
-        """Point of the train to which the chainage refers, such as "antenna", by antenna; empty if not recorded."""
+        """Point of the train to which each antenna's chainage refers, such as "antenna"; empty if not recorded."""
         return dict(self._line.get("chainage_of") or {})
 
     def turn_m(self, antenna: str) -> float:
@@ -90,7 +90,7 @@ class RunFolder(RunRecord):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings that were used, by dotted name, and the optional kinds of input that were given."""
+        """Settings that the run used, by dotted name, and entries for the optional kinds of input that it was given."""
         flat = flat_settings(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.entries}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
@@ -249,14 +249,14 @@ def _table(file: Path, columns: cs.Selector | None) -> pl.DataFrame:
 
 
 def floats(table: pl.DataFrame, name: str) -> Floats:
-    """Return a column as numbers; NaN where the column is null, and everywhere if the table does not have it."""
+    """Return a column as numbers; NaN where the column is null, and everywhere if the table lacks the column."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
 def words(table: pl.DataFrame, name: str) -> Strings:
-    """Return a column as text; blank where the column is null, and everywhere if the table does not have it."""
+    """Return a column as text; blank where the column is null, and everywhere if the table lacks the column."""
     if name not in table.columns:
         return np.full(len(table), "")
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
@@ -266,7 +266,8 @@ Method = Literal["chainage", "trajectory"]
 
 #: Longest interval between two reference positions over which the reference is interpolated [s].
 LARGEST_GAP_S: Final = 2.5
-#: Windows of continuity [s]: 15 s as for an approach in aviation, 60 s as for a journey between two stations.
+#: Durations of the windows for continuity [s]: 15 s as for an approach in aviation, 60 s as for a journey between two
+#: stations.
 WINDOWS_S: Final = (15.0, 60.0)
 
 

@@ -30,7 +30,7 @@ STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
 #: Columns of the table of epochs that a Stanford diagram requires, in addition to the level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
-#: Statuses with which the protection level of a position bounds the error, including that of a coasting filter.
+#: Statuses of positions whose protection level bounds the error; a coasting filter is included.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -72,7 +72,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as for 15 s, for windows of 60 s"),
 }
 
-#: Columns of the list of epochs beyond their level, with their unit and meaning; KIND is the kind of the level.
+#: Columns of the list of epochs whose error exceeds the level, with unit and meaning; KIND is the kind of the level.
 BEYOND_COLUMNS: Final[dict[str, str]] = {
     "run": "name of the run",
     "time_gpst": "time tag of the receiver, GPS time",
@@ -99,19 +99,20 @@ class Integrity:
     """Comparison of the protection levels of one kind with the errors."""
 
     stanford: pl.DataFrame  #: Counts of epochs: `railfix.evaluate.accuracy.KEYS`, then `STANFORD_COLUMNS`.
-    beyond: pl.DataFrame  #: Epochs beyond their level: `BEYOND_COLUMNS`, the largest excess first.
+    beyond: pl.DataFrame  #: Epochs whose error exceeds the level: `BEYOND_COLUMNS`, the largest excess first.
 
 
 def level_name(kind: str) -> str:
-    """Return the name of the column with the levels of a kind in the table of epochs."""
+    """Return the name of the column of the table of epochs that has the levels of a kind."""
     return f"{kind}_protection_level_m"
 
 
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
     """Return the levels that are compared with errors, shape (T,) [m].
 
-    A level is infinite if it is missing, or if it is not usable and `levels_of` is "usable". It is NaN where the mask
-    `has` is false: no position. `status` is the status of the position, `verdict` the status of the level.
+    A level is infinite if it is missing, or if it is not usable and `levels_of` is "usable". It is NaN at epochs
+    without a position, where the mask `has` is false. `status` is the status of the position, `verdict` the status of
+    the level.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
@@ -241,7 +242,7 @@ def _count(
 
 
 def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
-    """Return a table of the counts, their sums over antennas and over the runs of a configuration, and fractions."""
+    """Return a table of the counts and of fractions, with sums over antennas and over the runs of a configuration."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))

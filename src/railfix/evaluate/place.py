@@ -54,8 +54,8 @@ class Bracket:
 def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
     """Return the neighbouring instants of a reference for each time; the reference times must increase.
 
-    Times between two instants that are more than `largest_gap_s` apart are not inside. Raise ValueError if the
-    reference has fewer than two instants.
+    Times between two instants that are more than `largest_gap_s` apart are in a gap (`Bracket.inside`). Raise
+    ValueError if the reference has fewer than two instants.
     """
     if len(reference_time) < 2:
         raise ValueError(f"reference_time has {len(reference_time)} instants, at least two were expected")
@@ -143,8 +143,8 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Run and reference are on the same map if their distance in chainage differs from their distance in space by at most
-#: this at the median [m].
+#: Run and reference count as on the same map if the median difference between their distances in chainage and in space
+#: is at most this [m].
 SAME_MAP_M: Final = 1.0
 #: Largest distance of a position from the trajectory of the run that computed it [m].
 SAME_TRAJECTORY_M: Final = 0.01
@@ -269,7 +269,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
 def _note_of_passes(
     antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
 ) -> tuple[str, ...]:
-    """Return a note with the number of errors not measured to the pass of the line that is nearest to the reference."""
+    """Return a note on errors that were measured to another pass of the line than the one nearest to the reference."""
     known = np.isfinite(error_m)
     nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
     others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())
@@ -307,7 +307,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
 
 def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
     """Return the arc lengths at chainages; chainages beyond an end of the line by less than `_ROUNDING_M` are moved to
-    it.
+    this end.
     """
     first, last = trajectory.chainage_m[0], trajectory.chainage_m[-1]
     near = (chainage_m > first - _ROUNDING_M) & (chainage_m < last + _ROUNDING_M)
@@ -357,8 +357,8 @@ def find_trajectory(
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
     """Return the sets of options (CRS, height datum, geoid) with which the track is to be read, in order of preference.
 
-    If options are given, they are the only set. Otherwise the track is read with the options in ``run.json``, then
-    without options; without options first if the run wrote the track that it used.
+    If options are given, they are the only set. Otherwise the sets are the options in ``run.json``, then no options;
+    the order is reversed if the run wrote the track that it used.
     """
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):

@@ -1,5 +1,4 @@
-"""Pseudorange errors against a reference position, after subtraction of receiver clock and common errors (P1 7, fig.
-14).
+"""Pseudorange errors at a reference position, without receiver clock and common errors (P1 7, fig. 14).
 
 A nearby reference station measures the common errors. An error model is fitted to the errors of several runs.
 """
@@ -83,9 +82,10 @@ class StationErrors:
     """Range errors that a reference station shares with nearby receivers, at B epochs for S satellites."""
 
     name: str
-    time: Datetimes  #: Shape (B,).
-    satellite: Strings  #: Shape (S,).
-    #: Corrected pseudorange minus geometric range and receiver clock; NaN where not observed; shape (B, S).
+    time: Datetimes  #: Time of each epoch, shape (B,).
+    satellite: Strings  #: Satellites, shape (S,).
+    #: Corrected pseudorange minus geometric range, and minus the receiver clock offset; NaN where not observed; shape
+    #: (B, S).
     error_m: Floats
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
@@ -166,8 +166,8 @@ class RangeErrors:
     """Errors of n pseudoranges, with their times and satellites."""
 
     samples: ErrorSamples
-    time: Datetimes  #: Shape (n,).
-    satellite: Strings  #: Shape (n,).
+    time: Datetimes  #: Time of each error, shape (n,).
+    satellite: Strings  #: Satellite of each error, shape (n,).
     epochs: int  #: Number of epochs with a reference position.
 
 
@@ -235,7 +235,7 @@ def range_errors(
 
 
 def _level_sigma_m(result: AntennaResult) -> Floats:
-    """Return the standard deviation of each range that the protection level of the run uses, shape (T, K) [m]."""
+    """Return the standard deviation that the run's protection level assumes for each range, shape (T, K) [m]."""
     stated = result.corrected.sigma_m * np.maximum(result.noise_scale, 1.0)[:, None]
     return np.asarray(np.fmax(stated, result.corrected.bound_sigma_m))
 
@@ -332,8 +332,8 @@ def error_model_from_runs(
 
 
 def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
-    """Compute the range errors of one run by processing it again, chunk by chunk; `number` makes the block numbers of
-    the runs distinct.
+    """Compute the range errors of one run by processing it again, chunk by chunk; `number` is the number of the run,
+    which keeps the block numbers of different runs distinct.
     """
     past = read_record(source.run)
     past.check_inputs()

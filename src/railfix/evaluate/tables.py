@@ -46,7 +46,7 @@ _AVAILABLE: Final = (
 )
 
 
-#: Names of the protection levels of the filter; the others are levels of single epochs.
+#: Names of the protection levels of the filter; all other levels are levels of single epochs.
 _LEVEL: Final = pl.col("level").replace(
     {
         "train_protection_level_m": "filter, along the line",
@@ -270,7 +270,7 @@ def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _together(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return, with several runs, only the rows that combine both antennas; all rows for a single run."""
+    """Return only the rows that combine both antennas if there are several runs, or all rows of a single run."""
     several = rows["run"].n_unique() > 1 and "all" in rows["antenna"]
     return rows.filter(antenna="all") if several else rows
 
@@ -278,7 +278,7 @@ def _together(rows: pl.DataFrame) -> pl.DataFrame:
 def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
     """Return the rows of each run and antenna in display order, with formatted confidence limits.
 
-    Rows on common epochs are left out where all kinds of position have the same number of positions.
+    Rows for common epochs are left out where all kinds of position have the same number of positions.
     """
     order = {name: number for number, name in enumerate(_NAMES)}
     parts: Iterator[pl.DataFrame] = (
@@ -360,8 +360,8 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: Maximum number of epochs beyond their level in ``evaluation.json``, sorted by descending excess; the CSV file has all
-#: these epochs.
+#: Largest number of epochs listed in ``evaluation.json`` because their error exceeds the level, the largest excess
+#: first; the CSV file has all of them.
 MOST_BEYOND: Final = 200
 
 
