@@ -82,8 +82,8 @@ class Budget:
 def budget(limits: TrackingLimits) -> Budget:
     """Compute the risk budget of the level from the settings.
 
-    A fault is assumed to last as long as one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. The
-    fault then affects the filter for `FORGOTTEN` correlation times of codes, while its errors remain in the state.
+    A fault is assumed to last as long as one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. A
+    past fault affects the filter for `FORGOTTEN` more correlation times of codes, through errors in the state.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

@@ -102,7 +102,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
 
 
 def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLimits) -> Floats:
-    """Return the white-error variances of codes, phase changes and Dopplers, the last two by C/N0, shape (3, T, K)."""
+    """Return white-error variances of codes, and by C/N0 those of phase changes and Dopplers, shape (3, T, K)."""
     cn0 = np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
     return np.array(

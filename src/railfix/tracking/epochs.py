@@ -139,7 +139,7 @@ class SensorEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """Last epoch of the previous chunk, to which the first phase changes refer."""
+    """Last epoch of the previous chunk, from which the first phase changes of a chunk are computed."""
 
     channel: Strings  #: Channel names, shape (K,).
     sat_ecef_m: Floats  #: Satellite positions, shape (K, 3).

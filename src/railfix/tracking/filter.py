@@ -104,7 +104,7 @@ class Recursion:
         return done, reasons
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
-        """Return the record of an epoch for the smoother, without hypotheses."""
+        """Return the record of an epoch for the smoother, still without hypotheses."""
         own = self.chunk.epoch[epoch]
         return Step(dt=float(own["interval_s"]), satellite=state.satellite, tilt_scale=float(own["tilt_scale"]))
 

@@ -27,8 +27,8 @@ from railfix.tracking.state import TrackState
 #: Sensors whose values between two selected epochs are accumulated.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])  #: True for sensors whose values are averaged, not summed.
-#: Separation in standard deviations up to which a sub-filter is consistent with noise, for positions without a level,
-#: and with a level. A sub-filter that excludes a faulty satellite has a larger separation.
+#: Largest separation of a sub-filter that noise explains, in standard deviations: for positions without a level, and
+#: for positions with a level. A sub-filter that excludes a faulty satellite has a larger separation.
 _EXPLAINED: Final = (3.0, 4.0)
 #: Larger levels count as infinite [m], because they result from a sub-filter without measurements.
 LARGEST_LEVEL_M: Final = 1000.0
@@ -51,13 +51,13 @@ class AccumulatedIncrement:
     #: Sums of wheel distances [m], radar distances [m] and forces [m/s2], and of their variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
-    balises: BaliseEpochs | None = None  #: Last balises read since the selected epoch, as a single epoch.
+    balises: BaliseEpochs | None = None  #: Last balises read since the last selected epoch, stored as one epoch.
 
 
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return indices and measurements of one epoch per period, and the remainder after the last selected epoch.
+    """Select one epoch per period; return indices and measurements of these epochs, and the remainder after the last.
 
     A carrier phase must continue at all epochs between two selected epochs. Distances between selected epochs are
     summed, forces averaged, and balises assigned to the next selected epoch. Positions from features and ranges to
@@ -188,7 +188,7 @@ def carried_levels(
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
     tau = seconds(tracked.time - times[number])  # NaN before the first epoch of the second filter
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
-    # Growth of the position error since that epoch: V tau + a tau^2 / 2.
+    # Growth of the position error since the second filter's last epoch: V tau + a tau^2 / 2.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
     known = np.isfinite(tracked.arc_m)
 
@@ -203,7 +203,7 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # If doubtful, sigma includes the largest separation; otherwise, only the separation that noise does not explain.
+    # If doubtful, sigma includes the largest separation; otherwise, only the part that noise does not explain.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)

@@ -16,8 +16,8 @@ class Tails(NamedTuple):
     """Degrees of freedom of the Student t distribution of measurement errors."""
 
     usual: float
-    #: Degrees of freedom for codes longer than expected, because a reflected signal arrives late, never early, and its
-    #: excess path has no typical length. Small errors have the same weight on both sides.
+    #: Degrees of freedom for codes longer than expected. A reflected signal arrives late, never early, and the excess
+    #: path has no typical length. Small errors have the same weight on both sides.
     late: float
 
     def weight(self, residual: Floats, square: Floats) -> Floats:
@@ -26,7 +26,7 @@ class Tails(NamedTuple):
         return np.asarray((self.usual + 1.0) / self.usual * degrees / (degrees + square))
 
     def log_density(self, residual: Floats, square: Floats) -> Floats:
-        """Return the log density that corresponds to `weight`, for the same parameters; 0 at its maximum."""
+        """Return the log density that corresponds to `weight`, with the same parameters; 0 at the maximum."""
         degrees = np.where(residual > 0.0, self.late, self.usual)
         return np.asarray(-0.5 * (self.usual + 1.0) / self.usual * degrees * np.log1p(square / degrees))
 

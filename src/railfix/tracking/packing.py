@@ -1,4 +1,4 @@
-"""Conversion of state, settings and sensors to the arrays of the recursion, and of the resulting state back."""
+"""Conversion of state, settings and sensors to arrays of the recursion, and of resulting arrays to a state."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Tracked(NotebookTable):
     amount_m: Floats
     used: Integers  #: Number of measurements of each kind with a weight above a half, shape (T, len(Kind)).
     innovation: Floats  #: Innovations of codes, phase changes and Dopplers, shape (T, 3, K).
-    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); of several ranges, the last.
+    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); for several ranges, the last.
     sensed: Floats
     weight: Floats  #: Weights of codes, phase changes and Dopplers, shape (T, 3, K); 0 for codes that are left out.
     faulty: Masks  #: True for codes that are left out (`railfix.kernels.tracking.adaptation`), shape (T, K).

@@ -86,7 +86,7 @@ def begin(
     """Return means (H, N) and covariances (H, N, N) of new hypotheses at positions `arc_m`, shape (H,).
 
     `satellites` is the number of satellite errors in the state. `known` are mean (N,) and covariance (N, N) of a lost
-    track. Its sensor unknowns are kept; clocks and satellite errors restart.
+    track. The sensor unknowns of this track are kept; clocks and satellite errors restart.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
@@ -117,7 +117,7 @@ def begin(
     return mean, covariance
 
 
-#: Probability of other positions where the velocity contradicts the only position, since the map may be wrong.
+#: Probability of other positions if the velocity contradicts the only position; the cause may be a wrong map.
 _ELSEWHERE: Final = 0.01
 
 
@@ -194,7 +194,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
 
 
 def _start_branches(state: TrackState) -> None:
-    """Reset the time and the distance since the hypotheses began."""
+    """Reset the time and the distance that are counted since the hypotheses began."""
     state.hypothesis["log_least"], state.hypothesis["log_recent"] = state.hypothesis["log_probability"], 0.0
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 

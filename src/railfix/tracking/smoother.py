@@ -1,4 +1,4 @@
-"""Smoothed positions, the filter estimates combined with all later measurements (docs/filter-equations.md).
+"""Smoothed positions: filter estimates combined with all later measurements (docs/filter-equations.md).
 
 The smoother has the adjoint form of G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
 doi:10.1080/00207177308932424. The smoother uses the measurement weights of the filter, and at each epoch the hypothesis
@@ -128,7 +128,7 @@ def smooth_steps(
 
 
 def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: float) -> float:
-    """Return the variance along the line by which an epoch's ionospheric error exceeds a quiet ionosphere's [m^2]."""
+    """Return the variance along the line that an epoch's ionosphere adds to that of a quiet ionosphere [m^2]."""
     both = step.covariance[h][[ix.ARC, ix.SLOW_CODE]]
     P = both[:, [ix.ARC, ix.SLOW_CODE]] - both @ matrix @ both.T
     less = (1.0 - max(step.tilt_scale, 1.0) ** -2) / quiet_m**2

@@ -24,7 +24,7 @@ class Monitors:
     weak_code_s: float = 0.0  #: Time for which the mean weight of codes has been low [s].
     #: Logarithm of the estimated Doppler variance divided by the variance of `TrackingLimits`.
     log_doppler_scale: float = 0.0
-    log_phase_scale: float = 0.0  #: The same for carrier phases.
+    log_phase_scale: float = 0.0  #: As `log_doppler_scale`, for carrier phases.
     #: Mean position shift implied by the codes of the last epochs, in standard deviations.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0  #: Variance of `code_shift`.
