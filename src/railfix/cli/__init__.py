@@ -15,8 +15,8 @@ from railfix import __version__
 from railfix.cli.command import LazyCommands, command_group
 from railfix.core.files import source_commit
 
-# Threads of OpenBLAS occupy processor cores even while they wait for work, so that one thread is used. The variable
-# must be set before numpy is imported.
+# OpenBLAS is limited to one thread, because its threads occupy processor cores even while they wait for work. The
+# variable must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 

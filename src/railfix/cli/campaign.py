@@ -113,14 +113,17 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print the number of finished runs and the remaining time on standard error; `kept` runs were finished earlier."""
+    """Print the number of finished runs and the remaining time on standard error; `kept` runs were finished by an
+    earlier command.
+    """
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} of earlier calls)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
     sys.stderr.flush()
 
 
-#: Signals that end a worker process: SIGINT (Ctrl-C), and SIGTERM, which the pool sends after another worker has ended.
+#: Signals that end a worker process: SIGINT (Ctrl-C), and SIGTERM, which the pool sends if another worker ends
+#: unexpectedly.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -138,7 +141,7 @@ def _prepare_worker() -> None:
 
 
 def _end(number_of_signal: int, _frame: object) -> None:
-    """Ignore further signals, which would interrupt the end of the process, and raise SystemExit."""
+    """Ignore further signals, which would interrupt the clean-up of the process, and raise SystemExit."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number_of_signal)
@@ -146,7 +149,7 @@ def _end(number_of_signal: int, _frame: object) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Yield an executor, and the types of the exceptions by which it reports a lost worker process.
+    """Yield an executor, and the types of the exceptions that the executor raises when it has lost a worker process.
 
     Raise SettingsError if no scheduler answers at the given address, or if `distributed` is not installed.
     """

@@ -1,4 +1,4 @@
-"""Base classes of the commands, which are loaded on demand, and end with a one-sentence message and an exit code."""
+"""Base classes of the commands. Commands are loaded on demand, and end with a one-sentence message and an exit code."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from railfix.core.extras import needs_extra
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: Exit code of a program that was ended by a signal, minus the number of the signal, as in POSIX shells.
+#: A program that was ended by a signal has this exit code plus the number of the signal, as in POSIX shells.
 SIGNALLED: Final = 128
-#: Message of `pathlib` for a symbolic link that leads to itself.
+#: Pattern of the message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
-#: Error numbers with which a write fails when the standard output accepts no more data.
+#: Error numbers of a failed write to a standard output that accepts no more data, for example on a full disk.
 _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 
 class Command(TyperCommand):
-    """Command that rejects repeated options, and values after switches, and reports all missing options together."""
+    """Command that rejects repeated options and values after switches, and reports all missing options together."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -79,12 +79,15 @@ class Command(TyperCommand):
                 ctx.fail(f"{name} is a switch and takes no value; remove {after} after it")
 
 
-#: Longest line of choices in the column of types of a help page; typer cuts words in a longer one at 80 columns.
+#: Maximum number of characters in a line of choices on a help page; typer would break words of longer lines at a width
+#: of 80 characters.
 _CHOICES_WIDTH: Final = 20
 
 
 def _simplify_help(param: Any) -> None:
-    """Show an argument and a switch without their Python types, and long lists of choices in several lines."""
+    """Change the help of a parameter: no Python type for an argument or a switch, several lines for a long list of
+    choices.
+    """
     show = getattr(param, "display_type_rich", None)  # typer before 0.29 shows no types
     if show is None:
         return
@@ -96,7 +99,9 @@ def _simplify_help(param: Any) -> None:
 
 
 def _wrap_choices(show: Callable[..., str | None], **context: Any) -> str | None:
-    """Return the type of an option; lines of choices end at a bar and have at most `_CHOICES_WIDTH` characters."""
+    """Return the type of an option for the help; choices are wrapped at their bars to at most `_CHOICES_WIDTH`
+    characters.
+    """
     text = show(**context)
     if text is None or "|" not in text:
         return text
@@ -109,7 +114,7 @@ def _wrap_choices(show: Callable[..., str | None], **context: Any) -> str | None
 
 
 class Commands(TyperGroup):
-    """Group of commands that report an error in one sentence, and end with the exit code of the error class."""
+    """Group of commands; each command reports an error in one sentence, and ends with the exit code of the error."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; report a RailfixError in one sentence, and any other error with a traceback."""
@@ -133,7 +138,7 @@ class Commands(TyperGroup):
             _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; make it a link to a file"))
 
 
-#: Options of every typer program; rich formats the help but not the tracebacks.
+#: Options of every typer application of this package; rich formats the help but not the tracebacks.
 _TYPER: Final[dict[str, Any]] = {
     "add_completion": False, "pretty_exceptions_enable": False, "rich_markup_mode": "markdown"
 }  # fmt: skip
@@ -145,10 +150,10 @@ def command_group(name: str, *, cls: type[Commands] = Commands, **options: Any) 
 
 
 class LazyCommands(Commands):
-    """Group that imports the module of a command only when it is called; the group's help is made from `summaries`."""
+    """Group that imports a command's module only when the command is called; the help is made from `summaries`."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Names of modules, by command, for commands whose module has another name than the command.
+    #: Module of each command whose module does not have the name of the command.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -162,8 +167,9 @@ class LazyCommands(Commands):
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name, the imported command and its arguments; for an unknown name, the error suggests a similar
-        one.
+        """Return the command's name, the imported command and the command's arguments.
+
+        The error for an unknown name suggests a similar name.
         """
         known = self.list_commands(ctx)
         word = args[0] if args else ""
@@ -188,7 +194,9 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program and exit with its code; no error is reported if the reader of standard output has closed it."""
+    """Run the program and exit with its code; no error is reported if the reader of standard output has closed the
+    pipe.
+    """
     if number := getattr(signal, "SIGPIPE", None):
         signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -209,9 +217,9 @@ def run_program(app: typer.Typer) -> NoReturn:
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:
-    """Exit if the reader of standard output has closed it.
+    """Exit if the reader of standard output has closed the pipe.
 
-    Otherwise another pipe is broken; then the function returns, so that the write to that pipe fails.
+    Otherwise another pipe is broken. The function then returns, so that the write to that other pipe fails.
     """
     poll = select.poll()
     poll.register(1, 0)

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 #: Maximum number of lines in the verdict of an evaluation.
 _MOST: Final = 5
-#: Maximum number of lines that a run prints without ``--verbose``.
+#: Maximum number of lines in the summary of a run without ``--verbose``.
 _MOST_LINES: Final = 12
 _ANTENNAS: Final = ("front", "rear")
-#: Limit on the 95th percentile of |error| / stated sigma, above which the stated sigma is reported as too small. For
+#: If the 95th percentile of |error| / stated sigma exceeds this limit, the stated sigma is reported as too small. For
 #: normally distributed errors the percentile is 2.0.
 _OVERCONFIDENT: Final = 3.0
 
@@ -48,9 +48,9 @@ def print_json(values: Mapping[str, Any]) -> None:
 
 
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """Return the error statistics of the positions on the map, one row per run and antenna, over all epochs of the run.
+    """Return the error statistics of the positions on the map over all epochs, one row per run and antenna.
 
-    Rows without errors come first, then the rows in descending order of the 95th percentile.
+    Rows without errors come first; the other rows are in descending order of the 95th percentile.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
@@ -78,8 +78,8 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
 def describe_errors(evaluation: Evaluation) -> str:
     """Return one sentence on the errors of a run's positions against its ground truth.
 
-    The sentence has the errors of the filter's positions, or of the single-epoch positions if the run has no filter. It
-    also has the number of errors above the protection level, and the errors of the conventional positions.
+    The sentence states the errors of the filter's positions, or of the single-epoch positions if the run has no filter.
+    It also states the number of errors above the protection level, and the errors of the conventional positions.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("run") != "all", pl.col("antenna") == "all"
@@ -102,7 +102,7 @@ def describe_errors(evaluation: Evaluation) -> str:
 
 
 def _judge(row: Mapping[str, Any]) -> str:
-    """Return a sentence on one row of `list_antenna_errors`, that is, on the errors of one run and antenna."""
+    """Return a sentence on the errors of one run and antenna, from one row of `list_antenna_errors`."""
     from railfix.evaluate.accuracy import WRONG_PLACE_M
 
     run, train, _ = str(row["run"]).partition(" (train)")
@@ -159,7 +159,8 @@ class TableConsole(Console):
 
 
 def split_table(table: RichTable, console: Console) -> list[RichTable]:
-    """Split a table by columns into parts that fit the console; each part repeats the leading columns of text.
+    """Split a table by columns into parts that fit the console; every part begins with the table's leading text
+    columns.
 
     Cells with text may be folded, but numbers are not. A part with only one column of numbers may therefore be wider
     than the console.
@@ -232,9 +233,8 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     """Yield the function that updates a progress bar on standard error.
 
-    The bar is shown only if standard error is a terminal.
-
-    The bar shows the number of epochs, the rate in epochs/s and the remaining time.
+    The bar is shown only if standard error is a terminal. It has the number of epochs, the rate in epochs/s and the
+    remaining time.
     """
     console = Console(stderr=True)
     columns = (
@@ -249,7 +249,8 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
     def show(*, epochs: int, fraction: float) -> None:
-        # not earlier, because the bar starts a thread, and a run must fork its processes before it has threads
+        # The bar is started only here, because it starts a thread, and a run must fork its processes before it has
+        # threads.
         bar.start()
         elapsed = bar.tasks[task].elapsed or 0.0
         bar.update(task, completed=fraction, epochs=epochs, rate=epochs / elapsed if elapsed > 0 else 0.0)

@@ -133,7 +133,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
     async def work() -> None:
         async for fixes in _fixes(logs, choices):
-            # for recorded streams, no clock is passed, and the time tags are used instead
+            # for recorded streams, the time tags are used instead of a clock
             judged = monitor.judge(fixes, None if recorded else time.monotonic())
             choices.out.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if counts else "wb") as file:
@@ -187,7 +187,7 @@ async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[Stat
 
 
 class KeyChoices(Settings):
-    """Numbers of the trains for which keys are made, and validity of the certificates."""
+    """Numbers of the trains for which keys are made, and period of validity of the certificates."""
 
     train: tuple[int, ...] = option("Number of a train, from 1; may be repeated.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
@@ -299,7 +299,7 @@ def demo(choices: DemoChoices) -> None:
 
 
 class CentreChoices(Settings):
-    """Options of the centre's page, and the duration of the session."""
+    """Options of the centre: addresses of its page, file of passwords, and duration of the session."""
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(

@@ -37,7 +37,7 @@ MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "
 
 
 class RouteChoice(Settings):
-    """Selection of a route through a network by the names of tracks, by points or by positions."""
+    """Selection of a route through a network: by the names of tracks, by points, or by positions of a run."""
 
     tracks: str | None = option(
         "Names of tracks of the route, in order; tracks between two of them are added.", None, metavar="NAME,NAME..."
@@ -62,7 +62,7 @@ class RouteChoice(Settings):
 
 
 class Connecting(Settings):
-    """Tolerance of the connections between tracks, and frame of the positions."""
+    """Tolerance for connecting the ends of tracks, and reference frame of the positions."""
 
     tolerance: float = option(
         "Distance within which ends of tracks are connected, if the file has no connections.",
@@ -78,7 +78,7 @@ class Connecting(Settings):
 
 
 class MatchOptions(Settings):
-    """Cross-track error of the positions, choice of rows to fill, and files to write."""
+    """Options of a match: cross-track error of the positions, rows to fill, and files to write."""
 
     sigma: float | None = option(
         "Standard deviation of the distance from the track, including the map's error; by default as "
@@ -225,7 +225,7 @@ def _route_tracks(
 def _in_frame_of(
     net: Network, log: PlanLog, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
-    """Return the positions of a log in the reference frame of the network, and notes on log and transformation."""
+    """Return the positions of a log in the network's reference frame, and notes on the log and the transformation."""
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)

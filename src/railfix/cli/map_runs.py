@@ -20,7 +20,7 @@ from railfix.core.tables import Column, count, listing, number, percent, plain_t
 from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
-#: Fraction of epochs with a protection level within the alarm limit, from which on a stretch counts as served.
+#: A stretch counts as served if at least this fraction of epochs has a protection level within the alarm limit.
 _SERVED: Final = 0.95
 _COLUMNS: Final[Sequence[Column]] = (
     ("chainage m", "from_m", count),
@@ -104,7 +104,7 @@ def service(
 
 
 class SurveyFiles(Settings):
-    """Navigation files, picture and name of a survey."""
+    """Options of a survey: navigation files, picture, and name of the track."""
 
     nav: tuple[Path, ...] = option(
         "Navigation file of the logs; repeat the option for several days.", (), metavar="NAV", panel=INPUTS

@@ -50,7 +50,7 @@ def overwriting(asked: bool) -> Overwrite:
 
 
 def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, inputs: Iterable[Path | None]) -> list[Path]:
-    """Return the paths that are not None; raise the errors of `check_output_file` if one must not be written."""
+    """Return the paths that are not None; raise the errors of `check_output_file` if a file must not be written."""
     asked = [(path, kind) for path, kind in outputs if path is not None]
     read = [path for path in inputs if path is not None]
     for path, kind in asked:
@@ -68,7 +68,9 @@ class Without:
 
 @dataclass(frozen=True, kw_only=True)
 class _Option:
-    """Option of a command, with the parameter of the command and the field names that lead to the value in a model."""
+    """Option of a command: the command's parameter, and the names of the nested fields that lead to the value in a
+    model.
+    """
 
     path: tuple[str, ...]
     parameter: inspect.Parameter
@@ -322,7 +324,7 @@ def check_set_once(settings: tuple[str, ...]) -> None:
 
 
 def set_value(values: dict[str, Any], text: str) -> None:
-    """Insert one KEY=VALUE into nested settings; the value is parsed as TOML, or else kept as text.
+    """Insert one KEY=VALUE into nested settings; a value that is not valid TOML is kept as text.
 
     Raise SettingsError if the text has no key or no equals sign, or if a group in the key is already a single setting.
     """

@@ -29,7 +29,8 @@ _SATELLITES: Final[Sequence[Column]] = (
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: arrays above this size [bytes] have separate pages.
+#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the threshold: memory of arrays above this size [bytes] is mapped
+#: separately.
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
@@ -86,7 +87,7 @@ def report(
     ]
     _free_arrays_at_once()
     check_outputs((out, "page"), overwrite=overwrite, inputs=[*(reference or ()), *in_runs, background])
-    # the observations are read in pieces while the page is drawn, so that reading errors occur in this block
+    # the observations are read in pieces while the page is written, so that errors of reading are raised in this block
     with reading_table(runs[0] / "observations.parquet" if len(runs) == 1 else Path("observations.parquet of a RUN")):
         page = write_report(
             runs,

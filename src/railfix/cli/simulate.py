@@ -40,7 +40,7 @@ class SimulateOptions(Settings):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Settings that override those of the scenario; raise SettingsError if a key is given twice."""
+        """Settings that override the scenario's settings; raise SettingsError if a key is given twice."""
         check_set_once(self.setting)
         changes: dict[str, Any] = {}
         for text in self.setting:
@@ -50,7 +50,7 @@ class SimulateOptions(Settings):
 
     @property
     def words(self) -> list[str]:
-        """Words of the command line that reproduce the run, without SCENARIO and --only."""
+        """Words of a command line that would simulate the run again, without SCENARIO and --only."""
         sets = [("--set", text) for text in self.setting]
         given = [("--out", self.out), ("--seconds", self.seconds), ("--seed", self.seed), *sets]
         words = [word for name, value in given if value is not None for word in (name, str(value))]

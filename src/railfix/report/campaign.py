@@ -32,7 +32,7 @@ _PIECES: Final = 400
 #: Maximum number of runs in a chart with one bar per run. The runs with the largest values are drawn; the table has all
 #: runs.
 _BARS: Final = 40
-#: Quantities by which the worst epochs are selected, in order of preference.
+#: Quantities by which the worst epochs are selected: the first for which there are values.
 _QUANTITIES: Final = ("error_m", "protection_level_m", "along_sigma_m")
 _FIGURES: Final[Sequence[Column]] = (
     ("epochs", "epochs", count),
@@ -54,7 +54,7 @@ class CampaignReport:
 
     #: At most five sentences on the number of runs, failed runs, accuracy and the worst run.
     sentences: tuple[str, ...]
-    #: Tables of all runs, of failed runs if there are any, and of the worst epochs if there are positions.
+    #: Tables: all runs; failed runs, if any; the worst epochs, if there are positions.
     tables: tuple[Table, ...]
     charts: tuple[Chart, ...]
     notes: tuple[str, ...]  #: Notes on runs that could not be compared with their reference.
@@ -110,9 +110,10 @@ def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Pa
 
 
 def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Return the positions of the filter, or of single epochs if the filter was off, with errors if known.
+    """Return the positions of the filter, or of single epochs if the filter was off, and a note.
 
-    Errors are known if there is a reference. The second value contains a note if the reference cannot be used.
+    The positions have errors if there is a usable reference. The note is present if the reference cannot be used.
+
     """
     name = next((table for table in list_position_tables(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)
     table = read_table(folder, name, columns=cs.by_name("protection_level_m", require_all=False))[1]
@@ -157,7 +158,7 @@ def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
 
 
 def _worst(pieces: pl.DataFrame, quantity: str, out: Path) -> Table:
-    """Return a table of the worst epochs, with links to their explanations, which are written to files.
+    """Write the explanations of the worst epochs to files, and return a table of these epochs with links to the files.
 
     An epoch of a run without observations has no explanation.
     """

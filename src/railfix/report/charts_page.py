@@ -1,4 +1,4 @@
-"""HTML pages of charts and tables: templates, conversion of charts to JSON, and the page of a network of tracks."""
+"""HTML pages with charts and tables: templates, conversion of charts to JSON, and the page on a network of tracks."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def since_1970(time: np.datetime64) -> float:
 
 
 def _layer(layer: Layer) -> dict[str, Any]:
-    """Return a layer as plain values by the names of its fields; fields that are None are omitted."""
+    """Return a layer as plain values by field name; fields that are None are omitted."""
     values: dict[str, Any] = {"label": layer.label, "colour": layer.colour, "kind": layer.kind}
     if isinstance(layer, Cells):
         return values | _cells(layer)
@@ -109,7 +109,7 @@ def _cells(layer: Cells) -> dict[str, Any]:
 
 
 def sky_values(sky: SkyEpochs) -> dict[str, Any]:
-    """Return the satellites in view as plain values, with angles in units of 0.01 deg and C/N0 of 0.01 dB-Hz."""
+    """Return the satellites in view as plain values; the unit of angles is 0.01 deg, the unit of C/N0 is 0.01 dB-Hz."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
         "epoch": pack_array(sky.epoch_s),
@@ -130,7 +130,7 @@ def sky_values(sky: SkyEpochs) -> dict[str, Any]:
     return values
 
 
-#: Number of levels of nested lists above a list of points, by type of geometry (RFC 7946).
+#: Number of levels of lists in which the lists of points are nested, by type of geometry (RFC 7946).
 _DEPTH: Final = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
 _IGNORED: Final = ("Point", "MultiPoint")
 
@@ -207,7 +207,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Folded:
-    """Part of a page that is hidden until the reader opens it by its title."""
+    """Part of a page that is hidden until the reader clicks on the title of the part."""
 
     kind: ClassVar[str] = "folded"
     title: str
@@ -237,7 +237,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class PagePart:
-    """Figures under a heading; `absent` has one sentence with the reason for each missing figure."""
+    """Figures under a heading; `absent` has one sentence for each missing figure, with the reason."""
 
     title: str
     figures: Sequence[Figure]
@@ -289,9 +289,8 @@ def _resource(name: str) -> Markup:
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Charts under a heading.
-
-    `absent` has reasons for missing charts. The times `Points.epoch_s` are counted from `start`.
+    """Charts under a heading. `absent` has the reasons for missing charts. The times `Points.epoch_s` are counted from
+    `start`.
     """
 
     title: str

@@ -1,8 +1,9 @@
 """Explanation of one epoch of a run: position, outcome of each satellite, contributions to sigma and protection level.
 
 Everything is read from the tables of the run. The effect of a satellite is the change of the single-epoch position if
-the satellite is omitted. This change is computed from the residuals by weighted least squares along, across and above
-the line, linearised at the position, with the map error as a prior and one free clock per clock group (P1 2.2(3)).
+the satellite is omitted. This change is computed from the residuals by weighted least squares, linearised at the
+position. The unknowns are the shifts along, across and above the line and one clock per clock group; the map error is
+the prior of the shifts across and above the line (P1 2.2(3)).
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "doubtful": "measurements contradict the position or its bound: the error is not bounded",
     "spoofing_suspected": "the signals may come from a spoofer: the error is not bounded",
 }
-#: Columns of `Explanation.satellites` with the effect of omitting the satellite: shift and resulting sigma of the
-#: position.
+#: Columns of `Explanation.satellites` with the effect of omitting the satellite: the shift of the position and the
+#: sigma of the shifted position.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")
 _COLUMNS: Final = (
     "satellite", "signal", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "residual_m", "reason_text",
@@ -69,9 +70,9 @@ _COLUMNS: Final = (
 )  # fmt: skip
 
 
-#: Number of epochs that are shown before, and also after, the explained epoch.
+#: Number of epochs that are shown before the explained epoch, and number of epochs shown after it.
 _AROUND: Final = 5
-#: Columns of these epochs in ``positions`` and ``train``.
+#: Columns of ``positions`` and ``train`` that are shown for the epochs before and after the explained epoch.
 _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "status")
 
 
@@ -91,7 +92,8 @@ class Explanation:
     #: and its standard deviation if the observation is omitted [m]; null if there would be no position.
     satellites: pl.DataFrame
     sentences: tuple[str, ...]  #: Sentences on position, sigma, protection level and status.
-    #: Columns `_NEIGHBOURS` of ``positions`` and ``train`` (prefix ``filter_``) at the epochs before and after.
+    #: Epochs before and after the explained epoch: columns `_NEIGHBOURS` of ``positions``, and of ``train`` with the
+    #: prefix ``filter_``.
     neighbours: pl.DataFrame
 
 
@@ -198,7 +200,9 @@ def _without_each(
 def _solve(
     design: Floats, sigma_m: Floats, residual_m: Floats, clocks: Strings, map_sigma_m: tuple[float, float]
 ) -> tuple[float, float] | None:
-    """Return the least-squares step along the line and its sigma [m]; None if the ranges do not determine the step."""
+    """Return the least-squares step along the line and the step's sigma [m]; None if the ranges do not determine the
+    step.
+    """
     groups = np.unique(clocks)
     if len(residual_m) < len(groups) + 1:
         return None
@@ -301,7 +305,9 @@ def write_explanation(explanation: Explanation, path: Path) -> Path:
 
 
 def _label_points(sky: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """Return the start of the label of each satellite in a sky plot, where it covers the fewest others."""
+    """Return the start of each satellite's label in a sky plot, chosen so that the label covers the fewest points and
+    labels.
+    """
     wide, taken, labels = 9.5, [(point["x"] - 2.4, point["y"] + 1.8, 4.8) for point in sky], []
     for point in sky:
         x, y = point["x"], point["y"] + 1.8

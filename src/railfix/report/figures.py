@@ -1,4 +1,4 @@
-"""Charts of a run in the order of the page, reasons for missing charts, and tables on the protection levels."""
+"""Charts of a run in the order of the page, reasons for missing charts, and tables of the protection levels."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
                 ]
 
 
-#: For each kind of position, the number of epochs with the largest errors that the sky plot includes.
+#: The sky plot includes this number of epochs with the largest errors, for each kind of position.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
     "No reference was given (--reference), so there are no errors, figures of merit or Stanford diagrams. "
@@ -271,7 +271,7 @@ def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: flo
 
 
 def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
-    """Return the error of each position, shape (rows,) [m]; NaN if the table has no error."""
+    """Return the error of each position, shape (rows,) [m]; NaN for a position without an error in the table."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")
@@ -290,7 +290,9 @@ def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
 
 
 def _tunnels(errors: pl.DataFrame | None) -> list[tuple[float, float]]:
-    """Return the first and last chainage [m] of each tunnel, a stretch of two or more epochs in this environment."""
+    """Return the first and last chainage [m] of each tunnel: two or more consecutive epochs with the environment
+    ``tunnel``.
+    """
     if errors is None:
         return []
     known = errors.filter(pl.col("chainage_m").is_not_null()).sort("chainage_m")

@@ -108,7 +108,9 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
 
 
 def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
-    """Return an antenna's key figures from the verdict on the run, by name; empty if ``run.json`` lacks the antenna."""
+    """Return an antenna's key figures from the verdict on the run, by name; no key figures if ``run.json`` lacks the
+    antenna.
+    """
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None:
         return {}
@@ -119,7 +121,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
-    """Return the number of errors above usable protection levels, or the normalised error if there are no levels."""
+    """Return a text with the number of errors above usable levels, or the normalised error if there are no levels."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         f"{'filter' if kind == 'train' else 'single epochs'} {len(found):,}"

@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Errors in the table of all runs: kind of position and table of positions, by the name in the header.
+#: Errors in the table of all runs: for each name in the header, the kind of position and the table of positions.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -124,7 +124,7 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 
 def settings(run: ReportedRun) -> list[Block]:
-    """Return a table of the given and the used settings; given settings come first and are highlighted."""
+    """Return a table of the settings that were used; settings that the user gave come first and are highlighted."""
     asked = flat_settings(run.record.get("settings_asked") or {})
     used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
@@ -203,7 +203,7 @@ def write_report(
 ) -> Path:
     """Write the report on runs as an HTML page and return its path; a failed write leaves an existing file unchanged.
 
-    `references`, `conventional` and the raised errors are as for `railfix.report.read_runs`. `background` is a GeoJSON
+    For `references`, `conventional` and the raised errors see `railfix.report.read_runs`. `background` is a GeoJSON
     file with lines that are drawn below the plan. Raise OutputError if the page cannot be written.
     """
     folders, others, unscreened = (
@@ -224,7 +224,7 @@ def write_page(
 ) -> Path:
     """Write the report on runs that have been read (`read_runs`) as an HTML page, and return its path.
 
-    `background` is as for `report_page`. Raise OutputError if the page cannot be written.
+    For `background` see `report_page`. Raise OutputError if the page cannot be written.
     """
     write_whole(out, report_page(runs, evaluation, background=background, title=title), what="report")
     return out
@@ -272,7 +272,7 @@ def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers:
         for antenna in run.folder.antennas
         if (errors := run.get_errors(antenna)) is not None
     }
-    # the errors of a single run are already in its own chart over chainage
+    # for a single run, the run's own chart over chainage already shows the errors
     charts = [error_ranges(series), *([errors_of_runs(series)] if len(runs) > 1 else [])]
     return PagePart(title="", figures=[figure(chart, numbers) for chart in charts if not chart.empty])
 

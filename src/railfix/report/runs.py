@@ -56,8 +56,8 @@ class ReportedRun:
     config: Config  #: Settings that were used.
     observations: pl.LazyFrame | None  #: Table of observations; None if the run wrote none.
     #: Errors and protection levels per epoch (columns of `railfix.evaluate.EPOCH_COLUMNS`): `errors` of the
-    #: single-epoch positions, `filtered` of the filter along the track; None without a reference, or if the filter was
-    #: off.
+    #: single-epoch positions, `filtered` of the filter along the track. Both are None without a reference; `filtered`
+    #: is also None if the filter was off.
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
     train: pl.DataFrame | None  #: Times, positions and sigmas of the filter along the track; None if it was off.
@@ -112,12 +112,12 @@ def read_runs(
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
     """Read runs, and evaluate them if there are references; without references the evaluation is None.
 
-    `references` is empty, has one reference for all runs, or one for each run in order. `conventional` is empty, or
-    names for each run, in order, another run on the same log whose conventional positions are shown. A run with only
-    the elevation and C/N0 screens provides the unscreened positions of P1. The table of epochs in the evaluation is
-    empty; the report takes the values of the epochs from the returned runs instead.
+    `references` is empty, or has one reference for all runs or one for each run in order. `conventional` is empty, or
+    names another run on the same log for each run in order; the conventional positions of the other run are shown. A
+    run with only the elevation and C/N0 screens provides the unscreened positions of P1. The table of epochs in the
+    evaluation is empty; the report takes the values of the epochs from the returned runs instead.
 
-    Raise InputFileError or MismatchError if a file is missing or malformed, or a reference does not match the run.
+    Raise InputFileError if a file is missing or malformed. Raise MismatchError if a reference does not match the run.
     Raise SettingsError if there is no run, the number of references or conventional runs is wrong, or a run is given
     twice.
     """

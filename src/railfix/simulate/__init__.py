@@ -4,8 +4,8 @@
 `Simulation` returns the arrays in chunks. Equal scenarios give equal numbers. The command ``railfix simulate`` writes
 the same files.
 
-The rigid body of the vehicle is computed by a different method than in `railfix.track`, so that an error in either
-computation causes a position error.
+Antenna positions on the vehicle are computed by a different method than in `railfix.track`, so that a mistake in either
+computation shows as a position error.
 """
 
 import lazy_loader

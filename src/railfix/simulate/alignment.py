@@ -33,10 +33,10 @@ _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points at which the curve is integrated [m]; the spline between the points is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-_ROUNDS: Final = 8  #: Number of rounds of the integration; each multiplies the error by (length / Earth radius).
+_ROUNDS: Final = 8  #: Number of rounds of the integration; each round multiplies the error by (length / Earth radius).
 
-#: Elements of the simulated test line: length [m], and radius (right positive) [m] and cant [m] at the end of the
-#: element.
+#: Elements of the simulated test line: length [m]; radius at the end of the element (right positive) [m]; cant at the
+#: end of the element [m].
 PATTERN: Final = (
     (90.0, np.inf, 0.0),
     (40.0, -160.0, 0.090),
@@ -64,7 +64,7 @@ class Alignment(Knots):
 
     @property
     def length_m(self) -> float:
-        """Chainage of the end of the line, which begins at 0."""
+        """Chainage of the end of the line; the line begins at chainage 0."""
         return float(self.knot_m[-1])
 
     def curvature_at(self, chainage_m: ArrayLike) -> Floats:
@@ -138,7 +138,9 @@ class Alignment(Knots):
         return np.stack([offset.at(chainage_m) for offset in offsets], axis=-1)
 
     def track(self) -> Track:
-        """Return the track map: points of the curve at `point_chainage_m` with the map error, and their attributes."""
+        """Return the track map: the points of the curve at `point_chainage_m`, displaced by the map error, and their
+        attributes.
+        """
         chainage = self.point_chainage_m()
         ecef = self.at(chainage)
         exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
@@ -183,7 +185,9 @@ def build_alignment(settings: LineSettings) -> Alignment:
 
 
 def _pattern_knots(length_m: float) -> Knots:
-    """Return the knots of the simulated test line: `PATTERN` repeated, every second copy mirrored, up to a length."""
+    """Return the knots of the simulated test line: `PATTERN` is repeated up to a length, with every second copy
+    mirrored.
+    """
     repeats = int(np.ceil(length_m / PATTERN_LENGTH_M - 1e-12))
     lengths, radii, cants = (np.array(column) for column in zip(*PATTERN, strict=True))
     side = np.repeat(np.where(np.arange(repeats) % 2 == 0, 1.0, -1.0), len(lengths))
@@ -208,9 +212,10 @@ def _pattern_knots(length_m: float) -> Knots:
 def _integrate(line: Alignment) -> tuple[Floats, Floats]:
     """Return ECEF points [m] and unit tangents of the curve at evenly spaced chainages, shapes (n, 3).
 
-    Per plan length: ``d azimuth = curvature + sin(latitude) d longitude`` (meridian convergence),
-    ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``; per arc length
-    ``d height = sin(slope)``. The equations are integrated in several rounds by two-point Gauss quadrature.
+    Derivatives with respect to plan length: ``d azimuth = curvature + sin(latitude) d longitude`` (meridian
+    convergence), ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``;
+    derivative with respect to arc length: ``d height = sin(slope)``. The equations are integrated in several rounds by
+    two-point Gauss quadrature.
     """
     cells = int(np.ceil(line.length_m / _STEP_M))
     step = line.length_m / cells

@@ -1,7 +1,7 @@
 """Pulse times of a tachometer; specific force and angular rate of an inertial sensor fixed to the body.
 
-The inertial quantities are differences in time of the body's position and attitude in the Earth-fixed frame, with
-gravity and Earth rotation (Groves 2013, 2.3 to 2.5 and 5.2).
+The inertial quantities are computed from differences in time of the body's position and attitude in the Earth-fixed
+frame; gravity and Earth rotation are included (Groves 2013, 2.3 to 2.5 and 5.2).
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 
-_STEP_S: Final = 0.01  #: Spacing of the instants between which the wheel's acceleration is constant [s].
+#: Spacing of instants; between two instants, the wheel's acceleration is assumed to be constant [s].
+_STEP_S: Final = 0.01
 _LOOK_S: Final = 0.1  #: Time step of the search for phases of acceleration and braking [s].
-_HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in a phase [m/s^2].
+_HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in a phase of acceleration or braking [m/s^2].
 #: Streams of random numbers: phase and jitter, slips, teeth, lost and doubled pulses.
 _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
@@ -105,7 +106,7 @@ def pulse_times_s(
     times = _times_at(target, node, turned, np.abs(speed) + surplus)
     if tooth_errors is None:
         return times
-    # After a turn in either direction, the same tooth is at the sensor again.
+    # After a turn of the wheel in either direction, the same tooth is at the sensor again.
     tooth = np.cumsum(np.where(motion.at(times)[1] < 0.0, -1, 1)) % len(tooth_errors)
     moved = np.clip(target + apart * tooth_errors[tooth], 0.0, turned[-1])
     return _times_at(np.sort(moved), node, turned, np.abs(speed) + surplus)
@@ -115,7 +116,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
     """Return the times at which the wheel has rolled the given distances, with constant acceleration between nodes."""
     step = np.diff(node_s)
     cell = np.clip(np.searchsorted(turned_m, target_m, side="left") - 1, 0, len(step) - 1)
-    # s = v t + a t^2 / 2, with the acceleration at which the wheel rolls the distance of the cell.
+    # s = v t + a t^2 / 2, with the constant acceleration at which the wheel rolls the distance between the nodes.
     start = speed_mps[cell]
     bend = 2.0 * (turned_m[cell + 1] - turned_m[cell] - start * step[cell]) / step[cell] ** 2
     ahead = target_m - turned_m[cell]
@@ -126,7 +127,9 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
 
 
 def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
-    """Return the pulse times with random lost pulses, and random second pulses between a tooth and the next."""
+    """Return the pulse times after random pulses have been removed, and random second pulses inserted before the next
+    tooth.
+    """
     if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
         return time_s
     lost, doubled, part = np.random.default_rng([seed, _MISCOUNT]).uniform(size=(3, len(time_s)))
@@ -137,7 +140,9 @@ def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats
 
 
 def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Return the pulses of the tachometer with its errors, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the pulses of the tachometer, including its errors; for the columns see
+    `railfix.simulate.sensor_columns.COLUMNS`.
+    """
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _WHEEL])
     slips = wheel_slips(simulation, settings)
@@ -165,7 +170,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
 
 
 def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Return the ground truth of the wheel's slips and slides, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the true slips and slides of the wheel; for the columns see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     slips = wheel_slips(simulation, settings)
     start = scenario.start + timedelta([slip.start_s for slip in slips])
@@ -176,7 +181,8 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
 
 _HALF_S: Final = 0.02  #: Upper limit of half the time interval over which differences are formed [s].
 _BLOCK: Final = 50_000  #: Number of samples computed in one step.
-#: Lever arm from which the attitude is computed, so long that rounding of positions is negligible [m].
+#: Length of the lever arm from which the attitude is computed; with this length, rounding of positions is negligible
+#: [m].
 _LEVER_M: Final = 10.0
 #: Constants of WGS 84: normal gravity at the equator [m/s^2], Somigliana's constant, flattening, ratio m of centrifugal
 #: acceleration to gravity, semi-major axis [m].
@@ -214,7 +220,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
     """
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now
-    # The differences of positions are formed before the sum, which avoids a loss of digits.
+    # Positions are subtracted before the sum is formed, which avoids a loss of digits.
     acceleration = ((after[0] - place) - (place - before[0])) / half_s**2
     velocity = (after[0] - before[0]) / (2.0 * half_s)
     latitude, longitude, height = geodetic_from_ecef(place)
@@ -232,7 +238,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
 
 
 def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.DataFrame:
-    """Return the samples of the inertial sensor, see `railfix.simulate.sensor_columns.COLUMNS`."""
+    """Return the samples of the inertial sensor; for the columns see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(int(scenario.duration_s * settings.rate_hz + 1e-9) + 1) / settings.rate_hz
     offset = (settings.along_m, settings.across_m, settings.up_m)
@@ -265,7 +271,9 @@ def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Float
 
 
 def _with_errors(true: Floats, time_s: Floats, settings: InertialSettings, seed: int) -> Floats:
-    """Return the samples after misalignment, scale errors, biases, drifts, noise and quantisation, in this order."""
+    """Add the sensor's errors to true values: misalignment, scale errors, biases, drifts, noise and quantisation, in
+    this order.
+    """
     turned = Rotation.from_rotvec(settings.misalignment_rad).inv()
     measured = np.concatenate([turned.apply(true[:, :3]), turned.apply(true[:, 3:])], axis=1)
     measured *= 1.0 + np.array([*settings.accel_scale, *settings.gyro_scale])

@@ -29,9 +29,9 @@ from railfix.simulate.scenario import Scenario
 #: Health word of an unhealthy satellite, by constellation: all data bad (GPS, QZSS), E1-B and E5b out of service
 #: (Galileo), SatH1 (BeiDou).
 _ILL_HEALTH: Final = {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}
-#: Largest time from the reference time at which a record is valid [s], as in `railfix.gnss.orbits`.
+#: A record is valid up to this time before and after its reference time [s], as in `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
-#: Assumed time from transmission to reference time where the transmission time is absent or implausible [s].
+#: Time from transmission to reference time [s], assumed where the transmission time is absent or implausible.
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
 _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": ("D1", "D2")}
 
@@ -106,7 +106,8 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     return np.asarray(rows[: len(rows) if served.all() else 0])
 
 
-#: Klobuchar coefficients of GPS, alpha then beta, fictitious values of usual size; used for all constellations.
+#: Klobuchar coefficients in the form of GPS, alpha then beta; these fictitious values of usual size serve all
+#: constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
 #: Time between the transmissions of two successive records [s] (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
@@ -221,7 +222,9 @@ def _figure_of_eight(
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Return the records of one satellite as rows: the record before the run, the current and the following records."""
+    """Return the records of one satellite as rows: the record before the current one, the current and the following
+    records.
+    """
     every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
     mu, rotation = GM[system], ROTATION[system]
     start_sow = float(to_week(scenario.start)[1])
@@ -280,7 +283,8 @@ def _digits(value: float) -> str:
 
 _PIECE_S: Final = 60.0  #: Longest piece of `SatelliteTable` [s].
 _NODES: Final = 7  #: Number of nodes per piece of `SatelliteTable`.
-_FLIGHT_S: Final = 0.08  #: Approximate flight time with which the iteration of the light-time equation begins [s].
+#: Approximate flight time of a signal, with which the iteration of the light-time equation begins [s].
+_FLIGHT_S: Final = 0.08
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,8 +303,8 @@ def record_state(
 ) -> tuple[Floats, Floats]:
     """Return positions, shape (T, 3) [m], and clocks with relativistic correction, shape (T,) [s].
 
-    `row` is the row of the record for each instant; `since_toe_s` and `since_toc_s` are the times since toe and toc of
-    the record.
+    `row` is the row of the record for each instant; `since_toe_s` and `since_toc_s` are the times since the record's
+    toe and toc.
     """
     position, _, relativity = kepler_state(Orbits.from_records(records).take(row), since_toe_s)
     dt = since_toc_s
@@ -309,7 +313,9 @@ def record_state(
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
-    """Return the row of the newest record of a satellite transmitted before each time, or of its first record."""
+    """Return, for each time, the row of the newest record of a satellite transmitted before, or else of the first
+    record.
+    """
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])

@@ -11,7 +11,7 @@ from railfix.pipeline import Config, EpochProcessor, Result
 from railfix.run import RunInputs
 from railfix.track import antenna_trajectory, read_track, read_vehicle
 
-#: Files of the demonstration run by kind, with the kinds used by `railfix.simulate.write_run`.
+#: Files of the demonstration run by kind; the kinds are the names of `railfix.simulate.write_run`.
 DEMO_FILES: Final = {
     "front": "front.crx.gz",
     "rear": "rear.crx.gz",
@@ -63,7 +63,8 @@ def demo_truth() -> Path:
 
 
 def demo() -> Result:
-    """Compute the positions of the demonstration run for both antennas, by the filter and for single epochs.
+    """Compute the positions of the demonstration run for both antennas: by the filter along the track, and for single
+    epochs.
 
     A notebook shows the result as a table; `railfix.train_table` and `railfix.positions_table` return its rows.
     """

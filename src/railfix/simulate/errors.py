@@ -2,8 +2,8 @@
 errors.
 
 A Gauss-Markov process is drawn exactly at nodes and interpolated by cubics through four nodes (Catmull and Rom 1974).
-The loss of variance by interpolation (less than 1 %) is compensated on average. The values do not depend on the chunks
-in which a run is simulated.
+Interpolation reduces the variance by less than 1 %; the reduction is compensated on average. The values do not depend
+on the chunks in which a run is simulated.
 """
 
 from __future__ import annotations
@@ -36,12 +36,14 @@ _ROOM_S: Final = (0.1, 1.0)
 
 
 def satellite_key(satellite: str) -> tuple[int, int]:
-    """Return two numbers that identify a satellite in a seed, so that its errors do not depend on other satellites."""
+    """Return two numbers that identify a satellite in a seed, so that the satellite's errors do not depend on other
+    satellites.
+    """
     return ord(satellite[0]), int(satellite[1:])
 
 
 class Interpolated:
-    """C functions of time given at K evenly spaced nodes, shape (K, C), interpolated with a continuous rate.
+    """C functions of time with values at K evenly spaced nodes, shape (K, C); the interpolation has a continuous rate.
 
     `nodes_before` nodes precede the start of the run.
     """
@@ -52,7 +54,9 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return the values at the four nodes around each time, (T, C), and the elapsed part of its cell, (T, 1)."""
+        """Return the values at the four nodes around each time, (T, C), and the elapsed fraction of the time's cell,
+        (T, 1).
+        """
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
@@ -86,10 +90,10 @@ def node_count(duration_s: float, spacing_s: float) -> int:
 
 
 class GaussMarkov(Interpolated):
-    """Independent Gauss-Markov processes of first order, one per key, which is the seed of the process.
+    """Independent Gauss-Markov processes of first order; each key is the seed of one process.
 
-    `sigma` is the standard deviation and `time_s` the correlation time. A longer duration does not change the values
-    within a shorter duration.
+    `sigma` is the standard deviation and `time_s` the correlation time. The values do not depend on `duration_s`; a
+    longer duration only adds later values.
     """
 
     def __init__(self, keys: Sequence[Sequence[int]], *, sigma: float, time_s: float, duration_s: float) -> None:
@@ -174,7 +178,8 @@ class RandomFunction:
 #: Spacing of the nodes between which the axes of an orbit are interpolated [s]; in this time, the axes turn by half a
 #: degree.
 _AXES_S: Final = 60.0
-#: Streams of random numbers: clock, three axes, group delay, ionosphere, troposphere.
+#: Streams of random numbers: satellite clocks, orbit errors (three axes from this number on), group delays, ionosphere,
+#: troposphere.
 _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
 
 
@@ -198,12 +203,12 @@ class CommonErrors:
 
     @cached_property
     def active(self) -> bool:
-        """Whether `path_m` or `ionosphere_m` can differ from 0."""
+        """Whether the errors `path_m` or `ionosphere_m` can differ from 0."""
         atmosphere = self._settings.ionosphere.vertical_sigma_m, self._settings.ionosphere.gradient_mm_per_km
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
     def _of_satellites(self, stream: int, sigma: str, time: str) -> list[tuple[list[int], GaussMarkov]]:
-        """Return, for each constellation, the process of an error and the columns of the constellation's satellites.
+        """Return, for each constellation, the columns of the constellation's satellites and the process of an error.
 
         `sigma` and `time` are the names of the settings; constellations with a sigma of 0 are left out.
         """

@@ -180,9 +180,10 @@ class LineSettings(ScenarioSettings):
 
 #: Distance between the contact points of a wheelset on generated lines [m], for the equilibrium cant.
 _CONTACT_M: Final = 1.137
-#: Change of direction above which the next curve of a generated line turns back [rad].
+#: If the direction has changed by more than this angle, the next curve of a generated line turns back [rad].
 _FAR_RAD: Final = np.radians(50.0)
-_HIGH_M: Final = 150.0  #: Height difference above which the next gradient of a generated line leads back [m].
+#: Height difference above which the next gradient of a generated line leads back toward the initial height [m].
+_HIGH_M: Final = 150.0
 _CANT_STEP_M: Final = 0.005  #: Step to which cant is rounded [m].
 
 
@@ -198,7 +199,7 @@ class Knots:
 
 
 def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
-    """Return the knots of a line of given elements and gradients.
+    """Return the knots of a line that is specified by elements and gradients.
 
     Raise SettingsError if consecutive elements, or the gradients, do not fit together.
     """
@@ -392,7 +393,7 @@ def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Fl
 
 
 def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: Floats) -> Knots:
-    """Return the knots of a line from a file. Curvature is from the file's radii, or else from the spline."""
+    """Return the knots of a line from a file; the curvature is from the file's radii, or else from the spline."""
     bend = (
         np.interp(arc, point, _fill_gaps(point, 1.0 / track.radius_m))
         if (~np.isnan(track.radius_m)).any()
@@ -404,6 +405,8 @@ def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: F
 
 
 def _fill_gaps(point: Floats, values: Floats) -> Floats:
-    """Return values in which NaN is interpolated linearly over chainage; at the ends, the nearest value is used."""
+    """Return values in which NaN is replaced by linear interpolation over chainage; at the ends, the nearest value is
+    used.
+    """
     known = np.isfinite(values)
     return np.interp(point, point[known], values[known])

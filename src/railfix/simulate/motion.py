@@ -1,8 +1,8 @@
 """Chainage and speed of the train over time, and true positions of its antennas.
 
-The motion is a shuttle between two points, or a run curve with stops at stations and the highest speed that line,
-curves and train permit. Antennas are on a rigid body with both bogie centres on the continuous line; their positions
-are computed by Newton's method and Rodrigues' rotation, independently of `railfix.track.vehicle`.
+The motion is a shuttle between two points, or a run curve: stops at stations, and between these the highest speed that
+line, curves and train permit. Antennas are on a rigid body with both bogie centres on the continuous line; their
+positions are computed by Newton's method and Rodrigues' rotation, independently of `railfix.track.vehicle`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ROUNDS: Final = 20  #: Maximum number of rounds that increase the averaging tim
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Motion in P pieces of constant jerk, or of constant acceleration if the jerk is not limited.
+    """Motion of the train in P pieces of constant jerk, or of constant acceleration if the jerk is not limited.
 
     Speed, acceleration and jerk are positive toward rising chainage. The last piece has no end.
     """
@@ -131,7 +131,9 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Return the motion to and fro between two chainages, with a standstill at each, for at least `duration_s`."""
+    """Return the motion to and fro between two chainages for at least `duration_s`, with a standstill at both
+    chainages.
+    """
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
@@ -192,7 +194,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
     way = np.linspace(0.0, abs(last_m - first_m), cells + 1)
     sign = 1.0 if last_m > first_m else -1.0
     square = _limits(line, settings, first_m + sign * way, contact_m) ** 2
-    # A limit applies to the cells on both sides of its position.
+    # A speed limit applies to the cells on both sides of the position at which it was evaluated.
     square = np.minimum(square, np.minimum(np.append(square[1:], np.inf), np.append(np.inf, square[:-1])))
     square[[0, -1]] = 0.0
     up, down = 2.0 * settings.acceleration_mps2 * way, 2.0 * settings.deceleration_mps2 * way
@@ -217,7 +219,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
 
 
 def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_m: float) -> Floats:
-    """Return the highest speed at chainages [m/s] that cruising speed, speed limits and cant deficiency permit."""
+    """Return the highest speed [m/s] that cruising speed, speed limits and cant deficiency permit at chainages."""
     limit = np.full(chainage_m.shape, settings.cruise_mps)
     for part in settings.limits:
         inside = (chainage_m >= part.from_m) & (chainage_m <= part.to_m)
@@ -258,7 +260,7 @@ def antenna_truth(
     middle_m : ndarray, shape (n,) [m]
         Chainage midway between the chainages of the two bogie centres.
     sway_rad : ndarray, shape (n,), or float [rad]
-        Lean to the right in addition to the cant.
+        Lean of the body to the right in addition to the cant.
     pitch_rad : ndarray, shape (n,), optional [rad]
         Rotation in addition to the gradient, about the point between the bogies at the rail tops, positive where the
         front rises.

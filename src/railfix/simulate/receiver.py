@@ -1,4 +1,7 @@
-"""Simulated receiver: channels, clocks, time-correlated noise and loss of lock, continued from chunk to chunk."""
+"""Simulated receiver: channels, clocks, time-correlated noise and loss of lock.
+
+The state is continued from chunk to chunk.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +117,10 @@ class TrackingNoise:
         self._weak = np.zeros(channels, dtype=np.bool_)
 
     def too_weak(self, cn0_dbhz: Floats) -> Masks:
-        """Return whether signals are below the threshold or have not reached the re-acquisition C/N0 again, (T, M)."""
+        """Return whether signals are too weak to be tracked, shape (T, M).
+
+        A signal is too weak while it is below the threshold, and then until it reaches the re-acquisition C/N0.
+        """
         threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
         if threshold is None:
             return np.zeros(cn0_dbhz.shape, dtype=np.bool_)
@@ -166,7 +172,7 @@ def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
 #: First and second signal of each constellation with `ReceiverSettings.second` "L5".
 _WITH_L5: Final = {"G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q"), "C": ("1P", "5P")}
-#: Streams of random numbers: white noise, correlated noise, cycle slips, satellites' power.
+#: Streams of random numbers: white noise, correlated noise, cycle slips, C/N0 differences between satellites.
 _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
@@ -260,7 +266,9 @@ class ReceiverClocks:
         return even if walk is None else even + walk.rate(tag_s)[:, 0]
 
     def _walk(self, receiver: str) -> ClockWalk | None:
-        """Return the random walk of the clock of a receiver, or None; antennas with a common clock share one walk."""
+        """Return the random walk of a receiver's clock, None without a walk; antennas with a common clock share one
+        walk.
+        """
         common = self._scenario.receiver.clocks == "common" and receiver in ANTENNAS
         return self._walks[ANTENNAS[0] if common else receiver]
 

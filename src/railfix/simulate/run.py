@@ -25,14 +25,15 @@ from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
-#: Prefixes of the names of settings that the README lists only if they have non-default values.
+#: Prefixes of settings that the README lists only if they have non-default values.
 _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
 
 
 def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
     """Return the text of the README of a run.
 
-    `files` are the paths by name that `write_run` returns, `command` is the command that created the files, or empty.
+    `files` are the paths by name that `write_run` returns. `command` is the command that created the files; it may be
+    empty.
     """
     scenario = simulation.scenario
     made = f"Made by `{command}`.\n" if command else "Made by `railfix.simulate.write_run`.\n"
@@ -219,12 +220,12 @@ def write_run(
     README.md                    contents and settings of the run
     ============================ ===================================================
 
-    The files appear in the folder together, when all are complete. With `packing` "plain", no file is compressed, and
-    the tables of sensors are CSV files. `command` is the command that the README names. `progress` is called with the
-    name of the receiver and the number of epochs written since the last call. The names of the paths are ``front``,
-    ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the names of reference stations and
-    sensor tables, ``scenario`` and ``readme``. Raise SettingsError if the scenario is invalid, and OutputError if a
-    file cannot be written.
+    The files appear in the folder together, after all files are complete. With `packing` "plain", no file is
+    compressed, and the tables of sensors are CSV files. `command` is the command that the README names. `progress` is
+    called with the name of the receiver and the number of epochs written since the last call. The names of the paths
+    are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the names of reference
+    stations and sensor tables, ``scenario`` and ``readme``. Raise SettingsError if the scenario is invalid, and
+    OutputError if a file cannot be written.
     """
     check_type(scenario, Scenario, "scenario")
     simulation = Simulation(scenario)

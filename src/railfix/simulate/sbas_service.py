@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 Field = tuple[int, int]
-#: Mask slot, IODE, position [m] and clock [2^-31 s] of a long-term correction without velocity.
+#: Long-term correction without velocity: mask slot, IODE, correction of the position [m], correction of the clock
+#: [2^-31 s].
 LongTerm = tuple[int, int, tuple[float, float, float], float]
 
 #: Resolution of corrections and delays [m].
@@ -46,7 +47,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 
 
 def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
-    """Return a message with its parity, shape (32,), from its first bits as text and its fields (value, length).
+    """Return a message with parity, shape (32,), from the first bits as text and the fields (value, length in bits).
 
     Raise ValueError if a value does not fit its length, or the message is too long.
     """
@@ -81,13 +82,17 @@ def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0,
 
 
 def factors(second: int, indicator: Sequence[int], *, latency: int = 0) -> Bytes:
-    """Return a type 7 message with the fast-correction degradation indicators of the first slots, then 0."""
+    """Return a type 7 message with the fast-correction degradation indicators of the first slots; the remaining slots
+    have 0.
+    """
     values = list(indicator) + [0] * (51 - len(indicator))
     return message(7, second, (latency, 4), (0, 4), *((v, 4) for v in values))
 
 
 def parameters(second: int, **values: int) -> Bytes:
-    """Return a type 10 message, degradation parameters, with raw values by name (`DEGRADATION`), by default 0."""
+    """Return a type 10 message, degradation parameters, with raw values by name (`DEGRADATION`); parameters not given
+    are 0.
+    """
     if unknown := values.keys() - DEGRADATION.keys():
         raise ValueError(f"type 10 has no field {min(unknown)}")
     return message(10, second, *((values.get(name, 0), length) for name, length in DEGRADATION.items()))
@@ -124,7 +129,7 @@ def mixed(
 
 
 def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, bands: int = 1) -> Bytes:
-    """Return a type 18 message, the ionospheric grid mask, for bits of a band counted from 0."""
+    """Return a type 18 message, the ionospheric grid mask, for one band; `bits` has the set bits, counted from 0."""
     return message(18, second, (bands, 4), (band, 4), (iodi, 2), *((int(i in bits), 1) for i in range(201)))
 
 
@@ -158,8 +163,9 @@ class Service:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # The mask has all satellites, not only satellites in view of the train. Their errors equal the errors of the
-        # train's signals, because the errors of a satellite do not depend on the other satellites.
+        # The mask has all satellites, not only satellites in view of the train. For a satellite in view, the errors
+        # computed here equal the errors of the train's signals, because the errors of a satellite do not depend on
+        # other satellites.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
@@ -177,7 +183,9 @@ class Service:
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:
-        """Return the fast corrections of `satellites` [m]: clock minus group-delay errors of L1 C/A, plus noise."""
+        """Return the fast corrections of `satellites` [m]: the clock error minus the group-delay error of L1 C/A, plus
+        noise.
+        """
         clock = self._errors.clock_error_m(self._instant(second))[0]
         noise = self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(self.satellites))
         return np.asarray(np.clip(clock - self._group_delay_m + noise, -_LARGEST_FAST_M, _LARGEST_FAST_M))
@@ -191,7 +199,7 @@ class Service:
         return [DO_NOT_USE if abs(f) > settings.alert_m else usual for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:
-        """Return the long-term corrections of the positions of `satellites`, for the issue of data in force."""
+        """Return the long-term corrections of the positions of `satellites`, for the broadcast records in force."""
         at = self._instant(second)
         error = self._errors.orbit_error_m(at)[0]
         error = error + self._settings.orbit_sigma_m * self._rng[_ORBIT].standard_normal(error.shape)
@@ -223,7 +231,7 @@ class Service:
         return bands
 
     def delays_m(self, second: float, points: list[tuple[int, float, float]]) -> list[float]:
-        """Return the vertical delays on L1 at grid points [m], model plus error of the simulated ionosphere."""
+        """Return the vertical delays on L1 at grid points [m]: the model delay plus the simulated model error."""
         at = self._instant(second)
         latitude, longitude = (np.array([point[k] for point in points]) for k in (1, 2))
         time = self._start + timedelta(at)
@@ -237,7 +245,7 @@ class Service:
         return [float(delay) for delay in np.clip(total, 0.0, _LARGEST_DELAY_M)]
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 2 to 5 and 24 as functions of the second and of the issue (IODF)."""
+        """Return the messages of types 2 to 5 and 24, each as a function of the second and the issue (IODF)."""
         return [partial(self._fast, block=block) for block in range(-(-len(self.satellites) // _FAST))]
 
     def _fast(self, second: int, issue: int, block: int) -> Bytes:
@@ -249,7 +257,7 @@ class Service:
         return fast(second, values, grades, kind=2 + block, iodf=issue)
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Return all other messages, in the order in which they are sent, as functions of the second."""
+        """Return all other messages in the order in which they are sent, each as a function of the second."""
         numbers = {int(name[1:]) for name in self.satellites}
         count = len(self.satellites)
         messages: list[Callable[[int], Bytes]] = [

@@ -70,8 +70,8 @@ def correction(
 def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm: int = 0) -> Bytes:
     """Return a type 34 message with changes of the DFREI of the satellites in the mask.
 
-    `change` is, for each satellite, 0 for no change, 1 for the next value of `dfrei`, 2 for an increase by one, and 3
-    for "do not use".
+    `change` has one value per satellite: 0 for no change, 1 for the next value of `dfrei`, 2 for an increase of the
+    DFREI by one, 3 for "do not use".
     """
     every = [*change, *([0] * (AUGMENTED - len(change)))]
     grades = [*dfrei, *([0] * (7 - len(dfrei)))]
@@ -79,7 +79,9 @@ def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm:
 
 
 def integrity(second: int, dfrei: Sequence[int], *, kind: int = 35, iodm: int = 0) -> Bytes:
-    """Return a message of type 35, the DFREI of the first 53 satellites in the mask, or of type 36, for the others."""
+    """Return a message of type 35 with the DFREI of the first 53 satellites in the mask, or of type 36 with the other
+    DFREI.
+    """
     count = 53 if kind == 35 else 39
     fields = [(grade, 4) for grade in [*dfrei, *([15] * (count - len(dfrei)))]]
     return message(kind, second, *fields, (0, 2 if kind == 35 else 58), (iodm, 2))
@@ -106,7 +108,8 @@ def parameters(
     )
 
 
-#: Covariance that is sent. Along a line of sight, its sigma is 1.03 to 1.06 times the sigma of the DFREI.
+#: Covariance that is sent. Along a line of sight, the sigma of this covariance is 1.03 to 1.06 times the sigma of the
+#: DFREI.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
 _LARGEST_M: Final = 63.9  #: Largest clock correction that the field can represent [m].
 _GROWTH_MPS: Final = 0.002  #: Degradation rate of the corrections [m/s].
@@ -142,7 +145,7 @@ class SimulatedDfmc(Service):
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 35 and 36 as functions of the second and of an issue, which is not used."""
+        """Return the messages of types 35 and 36, each as a function of the second and of an (unused) issue."""
 
         def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
             return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)
@@ -151,7 +154,9 @@ class SimulatedDfmc(Service):
         return [of_kind(35, slice(0, FIRST)), *later]
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Return the messages of types 31 and 37, and of type 32 for each satellite, as functions of the second."""
+        """Return the messages of types 31 and 37, and one of type 32 for each satellite, each as a function of the
+        second.
+        """
         slots = [self.slot(name) for name in self.satellites]
         messages: list[Callable[[int], Bytes]] = [
             lambda second: mask(second, slots),
@@ -173,7 +178,7 @@ LOST: Final = 53  #: Stream of random numbers: lost messages.
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
-    """Return the SBAS messages of a run, one per second, from `lead_s` before its start to its end.
+    """Return the SBAS messages of a run, one per second, from `lead_s` before the start to the end of the run.
 
     On L1, the fast corrections of all satellites (types 2 to 5, 24) are sent every 6 s; between them follow, in turn,
     the masks, long-term corrections, grid delays, degradation and integrity. The corrections cancel the errors that

@@ -17,8 +17,8 @@ its folder or a shipped scenario, and the settings of each run that differ from 
     [parts.back]
     run.direction = "falling"
 
-The settings of a run override the settings of its parts, later parts override earlier parts, and all override the base.
-Paths in a file (``sky.nav``, ``line.file.path``) are relative to the folder of the file.
+The settings of a run override the settings of its parts, and later parts override earlier parts. All these settings
+override the base. Paths in a file (``sky.nav``, ``line.file.path``) are relative to the folder of the file.
 """
 
 from __future__ import annotations
@@ -145,7 +145,9 @@ def load_recipe(name: FilePath) -> Recipe:
 def _run_table(
     base: Mapping[str, Any], run: Mapping[str, Any], parts: Mapping[str, Any], path: Path
 ) -> Mapping[str, Any]:
-    """Return the settings of a run: the base, overridden by the parts that the run names, then by its own settings."""
+    """Return the settings of a run: the base, overridden by the parts that the run names, then by the run's own
+    settings.
+    """
     for name in run.get("parts", []):
         if not isinstance(parts.get(name), dict):
             raise SettingsError(f"{path}: [parts] has no table {name!r}; its tables are {', '.join(parts) or 'none'}")

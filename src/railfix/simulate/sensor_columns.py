@@ -23,7 +23,7 @@ _STEP_S = 0.1  #: Spacing of the instants between which the passing of a balise 
 
 
 def balises_along(simulation: Simulation, settings: BaliseSettings) -> tuple[Balise, ...]:
-    """Return the given balises, and further balises at a spacing of `spacing_m`, in order of chainage."""
+    """Return the balises of the settings, and further balises at a spacing of `spacing_m`, in order of chainage."""
     length = float(simulation.line.point_chainage_m()[-1])
     spaced = np.arange(settings.spacing_m, length, settings.spacing_m) if settings.spacing_m else np.empty(0)
     drawn = [Balise(name=f"B{k + 1:03d}", chainage_m=at) for k, at in enumerate(spaced.tolist())]
@@ -106,7 +106,7 @@ def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame
 
 
 def dropouts(settings: RadarSettings, seed: int, duration_s: float) -> list[tuple[float, float]]:
-    """Return the start and the end of intervals without a measurement [s], first the given, then random intervals."""
+    """Return the start and the end of each dropout [s]: first the dropouts of the settings, then random dropouts."""
     found = [(d.start_s, d.end_s) for d in settings.dropouts]
     if settings.dropouts_per_hour > 0.0:
         rng = np.random.default_rng([seed, _DROPOUTS])

@@ -34,7 +34,7 @@ from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Resolution of the reported C/N0 [dB-Hz].
 CHUNK_EPOCHS: Final = 2000  #: Number of epochs of a chunk.
-_LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are sought [s].
+_LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites are tested for being above the cutoff [s].
 _RATE_S: Final = 0.005  #: Half the time step of the differences from which range rates are computed [s].
 _SIGMA_AT_DBHZ: Final = 45.0  #: C/N0 to which the sigmas of `ReceiverSettings` refer [dB-Hz].
 _BEST_DBHZ: Final = 50.0  #: C/N0 above which the noise is constant [dB-Hz].
@@ -227,7 +227,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 
 
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
-    """Return the geometry by satellite, the delays at the epochs, and the rates of path and ionosphere [m/s].
+    """Return the geometry by satellite, the delays at the epochs, and the rates of path and ionospheric delay [m/s].
 
     The rates are computed from differences over 10 ms.
     """
@@ -270,7 +270,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
     clock = SPEED_OF_LIGHT * simulation.clocks.bias_s(receiver.antenna, tags)
-    # Errors that are equal in code and phase, and their rate.
+    # Errors that are equal in code and phase, and the rate of these errors.
     fault, fault_rate = _faults(simulation, receiver, tags)
     extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
     extra_rate = fault_rate + receiver.offset_drift_mps

@@ -1,4 +1,4 @@
-"""Charts of whole runs: runs of a campaign, processing time, and satellite service along a line."""
+"""Charts of whole runs: the runs of a campaign, processing time, and satellite service along a line."""
 
 from __future__ import annotations
 
@@ -105,7 +105,10 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
 
 
 def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
-    """Return charts over chainage: used satellites, 3-D offsets from the line, fractions of epochs, protection levels.
+    """Return charts of the satellite service over chainage.
+
+    The charts show used satellites, distances of 3-D positions from the line, fractions of epochs, and protection
+    levels.
 
     `service` is the table of `compute_service`, `limit_m` the alarm limit [m].
     """

@@ -18,7 +18,7 @@ from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.timescale import seconds
 from railfix.evaluate.evaluation_inputs import floats, words
 
-#: Colours that can be distinguished with colour blindness (Okabe and Ito), with a contrast of at least 3:1 on white.
+#: Colours that colour-blind readers can distinguish (Okabe and Ito), with a contrast of at least 3:1 on white.
 BLUE: Final[str] = "#0072b2"
 RED: Final[str] = "#d55e00"
 GREEN: Final[str] = "#00805e"
@@ -241,7 +241,7 @@ def nice_step(rough: float) -> float:
     return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
 
 
-#: Maximum number of points in a layer: more than two per pixel of the widest chart of a page (1150 pixels).
+#: Maximum number of points in a layer: more than two per pixel of the widest chart in a page (1150 pixels).
 POINTS: Final = 3000
 _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
@@ -269,10 +269,10 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
-    """Return the indices of at most `points` points, of which no two are in the same square cell.
+    """Return the indices of points with at most one point per square cell; if there are few points, of all points.
 
-    The width of the cells is increased from `cell` until at most `points` points are left. Points with NaN are omitted.
-    If there are at most `points` other points, all are returned.
+    Points with NaN are omitted. If more than `points` points are left, the cells have the width `cell`, which is
+    increased until at most `points` points are selected. Otherwise all points are selected.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
@@ -288,8 +288,8 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     """Return the indices of at most `points` points that represent a series.
 
-    A fifth of the points are `extremes`; a golden-ratio sequence selects the other points evenly. Points with NaN are
-    omitted. If there are at most `points` points, all are returned.
+    Points with NaN are omitted. If at most `points` points are left, all are selected. Otherwise a fifth of the
+    selected points are `extremes`, and a golden-ratio sequence selects the other points evenly.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
@@ -302,7 +302,7 @@ def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def thin_points(series: Iterable[Points]) -> tuple[list[Layer], str]:
-    """Return layers with the points that `spread` selects from each series, and a sentence on their number."""
+    """Return layers with the points that `spread` selects from each series, and a sentence on the number of points."""
     layers: list[Layer] = []
     shown = total = 0
     for whole in series:

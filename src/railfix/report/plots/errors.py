@@ -57,7 +57,9 @@ _SERIES: Final = (
 
 
 def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
-    """Return a chart of errors on the map and of conventional positions, with sigma and level (P1 figures 7 and 10).
+    """Return a chart of the errors of positions on the map and of conventional positions (P1 figures 7 and 10).
+
+    The chart also shows the stated sigma and the protection level.
 
     Both tables refer to the same antenna, and are in order of time. `filtered` has the errors of the filter along the
     track.
@@ -150,7 +152,7 @@ def error_scale(error_m: Floats) -> dict[str, Any]:
 
 
 def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the centre of each piece of the x axis that has data, and the largest y in the piece, with NaN at gaps."""
+    """Return the centre of each piece of the x axis that has data, and the largest y in the piece; NaN marks gaps."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(rows):
         return np.empty(0), np.empty(0)
@@ -171,7 +173,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
     """Return a chart of the minimum, mean and maximum errors of constrained and conventional positions (P1 figure 11).
 
-    `runs` has the errors of each run, by name.
+    `runs` has a table of errors for each run, by the name of the run.
     """
     names: list[str] = []
     values: list[Floats] = []
@@ -205,7 +207,10 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
 
 
 def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
-    """Return a chart of the errors of several runs, by name, over the chainage of their references (P1 figure 8)."""
+    """Return a chart of the errors of several runs over the chainage of the references (P1 figure 8).
+
+    `runs` has a table of errors for each run, by the name of the run.
+    """
     layers, thinned = thin_points(
         Points(
             label=run, colour=CYCLE[number % len(CYCLE)], x=floats(errors, "chainage_m"),
@@ -235,7 +240,8 @@ _PARTS: Final = (
 )
 
 
-#: Region, text, x and y of each label; x and y are 1 at the alarm limit, and 2 at the end of the axis.
+#: Region, text, x and y of each label of the Stanford diagram; x and y are 1 at the alarm limit, and 2 at the end of
+#: the axis.
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),

@@ -150,11 +150,11 @@ class LocalFrame:
         )
 
     def plane(self, ecef_m: Floats) -> Floats:
-        """Return the east and north of points in ECEF, shape (P, 2) [m]."""
+        """Return the east and north coordinates of points in ECEF, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
     def to_plane(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
-        """Return the east and north of geodetic points [deg] at the height of the origin, shape (P, 2) [m]."""
+        """Return east and north coordinates of geodetic points [deg] at the height of the origin, shape (P, 2) [m]."""
         return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 
@@ -177,7 +177,9 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
 def _line(
     track: Track | None, frame: LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
 ) -> Iterator[Curve]:
-    """Yield the line from `_BEYOND_M` before the first to `_BEYOND_M` after the last position, and its tunnels."""
+    """Yield the line from `_BEYOND_M` before the first to `_BEYOND_M` after the last position, and the tunnels of the
+    line.
+    """
     if track is None:
         yield _line_of_positions(here, chainage_m)
         return
@@ -199,7 +201,7 @@ def _line(
 def _classes(
     positions: pl.DataFrame, error_m: Floats | None, level_m: Floats | None
 ) -> tuple[list[tuple[str, str, Masks]], str]:
-    """Return label, colour and mask of each class of positions, and the name of the quantity that defines it."""
+    """Return label, colour and mask of each class of positions, and the name of the quantity that is classified."""
     if error_m is not None:
         return size_classes(np.abs(error_m), ERROR_CLASSES, "error", "no reference"), "the size of their error"
     if level_m is not None:

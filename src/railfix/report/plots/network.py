@@ -30,7 +30,7 @@ _NAMED: Final = 400
 #: track name from the track, as a fraction of the extent of the view.
 _MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
-#: Classes of positions: smallest track probability, and colour.
+#: Classes of matched positions: smallest track probability of the class, and colour.
 _CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
 
 
@@ -111,7 +111,9 @@ def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[f
 def _names_beside(
     network: Network, frame: LocalFrame, matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
 ) -> Marks:
-    """Return the names of the tracks of a run, each next to the middle position on the track, on alternating sides."""
+    """Return the names of the tracks of a run; each name is next to the middle position on the track, on alternating
+    sides.
+    """
     passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
     places = [np.flatnonzero(matched.track == track) for track in passed][:_NAMED]
     rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
@@ -119,14 +121,17 @@ def _names_beside(
     points, ahead, _ = network.course_on(track, matched.chainage_m[rows])
     (x, y), (dx, dy) = frame.plane(points).T, (ahead @ frame.axes[:2].T).T
     span = max(high - low for low, high in view)
-    # a text is wider than high, and is therefore placed farther from a track that runs north
+    # a name is wider than high, and is therefore placed farther from a track in north-south direction
     away = np.where(np.arange(len(rows)) % 2, -1.0, 1.0) * span * (_BESIDE * np.abs(dx) + 2.0 * _BESIDE * np.abs(dy))
     words = tuple(network.names[t] for t in track)
     return Marks(label="names", colour=BLACK, x=x + away * dy, y=y - away * dx, words=words, place="on")
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
-    """Return the indices of every n-th and the last point of each track, and where in them a further track begins."""
+    """Return the indices of every n-th point and the last point of each track.
+
+    The second array has the positions in the first array at which the second and each further track begins.
+    """
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
     place = np.arange(len(track)) - first[track]

@@ -39,16 +39,16 @@ from railfix.screens import SCREENS, Cn0Limits, ScreenPicture
 
 _KEPT: Final = "#2f86b8"
 _COLUMNS: Final = 4
-#: Number of rows of a picture that are processed together.
+#: Number of rows of a `ScreenPicture` that are processed together.
 _BLOCK: Final = 100_000
-#: Maximum number of points of the curve of a limit.
+#: Maximum number of points in the curve that shows a limit.
 _LINE_POINTS: Final = 1500
 
 
 def draw_screen(
     path: str | PathLike[str], picture: ScreenPicture, time: Datetimes, chainage_m: Floats | None = None
 ) -> Path:
-    """Write a picture of a metric with its limit over T times and, if given, over chainage [m]; return its path.
+    """Write a picture of a metric and its limit over T times and, if given, over chainage [m]; return the path.
 
     The file is PNG or SVG. Raise OutputError if it cannot be written.
     """
@@ -143,7 +143,7 @@ def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
 def _blocks(
     picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
 ) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
-    """Yield flat arrays of x, metric, rejection and limit for blocks of `_BLOCK` rows, to limit the memory."""
+    """Yield flat arrays of x, metric, rejection and limit for blocks of `_BLOCK` rows, which need little memory."""
     limit = np.broadcast_to(picture.limit, picture.metric.shape)
     for first in range(0, len(picture.metric), _BLOCK):
         rows = slice(first, first + _BLOCK)
@@ -171,7 +171,7 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
 
 
 def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples) -> Path:
-    """Write a picture of C/N0 over elevation with mean and threshold (P1 figure 3), and return its path.
+    """Write a picture of C/N0 over elevation with mean and threshold (P1 figure 3), and return the path.
 
     The picture has one panel per constellation and signal. Raise OutputError if the file cannot be written.
     """
@@ -241,7 +241,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
 
 
 def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
-    """Return the sorted names of the screens' columns that the tables lack, as tables of an earlier version may."""
+    """Return the sorted names of the columns that the charts need and the tables lack; old tables may lack some."""
     columns = [column for screen in SCREENS for column in screen.columns]
     missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
     missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())

@@ -2,8 +2,8 @@
 
 The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths
 in the early, late and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14). The
-autocorrelation is the triangle of unlimited bandwidth. Within its straight parts, the zero is a quotient, so that a few
-iterations suffice.
+autocorrelation is a triangle, as for unlimited bandwidth. Where the triangle is straight for all paths, the zero is a
+quotient, so that a few iterations suffice.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ _NARROW_CHIPS: Final = 0.2  #: Largest early-late spacing of a narrow correlator
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedCode:
-    """Tracked code, phase and amplitude of N signals relative to the unobstructed direct signal, shapes (N,)."""
+    """Code, phase and amplitude at which the loops track N signals, relative to the unobstructed direct signal; shapes
+    (N,).
+    """
 
     code_m: Floats  #: Delay of the code.
     phase_m: Floats  #: Delay of the carrier phase.

@@ -45,7 +45,7 @@ from railfix.simulate.environment.walls import (
     street_reflections,
 )
 
-_LEAST_WEIGHT: Final = 0.005  #: Weight below which the obstruction by a conductor is neglected.
+_LEAST_WEIGHT: Final = 0.005  #: Weight of a conductor's obstruction below which the obstruction is neglected.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class Electrification:
         self.settings = settings
 
     def _number(self, chainage_m: Floats, every: int) -> Floats:
-        """Return the chainage of the nearest mast, counting only every n-th mast (`every`)."""
+        """Return the chainage of the nearest mast; only every n-th mast is considered, with n given by `every`."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 
@@ -298,7 +298,9 @@ class Environment:
         return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
-        """Return the reflections by side streets, by both sides of the line in sequence, and by other vehicles."""
+        """Return the reflections by walls of side streets, by rows on both sides of the line in sequence, and by other
+        vehicles.
+        """
         settings, antenna = self.settings, self.settings.antenna
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
         if (streets := settings.side_streets) is not None:
@@ -376,7 +378,7 @@ class _GainRipple:
         self._phase = dict(zip(ANTENNAS, rng.uniform(0.0, 2.0 * np.pi, (len(ANTENNAS), _HARMONICS)), strict=True))
 
     def at(self, rays: Rays, antenna: str) -> Floats:
-        """Return the gain relative to the mean in standard deviations at the horizon, shape (N,)."""
+        """Return the gain minus the mean gain, shape (N,); the unit is the standard deviation at the horizon."""
         azimuth = np.arctan2(rays.y, rays.x)
         level = np.sqrt(np.maximum(1.0 - rays.z**2, 0.0))
         order = np.arange(1, _HARMONICS + 1)[:, None]

@@ -52,7 +52,7 @@ _CONCOURSE: Final = RoofSettings(
     inner_m=0.0, outer_m=40.0, height_m=8.0, length_m=(12.0, 30.0), gap_m=(150.0, 300.0), loss_db=40.0
 )
 
-#: Rows of walls, and roofs, by kind of section; other kinds have none.
+#: Rows of walls by kind of section; kinds that are not listed have no walls.
 ROWS: Final[Mapping[Kind, tuple[RowSettings, ...]]] = {
     "suburban": (_HOUSES, _BLOCKS_BEHIND),
     "urban": (_BLOCKS, _TOWERS_BEHIND),
@@ -61,6 +61,7 @@ ROWS: Final[Mapping[Kind, tuple[RowSettings, ...]]] = {
     "mountain": (_RIDGE,),
     "station": (_BLOCKS, _TOWERS_BEHIND),
 }
+#: Roofs by kind of section; kinds that are not listed have no roofs.
 ROOFS: Final[Mapping[Kind, tuple[RoofSettings, ...]]] = {
     **dict.fromkeys(("suburban", "urban", "canyon", "cutting"), (_BRIDGE,)),
     "station": (RoofSettings(), _CONCOURSE),
@@ -104,11 +105,13 @@ SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arra
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """n structures, first on the left, then on the right side, in order of chainage, without overlap on a side."""
+    """n structures: first those on the left side, then those on the right side. On each side, they are in order of
+    chainage and do not overlap.
+    """
 
     start_m: Floats  #: Chainage of the start, shape (n,).
     end_m: Floats  #: Chainage of the end, shape (n,).
-    border_m: Floats  #: `side * reach_m` plus the chainage from which the structure is the nearest, shape (n,).
+    border_m: Floats  #: `side * reach_m` plus the chainage from which on the structure is the nearest, shape (n,).
     reach_m: float  #: Length that is larger than all chainages.
     value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 
@@ -132,7 +135,7 @@ class Structures:
 
 
 def build_structures(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Structures:
-    """Return the walls and roofs of sections in order of chainage; equal seeds give equal structures."""
+    """Return the walls and roofs of sections, in order of chainage; equal seeds yield equal structures."""
     ends = np.array([section.to_m for section in sections])
     reach = 4.0 * (max(line_length_m, ends.max(initial=0.0)) + 2.0 * BEYOND_M)
     walls: dict[int, list[list[list[float]]]] = {}

@@ -23,7 +23,8 @@ from railfix.simulate.environment.settings import AntennaSettings, NeighbourSett
 from railfix.simulate.environment.structures import Strips
 
 FREE_V: Final = -99.0  #: Fresnel parameter of an unobstructed ray.
-_LEAST_LATERAL: Final = 1e-3  #: Lower limit of direction components, which avoids division by zero for parallel rays.
+#: Lower limit of direction components, which avoids division by zero for rays parallel to a wall.
+_LEAST_LATERAL: Final = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +111,8 @@ class Reflections:
 def reflections(row: Strips, rays: Rays) -> Reflections:
     """Return the reflections of signals by a row of walls on the side opposite the satellites.
 
-    The extra path is 2 D (-n . u) with the distance D of the wall, its normal n and the unit vector u to the satellite.
+    The extra path is 2 D (-n . u) with the distance D of the wall, the normal n of the wall and the unit vector u to
+    the satellite.
     """
     sign = np.where(rays.y > 0.0, -1.0, 1.0)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
@@ -169,7 +171,7 @@ _LEAST_TWICE: Final = 0.05  #: Smallest lateral component of rays for which seco
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return amplitude, extra path [m] and growth [m/m] of reflections by one side after the other, shapes (N,).
+    """Return amplitude, extra path [m] and growth [m/m] of signals reflected by both sides in sequence, shapes (N,).
 
     The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d of the walls of the first row on both sides.
     """
@@ -200,7 +202,8 @@ def second_reflection(
     return np.where(seen, amplitude, 0.0), 2.0 * (near + away) * lateral, growth
 
 
-_LEAST_SIDE: Final = 0.02  #: Lower limit of the lateral and longitudinal components of a direction.
+#: Lower limit of the lateral and longitudinal components of a ray's direction, for reflections by side streets.
+_LEAST_SIDE: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,7 +264,8 @@ def street_reflections(
             front, width = street.front_m[number], street.end_m[number] - street.start_m[number]
             top = street.height_m[number]
             inside = np.minimum(aside - front, front + street.depth_m[number] - aside) * along[rows]
-            # The ray must pass the mouth: there its distance to the wall must be less than the width of the street.
+            # The ray must pass the mouth: there the distance of the ray from the wall must be less than the width of
+            # the street.
             mouth = (width - distance * (1.0 - front / np.maximum(aside, front))) * lateral[rows]
             over = height + rays.z[rows] * width / along[rows] - street.opposite_m[number]
             margin = np.minimum(np.minimum(inside, mouth), np.minimum(top - height, over))
