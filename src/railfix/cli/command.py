@@ -79,8 +79,8 @@ class Command(TyperCommand):
                 ctx.fail(f"{name} is a switch and takes no value; remove {after} after it")
 
 
-#: Maximum number of characters in a line of choices on a help page; typer would break words of longer lines at a width
-#: of 80 characters.
+#: Maximum number of characters in a line of choices on a help page; on a terminal of 80 columns, typer would break
+#: words in longer lines.
 _CHOICES_WIDTH: Final = 20
 
 
