@@ -1,4 +1,4 @@
-"""Public recordings of the wheel `gnss-benchmark` (MIT) on the package index, kept unpacked in the user's cache.
+"""Public recordings in the Python wheel `gnss-benchmark` (MIT) of the package index, unpacked in the user's cache.
 
 The wheel contains a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz,
 November 2020), and logs of static antennas. The drive is a held-out case: neither settings nor constants were chosen
@@ -52,7 +52,7 @@ _RTK: Final = (
     "pos1-posmode=kinematic\npos1-frequency=l1+2\npos1-soltype=combined\npos1-elmask=15\npos1-navsys=45\n"
     "pos2-armode=continuous\npos2-gloarmode=off\nout-solformat=llh\nout-height=ellipsoidal\nant2-postype=rinexhead\n"
 )
-#: Positions with a larger standard deviation along an axis are not used as ground truth [m].
+#: Positions with a larger standard deviation along any axis are not used as ground truth [m].
 _LARGEST_SIGMA_M: Final = 1.5
 _LONGEST_S: Final = 900.0
 

@@ -30,9 +30,9 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
 
 
 def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
-    """Return the median over channels of the slant delays, mapped to the vertical on L1, shape (T,) [m].
+    """Return the median over channels of the slant delays, mapped to the vertical on L1, shape (T,) [m]; 0 without any.
 
-    `slant_m` and `elevation_deg` have shape (T, K), the carriers `frequency_hz` shape (K,). 0 where no delay is known.
+    `slant_m` and `elevation_deg` have shape (T, K), the carriers `frequency_hz` shape (K,).
     """
     vertical = medians(slant_m / thin_shell_obliquity(elevation_deg) * (frequency_hz / FREQUENCY_L1) ** 2)
     return np.where(np.isfinite(vertical), vertical, 0.0)
@@ -131,7 +131,7 @@ class Delays:
     #: Delays at the channel's carrier frequency; 0 if the model is off, NaN where SBAS provides none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation in addition to local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Standard deviation added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
     reason: Bits  #: Rejection reasons due to unknown delays (`Reason` bits), shape (T, K).
 

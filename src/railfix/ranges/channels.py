@@ -57,7 +57,7 @@ def relative_noise(signal: str) -> float:
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Return slices of channels that share a receiver clock; raise ValueError if they are not adjacent."""
+    """Return slices of channels that share a receiver clock; raise ValueError if those of a clock are not adjacent."""
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):

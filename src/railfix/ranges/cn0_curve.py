@@ -117,7 +117,7 @@ class Cn0CurveSource(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Curve:
-    """Mean C/N0 over elevation of an antenna and receiver."""
+    """Mean C/N0 as a function of elevation, for one antenna and receiver."""
 
     means: tuple[Cn0Mean, ...]  #: One curve per kind of satellites and signal.
     source: Cn0CurveSource = field(default_factory=Cn0CurveSource)

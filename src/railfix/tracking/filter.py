@@ -46,7 +46,7 @@ class Recursion:
         self, chunk: Chunk, line: Line, sensors: SensorEpochs, limits: TrackingLimits, start_state: TrackState, *,
         levels: bool,
     ) -> None:  # fmt: skip
-        from railfix.kernels.tracking.recursion import advance  # imports numba, which runs without a filter do not need
+        from railfix.kernels.tracking.recursion import advance  # imports numba, which is not needed without a filter
 
         self.kernel = advance
         self.chunk, self.line, self.limits, self.levels = chunk, line, limits, levels

@@ -23,7 +23,7 @@ from railfix.tracking.state import TrackState
 
 
 def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Propagate the information of later epochs on hypothesis h backward through the measurements of an epoch."""
+    """Propagate hypothesis h's information from later epochs backward through the measurements of an epoch."""
     from railfix.kernels.tracking.backward import before_measurements
 
     made = step.trace
@@ -58,7 +58,7 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 class BackwardInformation:
     """Information of all later epochs on the unknowns after an epoch."""
 
-    place_m: float  #: Arc length of the hypothesis that later epochs continue; NaN for none.
+    place_m: float  #: Arc length of the hypothesis that later epochs continue; NaN without such a hypothesis.
     vector: Floats  #: Information vector of the unknowns, shape (N,).
     matrix: Floats  #: Information matrix of the unknowns, shape (N, N).
     satellite: Strings  #: Satellites whose errors are among the unknowns, shape (N - ix.SATELLITES,).

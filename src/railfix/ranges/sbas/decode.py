@@ -276,7 +276,10 @@ def long_term(messages: SbasMessages) -> Decoded:
 
 
 def grid_delays(messages: SbasMessages) -> Decoded:
-    """Return fields of type 26: `band`, `block`, `iodi` (n,); `delay_m`, NaN for "do not use", `givei` (n, 15)."""
+    """Return fields of type 26: `band`, `block` and `iodi`, shape (n,); `givei` and `delay_m`, shape (n, 15).
+
+    A delay is NaN where the message states "do not use".
+    """
     decoded = decode(messages, 26)
     delay = decoded["delay_m"]
     return {**decoded, "delay_m": np.where(delay == _DO_NOT_USE_DELAY_M, np.nan, delay)}

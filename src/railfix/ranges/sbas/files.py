@@ -183,7 +183,7 @@ def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFil
 
 
 def _instant(date: str, second: str) -> int:
-    """Return the nanoseconds since the GPS epoch of a calendar time in GPS time."""
+    """Return a calendar time, given in GPS time, as nanoseconds since the GPS epoch."""
     year, month, day, hour, minute = (int(part) for part in date.split())
     year += 0 if year >= 100 else 1900 if year >= 80 else 2000
     value = float(second)
@@ -193,7 +193,8 @@ def _instant(date: str, second: str) -> int:
     return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
 
 
-_SHORT: Final = 58  #: Number of digits of a message cut after the 226 data bits; 6 bits of parity or zeros follow.
+#: Number of digits of a message cut after the 226 data bits; the last 6 of these 232 bits are parity or zeros.
+_SHORT: Final = 58
 
 
 @dataclass

@@ -19,7 +19,7 @@ Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
 DATA_BITS: Final = 226  #: Number of bits of preamble, type and data of a message.
 ROW_BYTES: Final = 32  #: Number of bytes of a message in `SbasMessages.bits`.
-#: A message that occurs twice within this time was forwarded by two receivers.
+#: A message that occurs twice within this time counts as forwarded by two receivers.
 _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
 
@@ -82,7 +82,7 @@ class SbasMessages(RowArrays, NotebookTable):
     source: Integers  #: Index in `sources`, shape (N,).
     line: Integers  #: 1-based line of the file, shape (N,).
     sources: tuple[str, ...] = ()  #: Names of the files.
-    #: Messages left out, by reason: "parity", "preamble", "line", "duplicate".
+    #: Number of messages left out, by reason: "parity", "preamble", "line", "duplicate".
     rejected: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  #: Warnings about the messages, one sentence each.
     band: Band = "L1"

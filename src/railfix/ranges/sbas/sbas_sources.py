@@ -36,7 +36,7 @@ class SbasSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return satellites with long-term and fast corrections, from the records to which the corrections refer."""
+        """Return satellites with long-term and fast corrections, computed from the records to which these refer."""
         fixes = self.corrections.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -70,7 +70,7 @@ class DfmcSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites with the corrections applied, from the records to which the corrections refer."""
+        """Return corrected satellites, computed from the records to which the corrections refer."""
         fixes = self.service.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
