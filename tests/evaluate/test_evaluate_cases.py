@@ -783,7 +783,7 @@ def test_levels_go_into_files_named_by_what_they_rest_on(tmp_path: Path):
     arguments = ["evaluate", str(run), "--reference", str(tmp_path / "truth.csv"), "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--alarm-limit", "5", "--alarm-limit", "30"])
     assert result.exit_code == 0, result.output
-    assert "Errors above the level (sbas): 5, of which 3 at a usable level" in result.output
+    assert "Errors above the level (single epochs, sbas): 5, of which 3 at a usable level" in result.output
     assert re.search(r"one_fault +unavailable +ambiguous +no +150 +\+9\.00 +2\.00", result.output)
     counts = pl.read_csv(out / "stanford_sbas.csv").filter(grouping="all")
     assert counts["alarm_limit_m"].to_list() == [5.0, 12.0, 30.0] * 2

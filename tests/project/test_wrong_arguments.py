@@ -47,7 +47,7 @@ def made() -> dict[str, Any]:
 #: Calls with a wrong argument, and the sentence that follows.
 WRONG: dict[str, tuple[Callable[..., object], str]] = {
     **{
-        f"{read}({value!r})": (lambda _, read=read, value=value: getattr(railfix, read)(value), "expected, got")
+        f"{read}({value!r})": (lambda _, read=read, value=value: getattr(railfix, read)(value), "expected.*, got")
         for read in "read_observations read_navigation read_track read_vehicle read_sbas read_sp3 read_positions "
         "load_config load_scenario scan_observations".split()
         for value in (None, 3)
