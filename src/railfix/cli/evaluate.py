@@ -265,12 +265,12 @@ def priors_text(rate: FaultRate) -> str:
     if not rate.bounds_priors:
         return (
             f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: the levels of runs with this model stay "
-            "indicative, unless risk.local_prior and risk.side_prior are given"
+            "indicative, unless settings state risk.local_prior and risk.side_prior"
         )
     return (
         f"Runs with this model (--error-model) use risk.local_prior = {rate.upper:.2g} and "
         "risk.side_prior = "
-        f"{rate.side_upper:.2g} as measured, unless they are given"
+        f"{rate.side_upper:.2g} as measured, unless settings state these priors"
     )
 
 

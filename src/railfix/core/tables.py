@@ -19,7 +19,7 @@ from railfix.core.errors import InputFileError
 def reading_table(
     path: str | PathLike[str], message: str = "cannot be read as a table ({}); run railfix run again"
 ) -> Iterator[None]:
-    """Convert errors that occur in the with-block while a table is read to `InputFileError`.
+    """Convert to `InputFileError` the errors that occur in the with-block while a table is read.
 
     The placeholder ``{}`` of `message` is replaced by the reason.
     """

@@ -44,8 +44,8 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "positioned": "whether there is a position on the map",
     "conventional_positioned": "whether there is a 3-D single point",
     "error_m": "error of the position on the map, + toward the end of the line",
-    "conventional_error_m": "error of the nearest point of the trajectory to the 3-D single point, + toward the end of "
-    "the line",
+    "conventional_error_m": "error of the trajectory point nearest to the 3-D single point position, + toward the end "
+    "of the line",
     "distance_m": "straight distance (3-D) from the position on the map to the reference",
     "along_sigma_m": "standard deviation along the line, as stated by the run",
     "branch_probability": "probability of the branch, for the filter along the track",

@@ -121,7 +121,7 @@ class CentreLimits(Settings):
     #: Largest delay of a train's clock behind the times of the train's positions. The time between two positions is
     #: assumed to be longer by this value, because the delay of the clock may vary.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
+    #: Largest accepted amount by which a sequence number may exceed the newest one, if it arrives immediately after it.
     jump: int = Field(default=1000, ge=1)
     #: Increase of this largest lead per second since the newest number arrived.
     rate: float = Field(default=20.0, gt=0)

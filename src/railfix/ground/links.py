@@ -37,7 +37,7 @@ class LinkResult(NamedTuple):
 
 
 class LinkLimits(Settings):
-    """Limits of the links."""
+    """Time-outs and switching rules of the two links between a train and the centre."""
 
     #: Longest time from a frame to its echo; a later echo counts as a miss. A centre delays echoes by up to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)

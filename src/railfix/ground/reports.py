@@ -71,7 +71,7 @@ class PlacedReport:
 
     @property
     def front_m(self) -> float:
-        """Reported front end [m]."""
+        """Reported chainage of the train's front end [m]."""
         return (self.message.chainage_cm or 0) / 100.0
 
     @property

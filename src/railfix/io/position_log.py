@@ -267,8 +267,8 @@ _OF_RTKLIB: Final = {
 
 
 def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
-    """Parse RTKLIB's solution format (manual 2.4.2, B.1); raise InputFileError for baselines or heights above the
-    geoid.
+    """Parse RTKLIB's solution format (manual 2.4.2, B.1); raise InputFileError if the file has baselines, or heights
+    above the geoid instead of the ellipsoid.
     """
     scale, names = _rtklib_header(path, [line for line in lines if line.startswith("%")])
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]

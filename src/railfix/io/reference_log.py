@@ -158,7 +158,9 @@ def _of_antenna(
 
 
 def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
-    """Return references as the table of a reference file, sorted by time; null where unknown."""
+    """Return reference positions as a table with the columns of a reference file, sorted by time; unknown values are
+    null.
+    """
     tables = [
         pl.DataFrame(
             {

@@ -15,7 +15,7 @@ from railfix.gnss.orbits.ephemerides import POINTS
 from railfix.gnss.plausible_records import plausible_radius
 from railfix.io.file_kind import wrong_kind
 
-#: Time systems that agree with GPS time to nanoseconds; SP3-a files have no time system and are in GPS time.
+#: Time systems that agree with GPS time to nanoseconds; SP3-a files name no time system, and their times are GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
 #: Functions that convert other time systems to GPS time, by the names of the systems in files.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}

@@ -204,7 +204,7 @@ def _tie(
 def _agreeing(
     ranges: Ranges, point: SinglePoint, start_ecef_m: Floats, limits: TieLimits
 ) -> tuple[Ranges, SinglePoint, Masks]:
-    """Return the ranges consistent with one 3-D position, the positions from these, and a mask of other ranges."""
+    """Return the ranges that agree on one 3-D position, this position, and a mask of the ranges that disagree."""
     dropped = (ranges.weight > 0) & ~robust_fit(ranges, start_ecef_m, limits=limits.robust_fit).kept
     changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):

@@ -114,7 +114,7 @@ class MapOffset(NotebookTable):
 
 
 class OffsetErrors(NamedTuple):
-    """Errors of the ranges of T epochs."""
+    """Range errors on which the map offset is based, for T epochs."""
 
     nominal_m: Floats  #: Standard deviations of satellite and atmospheric errors, shape (T, M).
     variance: Floats  #: Variance of the ranges as a multiple of the variance assumed by their weights, shape (T,).

@@ -177,7 +177,7 @@ class SectionArrays(NamedTuple):
 
 
 class SinglePointLimits(Settings):
-    """Limits of the iteration of 3-D positions, and of their validation (`conventional_status`)."""
+    """Limits of the iterative solution of 3-D positions, and of its validation (`conventional_status`)."""
 
     tolerance_m: float = Field(default=1.0, gt=0)  #: Step length below which the iteration ends; the error is 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.

@@ -58,7 +58,8 @@ class SectionLimits(Settings):
 class Section:
     """Best-fitting point of the trajectory, T epochs."""
 
-    vertex: Indices  #: Point with the least q; -1 where there are no more ranges than clocks; shape (T,).
+    #: Index of the point with the least q, shape (T,); -1 where the ranges do not outnumber the clocks.
+    vertex: Indices
     q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without a point; shape (T,).
     #: q at the best alternative position minus q at the best position, both interpolated between the points of the
     #: trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
@@ -142,7 +143,9 @@ def _ball(
     epochs: Indices,
     limits: SectionLimits,
 ) -> Floats:
-    """Return the radius around the 3-D positions that contains every candidate point [m]; NaN where unknown."""
+    """Return the radius of the sphere around each 3-D position that contains all candidate points [m]; NaN where
+    unknown.
+    """
     radius = np.full(len(epochs), np.nan)
     known = np.isfinite(point.ecef_m[epochs, 0])
     at = epochs[known]

@@ -43,7 +43,7 @@ Kind = (
 
 @dataclass(frozen=True, kw_only=True)
 class FileFinding:
-    """Properties of one file."""
+    """Kind, content, time span and problems of one file."""
 
     path: Path
     kind: Kind

@@ -328,7 +328,7 @@ class OutputFolder:
         self.append_csv(f"{name}.csv", round_floats(table))
 
     def end_parquet(self, metadata: Mapping[str, str] | None = None) -> None:
-        """End all Parquet files, with `metadata` in each footer; `scan` can then read them."""
+        """Close all Parquet files, with `metadata` in each footer; `scan` can then read them."""
         while self._parquet:
             name, file = next(iter(self._parquet.items()))
             with _writing(self.path / name):

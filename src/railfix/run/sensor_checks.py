@@ -233,7 +233,8 @@ _FAR_M: Final = 500.0
 _AHEAD: Final = 0.7
 #: Minimum number of ranges to ground units ahead, or behind, for a comparison.
 _LEAST_RANGES: Final = 10
-#: Smallest reported difference between ranges and satellite positions [m]: twice the code error over minutes.
+#: Smallest reported difference between measured ranges and ranges computed from satellite positions [m]: twice the code
+#: error that lasts for minutes.
 _RANGE_M: Final = 3.0
 
 

@@ -1,4 +1,4 @@
-"""SBAS messages whose corrections cancel the simulated errors, one per second (RTCA DO-229D, A.4.4)."""
+"""SBAS messages, one per second, whose corrections cancel the simulated errors (RTCA DO-229D, A.4.4)."""
 
 from __future__ import annotations
 

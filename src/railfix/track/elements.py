@@ -192,7 +192,7 @@ class CantElement:
     length_m: float  #: Length of the element in plan.
     left_m: tuple[float, float]  #: Heights of the left rail above the profile, at start and end of the element.
     right_m: tuple[float, float]  #: Heights of the right rail above the profile, at start and end of the element.
-    law: str = "linear"  #: Law of the heights, a key of `LAWS`.
+    law: str = "linear"  #: Law by which the height varies along the element, a key of `LAWS`.
 
     def rails_at(self, place_m: Floats) -> tuple[Floats, Floats]:
         """Return the heights of left and right rail above the profile at distances in plan, shape (n,) each [m]."""

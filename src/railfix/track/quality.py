@@ -103,7 +103,7 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
 
 
 def error_note(quality: TrackQuality) -> tuple[str, ...]:
-    """Return a note with the number of errors of a map and the first error; an empty tuple without errors."""
+    """Return a note with the number of errors of a map and the first error, or an empty tuple if there are none."""
     if not quality.errors:
         return ()
     return (

@@ -107,7 +107,7 @@ class Track(NotebookTable):
         names.
         """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
-            raise TypeError(f"a track has no {', '.join(sorted(unknown))}")
+            raise TypeError(f"unknown attributes of a track: {', '.join(sorted(unknown))}")
         latitude = np.array(latitude_deg, dtype=np.float64)
 
         def floats(values: ArrayLike | None) -> Floats:

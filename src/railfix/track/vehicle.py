@@ -66,7 +66,7 @@ class Vehicle(Settings):
 
     @property
     def ends_m(self) -> tuple[float | None, float | None]:
-        """Distance of the front end ahead of the middle between the bogies, and of the rear end behind the middle [m].
+        """Distances from the midpoint between the bogies forward to the front end, and back to the rear end [m].
 
         The values are None where unknown.
         """

@@ -116,7 +116,7 @@ def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLi
 
 @lru_cache(maxsize=64)
 def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """Compute `railfix.motion.singer.singer_steps` for one interval, shapes (3, 3)."""
+    """Compute transition matrix and process noise of Singer's model for one interval, shapes (3, 3)."""
     step, noise = singer_steps(np.array([dt]), sigma_mps2, tau_s)
     return step[0], noise[0]
 

@@ -45,7 +45,7 @@ class Cause(IntEnum):
     ONE_FAULT = 1
     #: Two simultaneous faults.
     TWO_FAULTS = 2
-    #: Infinite level: undetectable satellite faults are more probable than their part of the risk.
+    #: Infinite level: the probability of undetectable satellite faults exceeds the risk allocated to them.
     UNCHECKED = 3
     #: Infinite level: faults that are not hypotheses exceed the risk, or too many satellites are excluded.
     BUDGET = 4

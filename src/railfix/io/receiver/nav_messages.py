@@ -291,7 +291,7 @@ def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple
 
 
 def has_crc(bits: Bytes, checked: int) -> Masks:
-    """Return whether the first `checked` bits are followed by their CRC-24Q of 24 bits, shape (N,)."""
+    """Return a mask of the messages whose first `checked` bits are followed by their CRC-24Q, shape (N,)."""
     before = np.zeros((len(bits), -checked % 8), dtype=np.uint8)
     data = np.packbits(np.concatenate([before, bits[:, :checked]], axis=1), axis=1)
     start = np.arange(len(data)) * data.shape[1]

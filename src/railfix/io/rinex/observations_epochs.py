@@ -62,7 +62,7 @@ class FaultLog:
             self._messages.append(f"{self.path}, line {line}: {message}; {_CONSEQUENCE[kind]}")
 
     def faults(self, kind: str, lines: Integers, message: Callable[[int], str]) -> None:
-        """Record faults of one kind at ascending line numbers; `message(i)` is called for the first faults only."""
+        """Record faults of one kind at ascending line numbers; only the first faults are described, by `message(i)`."""
         described = 1 if self.stops else MAX_PROBLEMS
         for i, line in enumerate(lines[:described].tolist()):
             self.fault(kind, line, message(i))

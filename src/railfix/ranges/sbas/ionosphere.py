@@ -241,7 +241,9 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return corner points (M, 4), -1 where not used, and x and y in the cell, (M,), for latitudes below 75 deg."""
+    """Return the corner points (M, 4), -1 if unused, and the coordinates x and y in the cell (M,), below 75 deg
+    latitude.
+    """
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)

@@ -127,7 +127,7 @@ class RangeBars(_Layer):
 
 @dataclass(frozen=True, kw_only=True)
 class Marks(_Layer):
-    """Texts at P points."""
+    """Text labels at P points of a chart."""
 
     kind: ClassVar[str] = "marks"
     #: Coordinates of the texts, shape (P,).

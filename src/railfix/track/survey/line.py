@@ -180,7 +180,8 @@ def _line_sigmas(
     """Compute the standard deviations of the line, across and in height, shape (J, 2) [m].
 
     The expected information of an observation with Student's t errors is ``(freedom + size) / (freedom + size + 2)``
-    times the information with normal errors. The smaller of this factor and the weight is used.
+    times the information with normal errors. The information of each observation is multiplied by this factor or by its
+    robust weight, whichever is smaller.
     """
     expected = [
         np.full(len(weight), (limits.freedom + system.size) / (limits.freedom + system.size + 2.0))
