@@ -293,7 +293,7 @@ def test_a_run_names_a_mounting_that_moves() -> None:
     assert checks.notes(samples, None, round_line(), SensorLimits()) == ()
     assert checks.radar_alarms(samples.radar) == ()
     notes = checks.radar_alarms(moved)
-    assert any("differ from satellite speeds by -3.0 % (+0.0 % before); check" in note for note in notes), notes
+    assert any("differ from satellite-derived speeds by -3.0 % (+0.0 % before); check" in note for note in notes), notes
 
 
 @pytest.mark.requirement("E3")

@@ -89,7 +89,7 @@ def test_one_degenerate_way_leaves_the_others(tmp_path: Path) -> None:
     assert [s.metadata["name"] for s in segments] == ["way/10"]
     assert "way/12 (the file has 1 of its 1 nodes)" in segments[0].notes[0]
     assert "way/13 (the file has 0 of its 2 nodes)" in segments[0].notes[0]
-    with pytest.raises(InputFileError, match=r"way/12 \(the file has 1 of its 1 nodes\); request the nodes"):
+    with pytest.raises(InputFileError, match=r"way/12 \(the file has 1 of its 1 nodes\); also request the nodes"):
         read_segments(osm(tmp_path / "b.osm", CROSSED, {12: ([2], {})}), MapReading())
 
 

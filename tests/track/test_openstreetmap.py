@@ -161,7 +161,7 @@ def test_a_clipped_way_is_two_and_one_without_nodes_a_sentence(tmp_path: Path) -
     assert [len(s.latitude_deg) for s in read_segments(path, MapReading())] == [3, 2, 3]
     bare = [{"type": "way", "id": 11, "tags": TAGS[11], "nodes": [101, 102]}]
     path.write_text(json.dumps({"elements": bare}))
-    with pytest.raises(InputFileError, match=r"way/11 \(the file has 0 of its 2 nodes\); request the nodes"):
+    with pytest.raises(InputFileError, match=r"way/11 \(the file has 0 of its 2 nodes\); also request the nodes"):
         read_segments(path, MapReading())
 
 

@@ -294,7 +294,7 @@ def test_broken_geojson_is_refused_in_one_sentence(tmp_path: Path, document: obj
 
 
 def test_geojson_without_a_height_datum(tmp_path: Path) -> None:
-    assert "give height_datum (--height-datum)" in refused(geojson(tmp_path, feature(LINE)), SettingsError)
+    assert "the height datum is missing" in refused(geojson(tmp_path, feature(LINE)), SettingsError)
 
 
 def test_geojson_with_an_unknown_crs(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ Array functions raise `ValueError` when an argument violates their contract.
 code meaning
 ==== =====================================================================
 0    done
-1    a defect of railfix itself (a traceback is shown)
+1    an internal error of railfix (a traceback is shown)
 2    the command line was misused (unknown option, missing argument)
 3    an input file is missing, unreadable, or malformed
 4    a setting is misspelt, out of range, or contradicts another
