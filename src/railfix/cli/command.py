@@ -93,7 +93,7 @@ def _simplify_help(param: Any) -> None:
         return
     if isinstance(param, TyperArgument):
         name = param.metavar or str(param.name).upper()
-        param.get_usage_pieces = lambda _ctx: [name if param.required else f"[{name}]"]
+        param.get_usage_pieces = lambda ctx: [name if param.required else f"[{name}]"]  # type: ignore[method-assign]  # noqa: ARG005
     hidden = isinstance(param, TyperArgument) or getattr(param, "is_flag", False)
     param.display_type_rich = (lambda **_: None) if hidden else partial(_wrap_choices, show)
 

@@ -8,9 +8,9 @@ code meaning
 ==== =====================================================================
 0    done
 1    an internal error of railfix (a traceback is shown)
-2    the command line was misused (unknown option, missing argument)
+2    the command line is wrong (unknown option, missing argument)
 3    an input file is missing, unreadable, or malformed
-4    a setting is misspelt, out of range, or contradicts another
+4    a setting is misspelt, out of range, or contradicts another setting
 5    the inputs are readable but do not match each other, for example in day or location
 6    the track map was checked and has errors
 7    the results contain no position, or the inputs no usable position
